@@ -6,15 +6,13 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
 from soup_nlp.arrays import Float, Mask
-from soup_nlp.bench.study import Item, Overrides
+from soup_nlp.bench.study import Cell
 from soup_nlp.bench.suites import SUITES
-from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.baselines import fill_nearest
@@ -30,8 +28,6 @@ from soup_nlp.evaluate.scoring import at_truth, coverage, sparsification, surest
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
-from soup_nlp.report.folder import prepare_folder, write_folder
-from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.rows import Row
 
 METHODS: Mapping[str, str] = MappingProxyType(
@@ -54,52 +50,43 @@ BASELINES = ("unorganised", "rigid", "rigid_filled", "constant")
 """Depth maps that the solution is compared with."""
 KEPT_METRICS = (*ERRORS, "scale", "coverage", "n_pixels")
 """Depth metrics that a row has beside the skill."""
-MIN_PIXELS = 50
-"""Moving components with fewer true pixels have no scale in a row."""
 
 
-def measure_pair(item: Item, overrides: Overrides = (), folder: Path | None = None) -> Row:
-    """Solve and score one pair; `folder` gets the result folder.
+def measure_pair(cell: Cell) -> Row:
+    """Solve and score one pair.
 
     Raises:
         SoupError: the pair cannot be solved, or no convention has a true pixel.
     """
-    return scores(solved(item, overrides, folder), item.presets)
+    return scores(solved(cell), cell.item.presets)
 
 
-def solved(item: Item, overrides: Overrides = (), folder: Path | None = None) -> Run:
-    """The run of a pair that can be scored; `folder` gets the result folder.
+def solved(cell: Cell) -> Run:
+    """The run of a pair that can be scored.
 
     Raises:
         SoupError: the pair cannot be solved, or no convention has a true pixel.
     """
-    begin = time.perf_counter()
-    problem = item.problem(overrides)
+    begin, item = time.perf_counter(), cell.item
+    problem = item.problem(cell.overrides)
     pair = problem.load_pair()
     loaded = time.perf_counter() - begin
     # do not solve a pair that cannot be scored
     if not any(_applies(pair.truth, preset(name)) for name in item.presets):
-        suite = SUITES.get(item.suite)
+        suite = SUITES[item.suite]
         raise DataError(
             "pair has no true depth",
             where=item.key,
             found=f"no pixel that counts under {', '.join(item.presets)}",
-            expected=suite.layout or None if suite else None,
-            hint=f"get it from {suite.source}" if suite and suite.source else None,
+            expected=suite.layout or None,
+            hint=f"get it from {suite.source}" if suite.source else None,
         )
-    with scratch() as temporary:
-        log = temporary / "ipopt.log"
-        if folder is not None:
-            prepare_folder(folder)
-        result = run(problem, pair=pair, ipopt_log=None if folder is None else str(log))
-        result = replace(result, seconds={**result.seconds, "load": loaded})
-        if folder is not None:
-            write_folder(folder, result, dump_problem(problem), "", ipopt_log=log)
-    return result
+    result = run(problem, pair=pair)
+    return replace(result, seconds={**result.seconds, "load": loaded})
 
 
 def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
-    """Metrics by convention and method, energies, flow error, scene flow and sigma of a run.
+    """Metrics by convention and method, flow error, scene flow and sigma of a run.
 
     A convention is left out if no true pixel counts under it, or if it needs a depth map and the
     truth has sparse points. "guess" is the share of the image that is marked as a guess, "within"
@@ -118,23 +105,16 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
             if _applies(truth, preset(name)):
                 metrics[name] = _metrics(scored, preset(name))
     main = next(iter(metrics), "")
-    energy = {"start": solution.energy_start, "solution": result.energy}
-    if result.refined is not None:
-        energy["nlp"] = solution.energy
     return {
         "status": solution.status,
         "good": result.solved,
-        "superpixels": len(result.segmentation),
-        "size": list(result.pair.size),
         "stages": dict(result.seconds),
         "iterations": sum(stage.iterations for stage in solution.stages),
-        "parallax_px": float(np.median(result.start.parallax)),
         "bending_share": float(result.start.bends.mean()),
         "guess": result.confidence.guessed,
         **_sigma(result),
         "flow_error": flow_error(result.pair),
         "metrics": metrics,
-        "energy": {name: dict(terms) for name, terms in energy.items()},
         "scene_flow": _scene_flow(result, metrics[main]["solution"]["scale"]) if main else None,
         "moving": moving(result.pair, maps["solution"], preset(main)) if main else None,
     }
@@ -198,29 +178,21 @@ def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
         convention: Rule of the one scale of the whole image, and the pixels that count.
 
     Returns:
-        "mre" and "rest" (MRE of moving and of other pixels), "share" of the true pixels that move,
-        and "components": pixels and "scale" (median of z / z_true after the common scale) of every
-        moving component. None without such a truth or without moving pixels.
+        "mre" and "rest", the MRE of moving and of other pixels. None without such a truth or
+        without moving pixels.
     """
     truth = pair.truth
     if truth is None or truth.components is None or truth.depth_ref is None:
         return None
     gt, label = truth.depth_ref, truth.components
-    label = np.where((label > 0) & ~moves_by_itself(truth)[label], 0, label)
+    moving_part = (label > 0) & moves_by_itself(truth)[label]
     counts = convention.mask(gt) & np.isfinite(gt) & (gt > 0)
-    moves, rest = counts & (label > 0), counts & (label == 0)
+    moves, rest = counts & moving_part, counts & (label >= 0) & ~moving_part
     if not moves.any() or not rest.any():
         return None
     z = depth * convention.score(depth, gt).scale
-    mre = [depth_metrics(z, gt, scale="none", mask=mask).mre for mask in (moves, rest)]
-    components = []
-    for k in np.unique(label[moves]):
-        ratio = (z / np.where(moves, gt, np.nan))[moves & (label == k)]
-        ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
-        if len(ratio) >= MIN_PIXELS:
-            components.append({"pixels": len(ratio), "scale": float(np.median(ratio))})
-    share = float(moves.sum() / counts.sum())
-    return {"mre": mre[0], "rest": mre[1], "share": share, "components": components}
+    masks = {"mre": moves, "rest": rest}
+    return {k: depth_metrics(z, gt, scale="none", mask=m).mre for k, m in masks.items()}
 
 
 def moves_by_itself(truth: Truth) -> Mask:

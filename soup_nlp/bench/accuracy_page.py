@@ -25,10 +25,10 @@ SURENESS = ("AUSE", "guess", "within 1", "within 2")
 """Columns on sigma."""
 
 
-def write_suite(folder: Path, name: str, frame: pd.DataFrame, note: str = "") -> None:
-    """Write the page NAME.md of the rows of one suite, and the picture NAME.png."""
-    picture = _plot_sparsification(folder / f"{name}.png", frame)
-    (folder / f"{name}.md").write_text(suite_page(name, frame, note, picture), encoding="utf-8")
+def write_suite(page: Path, frame: pd.DataFrame, note: str = "") -> None:
+    """Write the page of the rows of one suite, and its picture beside it."""
+    picture = _plot_sparsification(page.with_suffix(".png"), frame)
+    page.write_text(suite_page(page.stem, frame, note, picture), encoding="utf-8")
 
 
 def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = False) -> str:

@@ -10,37 +10,25 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from soup_nlp.bench.paper import ALL_SECTIONS, BASE, DATASETS, METHODS, Plan
+from soup_nlp.bench.paper import BASE, DATASETS, METHODS
 from soup_nlp.bench.processes import processor
-from soup_nlp.bench.studies import (
-    ABLATION,
-    COMPARISON,
-    DATA,
-    DEPARTURES,
-    GRID_AGAINST_SLIC,
-    SOURCE,
-    STUDIES,
-)
+from soup_nlp.bench.studies import ABLATION, COMPARISON, DATA, DEPARTURES, SOURCE, STUDIES
 from soup_nlp.bench.study import (
     failures,
     figure,
     markdown,
     page_text,
     pivot,
-    plot_lines,
     provenance,
     save,
-    show,
-    table,
     titled,
 )
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.evaluate.protocols import preset
 
-PAGE = "README.md"
-PICTURES = ("comparison", "depth_maps", "convergence", *ALL_SECTIONS)
-FILES = (PAGE, *(f"{name}.png" for name in PICTURES))
-"""Names of all files that `write_page` may write."""
+PICTURES = ("comparison", "depth_maps", "convergence", "departures", *STUDIES)
+FILES = ("README.md", *(f"{name}.png" for name in PICTURES))
+"""Names of all files that `write_paper` writes, the page first."""
 STAGES = ("flow", "segmentation", "start", "nlp", "refine")
 """Stages of the table of time."""
 WITHOUT_TRUTH = {
@@ -53,31 +41,25 @@ WITHOUT_TRUTH = {
     "ULDEMV": "the paper draws its errors on KITTI and prints no number",
 }
 """Data of the paper without a row here, and the reason."""
-SAID = {
-    "superpixels": "Published as a figure: the error hardly falls beyond 1,000 superpixels.",
-    "neighbours": "Published as pictures of one pair (K = 4 and 20); K from 15 to 20 is used.",
-    "pattern": "Published for one frame with 1,000 superpixels: "
-    + ", ".join(f"{k} {v:.4f}" for k, v in GRID_AGAINST_SLIC.items())
-    + f". Copied, not measured: {SOURCE}.",
-    "flow": "Published as a figure of RMSE in metres on Sintel.",
-}
-"""Sentences on the paper's results, by section."""
 
 
-def write_page(folder: Path, plan: Plan, frame: pd.DataFrame, command: str) -> None:
-    """Write the page and its figures into a folder."""
-    sections = plan.sections(frame)
-    compared = sections.pop("comparison", plan.table.iloc[:0])
-    departures = sections.pop("departures", None)
-    lines = [*_head(plan, frame, command), *_comparison(folder, plan, compared)]
+def write_paper(
+    page: Path, frame: pd.DataFrame, plan: pd.DataFrame, command: str, note: str
+) -> None:
+    """Write the page and its figures beside it; `note` says the sizes of the rows."""
+    folder = page.parent
+    rows = plan.join(frame.set_index("key").drop(columns="variant"), on="key")
+    sections = dict(list(rows.groupby("section", sort=False)))
+    none = rows.iloc[:0]
+    compared = sections.pop("comparison", none)
+    departures = sections.pop("departures", none)
+    lines = [*_head(frame, command, note), *_comparison(folder, compared)]
     lines += _pictures(folder, compared)
-    for name, rows in sections.items():
-        lines += _study(folder, name, rows)
-    lines += [*_convergence(folder, compared), *_time(compared)]
-    if departures is not None:
-        lines += _departures(folder, departures)
-    text = page_text([*lines, *_missing(plan), *failures(frame)])
-    (folder / PAGE).write_text(text, encoding="utf-8")
+    for name, own in sections.items():
+        lines += _study(folder, str(name), own)
+    lines += [*_convergence(folder, compared), *_time(compared), *_departures(folder, departures)]
+    lines += [*_missing(set(plan["dataset"])), *failures(frame)]
+    page.write_text(page_text(lines), encoding="utf-8")
 
 
 def _figure(name: str, text: str) -> list[str]:
@@ -89,17 +71,13 @@ def _mre(rows: pd.DataFrame, convention: str = "paper", method: str = "solution"
     return rows[column].astype(float) if column in rows else pd.Series(np.nan, index=rows.index)
 
 
-def _head(plan: Plan, frame: pd.DataFrame, command: str) -> list[str]:
-    sizes, good = plan.sizes, int(frame["ok"].eq(True).sum())
-    changed = ", ".join(f"`{o}`" for o in sizes.overrides)
+def _head(frame: pd.DataFrame, command: str, note: str) -> list[str]:
     return [
         "# The paper, row by row",
         "",
         f"Made by `{command}`. {provenance(frame)}. Flow by OpenCV DIS unless named."
         f" Machine: {os.cpu_count()} cores of an {processor()}.",
-        f"Superpixels wanted: {sizes.superpixels} in the comparison, {sizes.analysis} elsewhere."
-        + (f" Overrides of every row: {changed}." if changed else "")
-        + f" {good} of the {len(plan.cells())} rows were measured.",
+        f"{note} {int(frame['ok'].eq(True).sum())} of the {len(frame)} rows were measured.",
         "",
         "`preset: paper` is the method as printed; *defaults* are those of this program. What both"
         " differ in is in [the table of departures](../../docs/formulation.md#the-preset-paper)."
@@ -110,13 +88,13 @@ def _head(plan: Plan, frame: pd.DataFrame, command: str) -> list[str]:
     ]
 
 
-def _comparison(folder: Path, plan: Plan, rows: pd.DataFrame) -> list[str]:
+def _comparison(folder: Path, rows: pd.DataFrame) -> list[str]:
     """Tables by dataset and by pair, and the figure of the errors."""
     caps = dict.fromkeys(cap for _, _, cap in DATASETS.values() if cap)
     lines = ["## Mean relative error per dataset", ""]
     entries, bars = {}, {}
     for name, (title, _, cap) in DATASETS.items():
-        group = rows[rows["name"].isin([i.name for i in plan.datasets[name]])]
+        group = rows[rows["dataset"] == name]
         line: dict[str, Any] = {f"{m} (published)": v for m, v in COMPARISON[name].items()}
         line["pairs here"] = str(group["name"].nunique())
         for method in METHODS:
@@ -208,13 +186,13 @@ def _study(folder: Path, name: str, rows: pd.DataFrame) -> list[str]:
         group = rows[rows["method"] == method].assign(value=_mre(rows))
         drawn[method] = pivot(group, "value", "name", "change").rename_axis(index="pair")
         lines += [f"{method}, MRE after median scale, no cap:", "", *markdown(drawn[method]), ""]
-    copied = f"Copied, not measured: {SOURCE}."
     if name == "ablation":
-        printed = [[f"{k} (published)", *(show(v) for v in row)] for k, row in ABLATION.items()]
-        head = ["sequence", "arap", "+ proj", "+ cont", "+ orient"]
-        lines += ["Published MRE:", "", *table(head, printed), "", copied, ""]
-    lines += [SAID[name], ""] if name in SAID else []
-    plot_lines(folder / f"{name}.png", drawn, name, text)
+        terms = ["arap", "+ proj", "+ cont", "+ orient"]
+        printed = pd.DataFrame.from_dict(dict(ABLATION), orient="index", columns=terms)
+        lines += ["Published MRE:", "", *markdown(printed.rename_axis("sequence")), ""]
+        lines += [f"Copied, not measured: {SOURCE}.", ""]
+    lines += [STUDIES[name].published, ""] if STUDIES[name].published else []
+    _plot_lines(folder / f"{name}.png", drawn, name, text)
     return [*lines, *_figure(name, text)]
 
 
@@ -236,14 +214,15 @@ def _convergence(folder: Path, rows: pd.DataFrame) -> list[str]:
         left.legend(fontsize=5)
         right.set_title("refinement, exact objective by round", fontsize=7)
         fall = f"{1 - rounds[-1] / rounds[0]:.1%}" if rounds and rounds[0] else "-"
-        numbers = [show(row["iterations"], ".0f"), f"{start:.5g}", f"{end:.5g}"]
         status = str(row["status"]).replace("_", " ")
-        entries.append([row["name"], row["method"], status, *numbers, fall])
+        numbers = int(row["iterations"]), f"{start:.5g}", f"{end:.5g}", fall
+        entries.append([row["name"], row["method"], status, *numbers])
     save(picture, folder / "convergence.png")
     head = ["pair", "method", "constrained NLP", "iterations", "E start", "E NLP"]
+    table = pd.DataFrame(entries, columns=[*head, "refinement lowers E by"])
     lines = ["## Convergence of E over iterations and rounds", ""]
     lines += ["The exact energy of start and NLP; the figure has the smoothed energy by stage.", ""]
-    lines += table([*head, "refinement lowers E by"], entries)
+    lines += markdown(table.set_index("pair"), "")
     return [*lines, *_figure("convergence", "Energy over iterations and rounds")]
 
 
@@ -289,13 +268,39 @@ def _departures(folder: Path, rows: pd.DataFrame) -> list[str]:
     return [*lines, "", *_figure("departures", text)]
 
 
-def _missing(plan: Plan) -> list[str]:
-    entries = []
+def _missing(given: set[str]) -> list[str]:
+    """Table of the data of the paper without rows, `given` being the datasets that have some."""
+    reasons = {}
     for name, (title, suites, _) in DATASETS.items():
-        if not plan.datasets[name]:
+        if name not in given:
             suite = SUITES[suites[0]]
-            entries.append([title, f"no pair was given; from {suite.source}, as {suite.layout}"])
-    entries += [[name, text] for name, text in WITHOUT_TRUTH.items()]
-    left = [name for name in ALL_SECTIONS if name not in plan.sizes.sections]
-    entries += [[f"section {name}", "left out of this run (`--sections`)"] for name in left]
-    return ["## What is not here", "", *table(["data", "why, and where from"], entries), ""]
+            reasons[title] = f"no pair was given; from {suite.source}, as {suite.layout}"
+    table = pd.Series(reasons | WITHOUT_TRUTH, name="why, and where from").rename_axis("data")
+    return ["## What is not here", "", *markdown(table.to_frame()), ""]
+
+
+def _plot_lines(path: Path, tables: Mapping[str, pd.DataFrame], axis: str, text: str) -> None:
+    """Lines of tables over their columns: a panel for each table, the mean in black."""
+    picture = figure(4.5 * len(tables) + 1.5, 3.6)
+    axes = picture.subplots(1, len(tables), sharey=True, squeeze=False)[0]
+    for ax, (title, drawn) in zip(axes, tables.items(), strict=True):
+        for name, line in drawn.iterrows():
+            mean = str(name).startswith("mean of")
+            style = {"color": "black", "lw": 2.0} if mean else {"lw": 1.0}
+            ax.plot(range(len(line)), line.to_numpy(float), "o-", ms=3, label=name, **style)
+        names = [str(c) for c in drawn.columns]
+        slanted = {"rotation": 20, "ha": "right"} if len("".join(names)) > 36 else {}
+        ax.set_xticks(range(len(names)), names, size=8, **slanted)
+        ax.set(title=title, xlabel=axis)
+        ax.grid(alpha=0.3)
+    values = np.concatenate([t.to_numpy(float).ravel() for t in tables.values()])
+    values = values[np.isfinite(values)]
+    if values.size and values.min() > 0 and values.max() > 20 * values.min():
+        axes[0].set_yscale("log")
+    else:
+        axes[0].set_ylim(bottom=0)
+    axes[0].set_ylabel("MRE")
+    if values.size:
+        picture.legend(*axes[-1].get_legend_handles_labels(), loc="outside right upper", fontsize=6)
+    picture.suptitle(text, fontsize=10)
+    save(picture, path)

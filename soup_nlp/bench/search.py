@@ -1,6 +1,6 @@
 """Search for better default options by Optuna; every family judges what the others choose.
 
-Trial t000 is the default. The same seed, pairs and code give the same trials, and an interrupted
+Trial t000 is the default. The same pairs and code give the same trials, and an interrupted
 search can be continued.
 """
 
@@ -18,7 +18,6 @@ from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.study import (
     Cell,
     Item,
-    Measure,
     Overrides,
     failures,
     main_metric,
@@ -29,7 +28,7 @@ from soup_nlp.bench.study import (
     provenance,
 )
 from soup_nlp.errors import ConfigError
-from soup_nlp.storage.rows import MeasureRows
+from soup_nlp.storage.rows import MeasureRows, measure_all
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -116,12 +115,9 @@ def search(
     space: Space,
     items: Sequence[Item],
     path: Path,
-    measure_rows: MeasureRows,
-    *,
+    measure_rows: MeasureRows = measure_all,
     trials: int = 24,
-    seed: int = 0,
     overrides: Overrides = (),
-    measure: Measure = measure_pair,
 ) -> pd.DataFrame:
     """Measure trials that Optuna's TPE sampler suggests.
 
@@ -131,34 +127,32 @@ def search(
         path: JSON-lines file of rows.
         measure_rows: `storage.rows.measure_all` with its options.
         trials: Number of configurations beside the default.
-        seed: Seed of the sampler.
         overrides: Overrides of every problem; those of a trial come after them.
-        measure: Makes the row of a pair.
 
     Returns:
         The frame of all rows: "variant" is the trial, "loss" that of the pair, "settings" the
         overrides of the trial as text.
 
     Raises:
-        ConfigError: there is no pair, or a parameter is wrong.
+        ConfigError: a parameter is wrong.
     """
-    if not items:
-        raise ConfigError("no pair is left", where="search")
     for key, distribution in space.items():
-        ends = getattr(distribution, "choices", None) or (distribution.low, distribution.high)
-        for value in ends:
+        for value in getattr(distribution, "choices", None) or (
+            distribution.low,
+            distribution.high,
+        ):
             items[0].problem([f"{key}={as_yaml(value)}"])
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed))
+    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=0))
     frames = []
     for k in range(trials + 1):
         trial = study.ask(dict(space)) if k else None
         chosen = {} if trial is None else trial.params
         settings = tuple(f"{key}={as_yaml(v)}" for key, v in chosen.items())
         cells = [Cell(i, (*overrides, *settings), f"t{k:03d}") for i in items]
-        frame = measure_cells(cells, measure, path, measure_rows)
+        frame = measure_cells(cells, measure_pair, path, measure_rows)
         frame["loss"] = pair_loss(frame)
         frame["settings"] = " ".join(f"`{o}`" for o in settings) or "-"
         frames.append(frame)

@@ -19,7 +19,6 @@ from soup_nlp.bench.reference_solver import levenberg_marquardt
 from soup_nlp.bench.study import (
     Cell,
     Item,
-    Overrides,
     failures,
     figure,
     markdown,
@@ -27,6 +26,7 @@ from soup_nlp.bench.study import (
     save,
     titled,
 )
+from soup_nlp.bench.suites import MOTORCYCLE, Options, list_suite
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
@@ -89,54 +89,48 @@ NOTE = (
 # --- the measurement ------------------------------------------------------------------------------
 
 
-def speed_cells(
+def timed_pairs(
     scenes: Sequence[str],
-    sizes: Sequence[int],
-    neighbours: Sequence[int],
     seeds: Sequence[int],
     width: int = 1024,
-    height: int = 436,
+    pairs: Sequence[str] = (),
+    data: Path | None = None,
+) -> list[Item]:
+    """Rendered scenes and the motorcycle, then named pairs of the suite shared, with DIS flow."""
+    rendered = list_suite("rendered", None, Options(("dis",), width, tuple(seeds)))
+    items = [i for i in rendered if i.sequence in scenes]
+    items += [MOTORCYCLE] * (MOTORCYCLE.name in scenes)
+    named = list_suite("shared", data, Options(("dis",), only=tuple(pairs))) if pairs else []
+    return items + [replace(pair, sequence=pair.name) for pair in named]
+
+
+def speed_cells(
+    items: Sequence[Item],
+    sizes: Sequence[int],
+    neighbours: Sequence[int],
     overrides: Sequence[str] = (),
-    pairs: Sequence[Item] = (),
 ) -> list[Cell]:
-    """Timed runs, small sizes first: DIS flow, the NLP without refinement.
+    """Timed runs of pairs over N and K, small N first: the NLP without refinement.
 
-    Args:
-        scenes: Rendered scenes, and motorcycle, which has one seed.
-        sizes: Wanted numbers of superpixels N.
-        neighbours: K of the K-NN graph.
-        seeds: Of the scenes.
-        width: Columns of the rendered images.
-        height: Their rows.
-        overrides: Further overrides.
-        pairs: Pairs of a suite, which are timed as well.
-
-    Raises:
-        ConfigError: an override is wrong.
+    A rendered scene has its seed in the solve as well.
     """
-    cells = []
-    items = []
-    for scene, seed in product(scenes, seeds):
-        size = {"width": width, "height": height}
-        source = {"kind": "scene", "scene": scene, "seed": seed, **size}
-        source = {"kind": scene} if scene == "motorcycle" else source
-        items.append((Item("speed", scene, f"{scene}, seed {seed}", "dis", source), seed))
-    items = [own for own in items if own[0].sequence != "motorcycle" or own[1] == seeds[0]]
-    items += [(replace(pair, sequence=pair.name), seeds[0]) for pair in pairs]
-    for n, k, (item, seed) in product(sorted(sizes), sorted(neighbours), items):
-        settings = (
-            f"segmentation.superpixels={n}",
-            f"segmentation.neighbours={k}",
-            f"seed={seed}",
-            "refine.enabled=false",
-            *overrides,
+    return [
+        Cell(
+            item,
+            (
+                f"segmentation.superpixels={n}",
+                f"segmentation.neighbours={k}",
+                f"seed={item.input.get('seed', 0)}",
+                "refine.enabled=false",
+                *overrides,
+            ),
+            f"N {n}, K {k}",
         )
-        item.problem(settings)
-        cells.append(Cell(item, settings, f"N {n}, K {k}"))
-    return cells
+        for n, k, item in product(sorted(sizes), sorted(neighbours), items)
+    ]
 
 
-def measure_speed(item: Item, overrides: Overrides = (), keep: Path | None = None) -> Row:
+def measure_speed(cell: Cell) -> Row:
     """Solve a problem and measure the cost of every stage.
 
     Returns:
@@ -157,7 +151,7 @@ def measure_speed(item: Item, overrides: Overrides = (), keep: Path | None = Non
         wall[stage], cpu[stage] = (a - b for a, b in zip(now, last, strict=True))
         last[:] = now
 
-    problem = item.problem(overrides)
+    problem = cell.item.problem(cell.overrides)
     case = prepare(problem, on_stage=lap)
     lap("weights")
     solution = solve_soup(case.soup, case.data, case.weights, case.formulation(), case.options)
@@ -173,7 +167,7 @@ def measure_speed(item: Item, overrides: Overrides = (), keep: Path | None = Non
         "k": problem.segmentation.neighbours,
         "sizes": solution.nlp,
         "wall": {**wall, **_parts(wall["nlp"], solution)},
-        "cpu": {**cpu, **solution.cpu_seconds, "compiler": solution.seconds["compile"]},
+        "cpu": cpu,
         "iterations": sum(s.iterations for s in solution.stages),
         "stages": " + ".join(str(s.iterations) for s in solution.stages),
         "status": solution.status,
@@ -217,8 +211,7 @@ def _reference(case: Case) -> Row:
     )
     pair = case.pair
     dense = reconstruct(found.soup, case.segmentation.labels, pair.K_ref, pair.K_next)
-    depths = {"lm": dense.depth_ref}
-    scores = score_depths(pair.truth, depths)
+    scores = score_depths(pair.truth, {"lm": dense.depth_ref})
     return {
         "status": found.status,
         "energy": dict(found.energy),
@@ -276,6 +269,21 @@ def speed_page(frame: pd.DataFrame) -> str:
     facts = {"date": date.today(), **machine()}.items()
     lines += ["", "## Machine", "", *(f"- {k}: {v}" for k, v in facts)]
     return page_text([*lines, *failures(frame)])
+
+
+def write_speed(page: Path, frame: pd.DataFrame) -> None:
+    """Write the page of all rows, and the picture growth.png beside it."""
+    page.write_text(speed_page(frame), encoding="utf-8")
+    plot_growth(page.with_name("growth.png"), frame)
+
+
+def progress_line(row: Row) -> str:
+    """The result of a run as text for the progress line."""
+    reference = row["reference"]
+    return (
+        f"{row['status']}, {row['cpu']['nlp']:.1f} CPU s, E {row['energy']['total']:.4g}; LM"
+        f" {reference['cpu_seconds']:.1f} CPU s, E {reference['energy']['total']:.4g}"
+    )
 
 
 def _conclusion(frame: pd.DataFrame) -> str:

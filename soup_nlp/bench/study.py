@@ -1,8 +1,8 @@
-"""The engine of all benchmarks: cells are measured as rows, rows become a data frame.
+"""The engine of all benchmarks: a study is a list of cells with a measure, its result a data frame.
 
-A cell is a pair under overrides. `measure_cells` measures cells that the file of rows does not hold
-yet, so that an interrupted study can be continued. Nested entries of a row become columns with
-dotted names, such as `metrics.paper.solution.mre`. A table is a pivot of the frame.
+A cell is a pair with a flow, under overrides. `measure_cells` measures cells that the file of rows
+does not hold yet, so that an interrupted study can be continued. Nested entries of a row become
+columns with dotted names, such as `metrics.paper.solution.mre`. A table is a pivot of the frame.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ import pandas as pd
 from soup_nlp.bench.processes import alone
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.storage.files import atomic_path
-from soup_nlp.storage.rows import Job, MeasureRows, Row, attempt, reason
+from soup_nlp.storage.rows import Job, MeasureRows, Row, attempt, measure_all, reason
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,6 +42,7 @@ class Item:
         input: Section `input` of the problem.
         presets: Metric conventions of the scores, the main one first.
         needs: Files that must exist.
+        true_flow: Whether the pair has a true flow that it may be solved with.
     """
 
     suite: str
@@ -51,15 +52,12 @@ class Item:
     input: Mapping[str, Any] = field(repr=False)
     presets: tuple[str, ...] = ("paper",)
     needs: tuple[Path, ...] = field(default=(), repr=False)
+    true_flow: bool = True
 
     @property
     def key(self) -> str:
         """Unique among all suites."""
         return f"{self.suite}/{self.name}/{self.flow}"
-
-    def scored_by(self, presets: Sequence[str] | None) -> Item:
-        """The item with other metric conventions; unchanged if none are given."""
-        return replace(self, presets=tuple(presets)) if presets else self
 
     def problem(self, overrides: Sequence[str] = ()) -> Problem:
         """The problem of the pair with default options and overrides.
@@ -72,9 +70,6 @@ class Item:
 
 
 Overrides = tuple[str, ...]
-Measure = Callable[[Item, Overrides, Path | None], Row]
-"""Makes the row of a pair under overrides; the path is that of `Cell.keep`."""
-Forms = str | Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -94,12 +89,12 @@ class Cell:
     keep: Path | None = field(default=None, compare=False)
 
     def identity(self) -> Row:
-        """Entries that identify the row together with the code version."""
-        try:
-            problem = self.item.problem(self.overrides)
-            settings, source = _hash(problem, NOT_SETTINGS), _hash(problem.input, PATHS)
-        except Exception:
-            settings = source = "wrong"
+        """Entries that identify the row together with the code version.
+
+        Raises:
+            ConfigError: an override is wrong.
+        """
+        problem = self.item.problem(self.overrides)
         return {
             "key": f"{self.item.key} {self.variant}".strip(),
             "suite": self.item.suite,
@@ -109,17 +104,19 @@ class Cell:
             "variant": self.variant,
             "overrides": list(self.overrides),
             "presets": list(self.item.presets),
-            "settings": settings,
-            "input": source,
+            "settings": _hash(problem, NOT_SETTINGS),
+            "input": _hash(problem.input, PATHS),
         }
 
     def job(self, measure: Measure, own_process: bool = False) -> Job:
         """The job of the cell; it can be sent to another process."""
-        work = partial(measure, self.item, self.overrides, self.keep)
+        work = partial(measure, self)
         stale = self.keep is not None and not self.keep.exists()
         return Job(self.identity(), partial(alone if own_process else attempt, work), stale)
 
 
+Measure = Callable[[Cell], Row]
+"""Makes the row of a cell."""
 NOT_SETTINGS = {"name", "base", "preset", "input", "expected"}
 """Keys of a problem that its hash leaves out, so that it is the same for every pair and folder."""
 PATHS = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
@@ -135,7 +132,7 @@ def measure_cells(
     cells: Sequence[Cell],
     measure: Measure,
     path: Path,
-    measure_rows: MeasureRows,
+    measure_rows: MeasureRows = measure_all,
     own_process: bool = False,
 ) -> pd.DataFrame:
     """Measure cells and return the frame of their rows.
@@ -206,18 +203,14 @@ def show(value: Any, form: str = ".4f") -> str:
     return format(value, form) if number else str(value)
 
 
-def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> list[str]:
-    """A Markdown table."""
-    rule = ["---"] + ["---:"] * (len(head) - 1)
-    return ["| " + " | ".join(cells) + " |" for cells in [head, rule, *lines]]
-
-
-def markdown(frame: pd.DataFrame, forms: Forms = ".4f") -> list[str]:
+def markdown(frame: pd.DataFrame, forms: str | Mapping[str, str] = ".4f") -> list[str]:
     """A frame as a Markdown table, its index first; one format, or one for each column."""
     flat = frame.reset_index()
     form = {c: forms if isinstance(forms, str) else forms.get(c, "") for c in flat.columns}
     columns = [[show(v, form[c]) for v in flat[c].tolist()] for c in flat.columns]
-    return table([str(c) for c in flat.columns], zip(*columns, strict=True))
+    rule = ["---"] + ["---:"] * (len(columns) - 1)
+    lines = [map(str, flat.columns), rule, *zip(*columns, strict=True)]
+    return ["| " + " | ".join(cells) + " |" for cells in lines]
 
 
 def titled(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> list[str]:
@@ -268,30 +261,3 @@ def save(out: Figure, path: Path) -> None:
     """Write a figure as PNG file, whole or not at all."""
     with atomic_path(path) as temporary:
         out.savefig(temporary, format="png", metadata={"Software": ""})
-
-
-def plot_lines(path: Path, tables: Mapping[str, pd.DataFrame], axis: str, text: str) -> None:
-    """Lines of tables over their columns: a panel for each table, the mean in black."""
-    picture = figure(4.5 * len(tables) + 1.5, 3.6)
-    axes = picture.subplots(1, len(tables), sharey=True, squeeze=False)[0]
-    for ax, (title, drawn) in zip(axes, tables.items(), strict=True):
-        for name, line in drawn.iterrows():
-            mean = str(name).startswith("mean of")
-            style = {"color": "black", "lw": 2.0} if mean else {"lw": 1.0}
-            ax.plot(range(len(line)), line.to_numpy(float), "o-", ms=3, label=name, **style)
-        names = [str(c) for c in drawn.columns]
-        slanted = {"rotation": 20, "ha": "right"} if len("".join(names)) > 36 else {}
-        ax.set_xticks(range(len(names)), names, size=8, **slanted)
-        ax.set(title=title, xlabel=axis)
-        ax.grid(alpha=0.3)
-    values = np.concatenate([t.to_numpy(float).ravel() for t in tables.values()])
-    values = values[np.isfinite(values)]
-    if values.size and values.min() > 0 and values.max() > 20 * values.min():
-        axes[0].set_yscale("log")
-    else:
-        axes[0].set_ylim(bottom=0)
-    axes[0].set_ylabel("MRE")
-    if values.size:
-        picture.legend(*axes[-1].get_legend_handles_labels(), loc="outside right upper", fontsize=6)
-    picture.suptitle(text, fontsize=10)
-    save(picture, path)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 from soup_nlp.bench.study import Item
 from soup_nlp.data.datasets.benchmarks import DEFAULT_SCENE
@@ -20,6 +20,8 @@ RENDERED = ("street", "room", "sheet", "orbit", "still", "banner")
 PAPER, SINTEL = ("paper", "best"), ("sintel70", "paper", "best")
 KITTI, KITTI_SHARED = ("kitti", "eigen80", "best"), ("kitti", "best", "eigen80")
 """Metric conventions, the main one first."""
+MOTORCYCLE = Item("shared", "motorcycle", "motorcycle", "dis", {"kind": "motorcycle"}, PAPER)
+"""The real pair that needs no data; it comes with scikit-image."""
 SINTEL_FRAMES = MappingProxyType(
     {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}
 )
@@ -33,35 +35,16 @@ class Options:
     """Filters and variants of the list of a suite.
 
     Attributes:
-        flows: Flow sources; None for those of the suite.
+        flows: Flow sources; empty for those of the suite.
         width: Columns of suite rendered, 436 rows per 1024; everyday is 640 x 480 at 1024.
         seeds: Seeds of rendered scenes.
-        limit: Most pairs, evenly spaced, each with every flow; None for all.
         only: Keep pairs whose names contain one of these words; empty for all.
     """
 
-    flows: tuple[str, ...] | None = None
+    flows: tuple[str, ...] = ()
     width: int = 1024
     seeds: tuple[int, ...] = (0,)
-    limit: int | None = None
     only: tuple[str, ...] = ()
-
-
-class Entry(NamedTuple):
-    """A pair of a suite with fields of `Item`; empty `presets` stand for those of the suite.
-
-    `true_flow` says whether the pair has a true flow that it may be solved with.
-    """
-
-    sequence: str
-    name: str
-    input: Mapping[str, Any]
-    needs: tuple[Path, ...] = ()
-    true_flow: bool = True
-    presets: tuple[str, ...] = ()
-
-
-Entries = Iterator[Entry]
 
 
 def spread(count: int, wanted: int, first: int = 0) -> list[int]:
@@ -72,56 +55,67 @@ def spread(count: int, wanted: int, first: int = 0) -> list[int]:
 
 # --- pairs ----------------------------------------------------------------------------------------
 
+Items = Iterator[Item]
 
-def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: Options) -> Entries:
+
+def _item(
+    sequence: str, name: str, raw: Mapping[str, Any], needs: Sequence[Path] = (), **more: Any
+) -> Item:
+    """A pair whose suite, flow and, unless given, conventions are added by its suite."""
+    return Item("", sequence, name, "", raw, **({"presets": ()} | more), needs=tuple(needs))
+
+
+def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: Options) -> Items:
     """Rendered scenes with all seeds; columns and rows are relative to the width."""
     width, height = max(64, int(o.width * columns)), max(48, round(o.width * rows))
     for seed in o.seeds:
         for scene in scenes:
             raw = {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height}
-            yield Entry(scene, f"{scene}-s{seed}-{width}x{height}", raw)
+            yield _item(scene, f"{scene}-s{seed}-{width}x{height}", raw)
 
 
-def _folder(family: str, path: Path, true_flow: bool = False, **more: Any) -> Entry:
+def _folder(path: Path, family: str = "", kind: str = "folder", **more: Any) -> Item:
     """A pair in a folder with frame_0.png, named by its family and folder."""
     name = " ".join(dict.fromkeys([family, path.name.removeprefix("pair_")]))
     presets = KITTI_SHARED if family == "kitti2015" else ()
-    raw = {"kind": "folder", "path": str(path), **more}
-    return Entry(family, name, raw, (path / "frame_0.png",), true_flow, presets)
+    true_flow = family in ("kitti2015", "driving_synthetic")
+    raw = {"kind": kind, "path": str(path), **more}
+    needs = [path / "frame_0.png"]
+    return _item(family, name, raw, needs, true_flow=true_flow, presets=presets)
 
 
-def _shared(root: Path, o: Options) -> Entries:
+def _shared(root: Path, o: Options) -> Items:
     """The real pairs that development used, by family, the motorcycle first."""
-    yield Entry("motorcycle", "motorcycle", {"kind": "motorcycle"})
+    yield MOTORCYCLE
     for index in ("000138", "000027"):
         raw = {"kind": "kitti2012", "root": str(root / "kitti2012"), "index": index}
         image = root / "kitti2012" / "training" / "image_0" / f"{index}_10.png"
-        yield Entry("kitti2012", f"kitti2012 {index}", raw, (image,), True, KITTI_SHARED)
-    yield _folder("driving_synthetic", root / "driving_synthetic", True)
+        yield _item("kitti2012", f"kitti2012 {index}", raw, [image], presets=KITTI_SHARED)
+    yield _folder(root / "driving_synthetic", "driving_synthetic")
     for path in sorted((root / "kinect_paper").glob("pair_*")):
-        yield _folder("kinect_paper", path, unit="mm")
+        yield _folder(path, "kinect_paper", unit="mm")
     raw = {"kind": "sintel", "root": str(root / "sintel"), "scene": "alley_1"}
     image = root / "sintel" / "training" / "clean" / "alley_1" / "frame_0020.png"
     alley = {**raw, "frame": 20, "step": 5}
-    yield Entry("sintel", "sintel alley_1-0020+5", alley, (image,), False, SINTEL)
-    tum = _folder("tum_fr1", root / "tum_fr1")
-    yield tum._replace(input={**tum.input, "kind": "tum"})
+    apart = {"true_flow": False, "presets": SINTEL}
+    yield _item("sintel", "sintel alley_1-0020+5", alley, [image], **apart)
+    yield _folder(root / "tum_fr1", "tum_fr1", kind="tum")
     for path in sorted((root / "kitti2015").glob("pair_*")):
-        yield _folder("kitti2015", path, True)
+        yield _folder(path, "kitti2015")
     track = root / "kitti_tracking"
     for k in range(4):
         names = {"ref": f"frame_{k}.png", "next": f"frame_{k + 1}.png", "intrinsics": "K.txt"}
         names |= {"depth": f"depth_{k}.png", "depth_next": f"depth_{k + 1}.png"}
         files = {key: str(track / name) for key, name in names.items()}
         source = {"kind": "files", **files, "depth_scale": 256.0}
-        needs = (track / names["next"],)
-        yield Entry("kitti_tracking", f"kitti_tracking {k}", source, needs, False)
+        needs = [track / names["next"]]
+        yield _item("kitti_tracking", f"kitti_tracking {k}", source, needs, true_flow=False)
     for family, pattern, scale in (("rgbd", "*", 5000.0), ("deepdeform", "pair_*", 1000.0)):
         for path in sorted((root / family).glob(pattern)):
-            yield _folder(family, path, depth_scale=scale)
+            yield _folder(path, family, depth_scale=scale)
 
 
-def _sintel(root: Path, o: Options) -> Entries:
+def _sintel(root: Path, o: Options) -> Items:
     """Pairs of the five sequences: the paper has 120 but does not name them, so 24 of each."""
     base = root / "training" if is_folder(root / "training") else root
     for scene, frames in SINTEL_FRAMES.items():
@@ -132,18 +126,18 @@ def _sintel(root: Path, o: Options) -> Entries:
             if scene != DEFAULT_SCENE:
                 # the loader has a default camera for one scene only
                 needs += [base / "camdata_left" / f"{name}.cam" for name in names]
-            yield Entry(scene, f"{scene}-{frame:04d}", raw, tuple(needs))
+            yield _item(scene, f"{scene}-{frame:04d}", raw, needs)
 
 
-def _kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Entries:
+def _kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Items:
     """Training pairs of KITTI 2012 or 2015."""
     base = root / "training" if is_folder(root / "training") else root
     for index in (f"{k:06d}" for k in range(count)):
-        needs = tuple(base / camera / f"{index}_{frame}.png" for frame in (10, 11))
-        yield Entry(kind, index, {"kind": kind, "root": str(root), "index": index}, needs)
+        needs = [base / camera / f"{index}_{frame}.png" for frame in (10, 11)]
+        yield _item(kind, index, {"kind": kind, "root": str(root), "index": index}, needs)
 
 
-def _vkitti(root: Path, o: Options) -> Entries:
+def _vkitti(root: Path, o: Options) -> Items:
     """Morning pairs of version 1 or 2: the paper has 120 but does not name them, so 30 a world."""
     second = is_folder(root / "Scene01") or is_folder(root / "Scene02")
     parts = sorted(root.glob("vkitti_*_rgb")) or [root / "vkitti_1.3.1_rgb"]
@@ -154,16 +148,16 @@ def _vkitti(root: Path, o: Options) -> Entries:
         if second:
             folder, name = root / scene / "morning/frames/rgb/Camera_0", "rgb_{:05d}.jpg"
         for frame in spread(frames - 1, 30):
-            needs = tuple(folder / name.format(frame + k) for k in (0, 1))
+            needs = [folder / name.format(frame + k) for k in (0, 1)]
             source = {**raw, "scene": scene, "frame": frame}
-            yield Entry(f"{world}_morning", f"{world}_morning-{frame:05d}", source, needs)
+            yield _item(f"{world}_morning", f"{world}_morning-{frame:05d}", source, needs)
 
 
-def _kinect(root: Path, o: Options) -> Entries:
+def _kinect(root: Path, o: Options) -> Items:
     """Every folder pair_*."""
     for pair in sorted(root.glob("pair_*")):
         raw = {"kind": "folder", "path": str(pair), "unit": "mm", "depth_scale": 1.0}
-        yield Entry("", pair.name, raw, (pair / "frame_0.png",))
+        yield _item("", pair.name, raw, [pair / "frame_0.png"])
 
 
 # --- suites ---------------------------------------------------------------------------------------
@@ -176,7 +170,7 @@ class Suite:
     Attributes:
         name: Name on the command line.
         text: Description.
-        entries: Makes the pairs of a root folder.
+        pairs: Makes the pairs of a root folder.
         flows: Default flow sources.
         presets: Metric conventions, the main one first.
         folders: Candidates for the root below --data; the first one with a pair is used.
@@ -186,22 +180,23 @@ class Suite:
 
     name: str
     text: str
-    entries: Callable[[Path, Options], Iterable[Entry]]
+    pairs: Callable[[Path, Options], Iterable[Item]]
     flows: tuple[str, ...] = ("dis",)
     presets: tuple[str, ...] = PAPER
     folders: tuple[str, ...] = (".",)
     layout: str = ""
     source: str = ""
 
-    def items(self, root: Path, o: Options) -> Iterator[Item]:
+    def items(self, root: Path, o: Options) -> Items:
         """Every wanted pair with every flow, whether its files exist or not."""
-        for e in self.entries(root, o):
-            if o.only and not any(word in e.name for word in o.only):
+        for pair in self.pairs(root, o):
+            presets, sequence = pair.presets or self.presets, pair.sequence or self.name
+            own = replace(pair, suite=self.name, sequence=sequence, presets=presets)
+            if o.only and not any(word in pair.name for word in o.only):
                 continue
             for flow in o.flows or self.flows:
-                if e.true_flow or not flow.startswith("truth"):
-                    sequence, presets = e.sequence or self.name, e.presets or self.presets
-                    yield Item(self.name, sequence, e.name, flow, e.input, presets, e.needs)
+                if pair.true_flow or not flow.startswith("truth"):
+                    yield replace(own, flow=flow)
 
 
 _ALL = (
@@ -296,32 +291,8 @@ SUITES: Mapping[str, Suite] = MappingProxyType({s.name: s for s in _ALL})
 """Suites by name."""
 
 
-@dataclass(frozen=True)
-class Listing:
-    """The available pairs of a suite.
-
-    Attributes:
-        suite: The suite.
-        items: One item for each pair and flow.
-        left_out: Number of available pairs that a limit leaves out.
-        missing: Number of pairs in the filtered list of the suite that do not exist.
-    """
-
-    suite: Suite
-    items: tuple[Item, ...]
-    left_out: int = 0
-    missing: int = 0
-
-    def __str__(self) -> str:
-        pairs = len({i.name for i in self.items})
-        rows = f" ({len(self.items)} rows)" if len(self.items) > pairs else ""
-        limit = f", {self.left_out} left out by the limit" if self.left_out else ""
-        lack = f", {self.missing} of the list are not in the folder" if self.missing else ""
-        return f"suite {self.suite.name}: {pairs} pairs{rows}{limit}{lack}"
-
-
-def list_suite(name: str, data: Path | None = None, options: Options | None = None) -> Listing:
-    """The available pairs of a suite.
+def list_suite(name: str, data: Path | None = None, options: Options | None = None) -> list[Item]:
+    """The available pairs of a suite, each with every flow.
 
     `data` is the root folder of the dataset, or a folder that holds it.
 
@@ -338,11 +309,7 @@ def list_suite(name: str, data: Path | None = None, options: Options | None = No
         listed = list(suite.items(Path(os.path.realpath(root / folder)), o))
         here = [i for i in listed if all(is_file(f) for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):
-            names = list(dict.fromkeys(i.name for i in here))
-            kept = names if o.limit is None else [names[k] for k in spread(len(names), o.limit)]
-            items = tuple(i for i in here if i.name in kept)
-            missing = len({i.name for i in listed}) - len(names)
-            return Listing(suite, items, len(names) - len(kept), missing)
+            return here
     if o.only and not listed and (not suite.layout or is_folder(root)):
         raise DataError(
             "no pair of the suite has such a name", where=f"suite {name}", found=", ".join(o.only)

@@ -15,7 +15,6 @@ import pandas as pd
 from soup_nlp.bench.study import (
     Cell,
     Item,
-    Overrides,
     failures,
     markdown,
     page_text,
@@ -60,20 +59,19 @@ def sequences(data: Path | None) -> list[Item]:
     folder = (data or Path()).resolve() / "kitti_tracking"
     if data is not None and folder.is_dir():
         images = tuple(find_images(folder))
-        files = {"ref": str(images[0]), "next": str(images[1]), "intrinsics": str(folder / "K.txt")}
-        source = {"kind": "files", **files}
+        source = {"kind": "files", "ref": str(images[0]), "next": str(images[1])}
+        source["intrinsics"] = str(folder / "K.txt")
         out.append(Item("shared", folder.name, folder.name, "dis", source, needs=images))
     return out
 
 
-def measure_chain(
-    item: Item, overrides: Overrides = (), keep: Path | None = None, *, frames: int = 10
-) -> Row:
+def measure_chain(cell: Cell, frames: int = 10) -> Row:
     """Errors of a sequence with a scale for every frame and with one for all.
 
     Raises:
         DataError: the sequence has no truth.
     """
+    item = cell.item
     source = scene_frames(item.sequence, frames)
     if item.needs:
         images = list(item.needs[:frames])
@@ -81,7 +79,7 @@ def measure_chain(
         source = Frames(tuple(map(str, images)), camera, find_depths(images), 256.0)
     with scratch() as folder:
         which = [(k, k + 1) for k in range(len(source) - 1)]
-        chain = make_chain(solve_pairs(source, which, folder, overrides))
+        chain = make_chain(solve_pairs(source, which, folder, cell.overrides))
         seconds = {row["key"]: row["cpu_seconds"] for row in read_rows(folder / ROWS)}
     found = score(chain)
     if found is None:
@@ -125,20 +123,12 @@ TABLES = {
 
 def cost_cells() -> list[Cell]:
     """Rendered streets with the default options, small ones first."""
-    return [
-        Cell(
-            Item(
-                "cost",
-                "street",
-                f"street {width} x {height}",
-                "dis",
-                {"kind": "scene", "scene": "street", "width": width, "height": height},
-            ),
-            (f"segmentation.superpixels={n}",),
-            f"N = {n}",
-        )
-        for (width, height), n in product(SIZES, SUPERPIXELS)
-    ]
+    cells = []
+    for (width, height), n in product(SIZES, SUPERPIXELS):
+        source = {"kind": "scene", "scene": "street", "width": width, "height": height}
+        item = Item("rendered", "street", f"street {width} x {height}", "dis", source)
+        cells.append(Cell(item, (f"segmentation.superpixels={n}",), f"N = {n}"))
+    return cells
 
 
 def cost_page(frame: pd.DataFrame) -> str:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import pandas as pd
 import typer
@@ -16,10 +15,10 @@ from soup_nlp.bench import search as searching
 from soup_nlp.bench import speed as timing
 from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.accuracy_page import write_suite
-from soup_nlp.bench.paper import ALL_SECTIONS, FAMILIES, Sizes, make_plan, measure_paper
-from soup_nlp.bench.paper_page import FILES, write_page
-from soup_nlp.bench.study import Cell, Measure, measure_cells, show
-from soup_nlp.bench.suites import SUITES, Options, list_suite
+from soup_nlp.bench.paper import make_plan, measure_paper
+from soup_nlp.bench.paper_page import FILES, write_paper
+from soup_nlp.bench.study import Cell, measure_cells, show
+from soup_nlp.bench.suites import MOTORCYCLE, RENDERED, SUITES, Options, list_suite
 from soup_nlp.bench.tables import chain_page, cost_cells, cost_page, measure_chain, sequences
 from soup_nlp.cli.options import (
     AnyCode,
@@ -30,18 +29,17 @@ from soup_nlp.cli.options import (
     RowProgress,
     Set,
     Workers,
+    listed,
     numbers,
     words,
 )
-from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.errors import ConfigError
-from soup_nlp.evaluate.protocols import preset
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SIDE, MAX_SUPERPIXELS
 from soup_nlp.storage.files import write_text
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.rows import Row, measure_all
+from soup_nlp.storage.rows import MeasureRows, Row, measure_all
 
-SuiteName = Annotated[
+Suites = Annotated[
     list[str] | None, typer.Option("--suite", help=f"{', '.join(SUITES)}; may be repeated.")
 ]
 Flow = Annotated[
@@ -50,16 +48,71 @@ Flow = Annotated[
 Only = Annotated[list[str] | None, typer.Option(help="Only pairs whose name holds this word.")]
 Width = Annotated[int, typer.Option(help="Columns of rendered scenes.", min=64, max=MAX_SIDE)]
 Seeds = Annotated[str, typer.Option(help="Seeds of rendered scenes, such as 0,1,2.")]
+SIZES: Mapping[str, Any] = {"min": 2, "max": MAX_SUPERPIXELS}
+Measured = Callable[[Path, MeasureRows], pd.DataFrame]
+"""Measures the rows of a study into a file and returns their frame."""
+Write = Callable[[Path, pd.DataFrame], None]
+"""Writes the page of a frame, and its pictures beside it."""
+
+
+def _study(
+    page: Path,
+    measured: Measured,
+    write: Write,
+    quiet: bool,
+    overwrite: bool,
+    files: Sequence[str] = (),
+    result_of: Callable[[Row], str] | None = None,
+    **options: Any,
+) -> int:
+    """Measure the rows of a study, write and print its page; 1 if a row failed.
+
+    Args:
+        page: The page; its rows are in a .jsonl beside it.
+        measured: See Measured.
+        write: See Write.
+        quiet: Print no progress.
+        overwrite: Also over files of the user.
+        files: Further files that are written.
+        result_of: Text of a row for the progress line; by default its MRE.
+        options: Further options of `measure_all`.
+    """
+    claim(page.parent, [page.name, *files], overwrite)
+    say = RowProgress(quiet, result_of or mre_of)
+    frame = measured(page.with_suffix(".jsonl"), partial(measure_all, say=say, **options))
+    with staged(page.parent) as new:
+        write(new / page.name, frame)
+    print(page.read_text(encoding="utf-8"))
+    print(f"files       {page.parent}/: {', '.join([page.name, *files])}")
+    return int(frame["ok"].ne(True).any())
+
+
+def _text(page_of: Callable[[pd.DataFrame], str]) -> Write:
+    """Writes a page without pictures."""
+    return lambda path, frame: write_text(path, page_of(frame))
 
 
 def mre_of(row: Row) -> str:
     """The main error of a row as text for the progress line."""
-    own = row["metrics"].get(row["presets"][0], {}).get("solution", {}).get("mre")
-    return "MRE -" if own is None else f"MRE {own:.4f}"
+    return f"MRE {show(row['metrics'].get(row['presets'][0], {}).get('solution', {}).get('mre'))}"
+
+
+def _wanted(flow: list[str] | None, width: int, seeds: str, only: list[str] | None) -> Options:
+    chosen = tuple(numbers(seeds, "--seeds"))
+    return Options(tuple(flow or ()), width, chosen, tuple(only or ()))
+
+
+def _command(name: str, data: Path | None, given: Mapping[str, Any]) -> str:
+    """A command as text, without the place of its data; an option may have several values."""
+    said = ["--data DIR"] * (data is not None)
+    for key, value in given.items():
+        values = value if isinstance(value, list) else [] if value is None else [value]
+        said += [f"--{key} {shlex.quote(str(item))}" for item in values]
+    return f"soup-nlp bench {name} {' '.join(said)}"
 
 
 def accuracy(
-    suite: SuiteName = None,
+    suite: Suites = None,
     data: Data = None,
     out: Out = Path("out/bench/accuracy"),
     overrides: Set = None,
@@ -67,14 +120,7 @@ def accuracy(
     width: Width = 1024,
     seeds: Seeds = "0",
     only: Only = None,
-    limit: Annotated[
-        int | None, typer.Option(help="At most this many pairs a suite.", min=1)
-    ] = None,
     workers: Workers = 1,
-    folders: Annotated[Path | None, typer.Option(help="Keep every result folder here.")] = None,
-    conventions: Annotated[
-        list[str] | None, typer.Option("--preset", help="Metric convention; may be repeated.")
-    ] = None,
     name: Annotated[str, typer.Option(help="Name of the files of one suite.")] = "",
     any_code: AnyCode = False,
     overwrite: Overwrite = False,
@@ -84,70 +130,33 @@ def accuracy(
     if not suite:
         print("\n".join(f"{entry.name:<14} {entry.text}" for entry in SUITES.values()))
         raise ConfigError("no suite was named", where="--suite", expected=", ".join(SUITES))
-    for convention in conventions or []:
-        preset(convention)
     if name and len(suite) > 1:
         raise ConfigError("one name for several suites", where="--name", found=", ".join(suite))
-    wanted = _wanted(flow, width, numbers(seeds, "--seeds"), only, limit)
-    listings = [list_suite(known, data, wanted) for known in suite]
-    progress, changes = RowProgress(quiet, mre_of), tuple(overrides or ())
-    measure_rows = partial(measure_all, workers=workers, say=progress, any_code=any_code)
-    names = [name or listing.suite.name for listing in listings]
-    claim(out, [f"{own}.{kind}" for own in names for kind in ("md", "png")], overwrite)
-    for listing, own in zip(listings, names, strict=True):
-        if not quiet:
-            print(listing, file=sys.stderr)
-        cells = [
-            Cell(
-                item.scored_by(conventions),
-                changes,
-                keep=folders / item.key.replace(" ", "_") if folders else None,
-            )
-            for item in listing.items
-        ]
-        frame = measure_cells(cells, measure_pair, out / f"{own}.jsonl", measure_rows)
-        note = f"Suite `{listing.suite.name}`: {listing.suite.text}. Overrides of every pair: "
+    wanted, changes = _wanted(flow, width, seeds, only), tuple(overrides or ())
+    cells = {own: [Cell(i, changes) for i in list_suite(own, data, wanted)] for own in suite}
+    # check all names before the first suite is measured
+    claim(out, [f"{name or own}.{kind}" for own in cells for kind in ("md", "png")], overwrite)
+    codes = []
+    for own in cells:
+        note = f"Suite `{own}`: {SUITES[own].text}. Overrides of every pair: "
         note += f"{', '.join(f'`{o}`' for o in changes) or 'none'}."
-        with staged(out) as new:
-            write_suite(new, own, frame, note)
-        _print_page(out / f"{own}.md")
-    raise typer.Exit(1 if progress.failed else 0)
-
-
-def _wanted(
-    flow: list[str] | None,
-    width: int,
-    seeds: Sequence[int],
-    only: list[str] | None,
-    limit: int | None = None,
-) -> Options:
-    flows = tuple(flow) if flow else None
-    return Options(flows, width, tuple(dict.fromkeys(seeds)), limit, tuple(only or ()))
-
-
-def _command(
-    name: str, data: Path | None, overrides: list[str] | None, given: Mapping[str, Any]
-) -> str:
-    """A command as text, without the place of its data; an option may have several values."""
-    said = ["--data DIR"] * (data is not None)
-    for key, value in (*given.items(), ("set", overrides)):
-        values = value if isinstance(value, list) else [] if value is None else [value]
-        said += [f"--{key} {shlex.quote(str(item))}" for item in values]
-    return f"soup-nlp bench {name} {' '.join(said)}"
-
-
-def _failed(frame: pd.DataFrame) -> int:
-    """Number of runs that failed."""
-    return int(frame["ok"].ne(True).sum())
-
-
-def _print_page(page: Path) -> None:
-    print(page.read_text(encoding="utf-8"))
-    print(f"files       {page.parent}/{page.stem}.*")
+        codes.append(
+            _study(
+                out / f"{name or own}.md",
+                partial(measure_cells, cells[own], measure_pair),
+                partial(write_suite, note=note),
+                quiet,
+                overwrite,
+                [f"{name or own}.png"],
+                workers=workers,
+                any_code=any_code,
+            )
+        )
+    raise typer.Exit(max(codes))
 
 
 def search(
-    suite: SuiteName = None,
+    suite: Suites = None,
     data: Data = None,
     out: Out = Path("out/bench/accuracy"),
     params: Annotated[
@@ -155,7 +164,6 @@ def search(
         typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH or KEY=choice:A:B instead."),
     ] = None,
     trials: Annotated[int, typer.Option(help="Configurations beside the default.", min=1)] = 24,
-    seed: Annotated[int, typer.Option(help="Of the trials.", min=0)] = 0,
     seeds: Seeds = "0,1",
     overrides: Set = None,
     flow: Flow = None,
@@ -167,53 +175,32 @@ def search(
     quiet: Quiet = False,
 ) -> None:
     """Search for better defaults and check them on the families that did not choose them."""
-    wanted = _wanted(flow, width, numbers(seeds, "--seeds"), only)
-    texts = params or searching.DEFAULT_SPACE
-    space = searching.parse_space(texts)
-    items = [i for name in suite or ["rendered"] for i in list_suite(name, data, wanted).items]
-    claim(out, ["search.md"], overwrite)
-    progress = RowProgress(quiet, mre_of)
-    frame: pd.DataFrame = searching.search(
-        space,
-        items,
-        out / "search.jsonl",
-        partial(measure_all, workers=workers, say=progress, any_code=any_code),
-        trials=trials,
-        seed=seed,
-        overrides=tuple(overrides or ()),
+    suites, texts = suite or ["rendered"], params or searching.DEFAULT_SPACE
+    wanted, space = _wanted(flow, width, seeds, only), searching.parse_space(texts)
+    items = [i for name in suites for i in list_suite(name, data, wanted)]
+    given = {"suite": suites, "trials": trials, "seeds": seeds, "width": width, "flow": flow}
+    command = _command("search", data, {**given, "only": only, "set": overrides})
+    changes = tuple(overrides or ())
+    code = _study(
+        out / "search.md",
+        partial(searching.search, space, items, trials=trials, overrides=changes),
+        _text(partial(searching.search_page, space=texts, command=command)),
+        quiet,
+        overwrite,
+        workers=workers,
+        any_code=any_code,
     )
-    given = {"suite": suite or ["rendered"], "trials": trials, "seed": seed, "seeds": seeds}
-    given |= {"width": width, "flow": flow, "only": only}
-    command = _command("search", data, overrides, given)
-    with staged(out) as new:
-        write_text(new / "search.md", searching.search_page(frame, texts, command))
-    _print_page(out / "search.md")
-    raise typer.Exit(1 if progress.failed else 0)
+    raise typer.Exit(code)
 
 
 def paper(
     data: Data = None,
     out: Out = Path("results/paper"),
-    superpixels: Annotated[
-        int, typer.Option(help="Superpixels of the comparison.", min=2, max=MAX_SUPERPIXELS)
-    ] = 1000,
-    analysis: Annotated[
-        int, typer.Option(help="Superpixels of the other sections.", min=2, max=MAX_SUPERPIXELS)
-    ] = 500,
+    superpixels: Annotated[int, typer.Option(help="N of the comparison.", **SIZES)] = 1000,
+    analysis: Annotated[int, typer.Option(help="N of the other sections.", **SIZES)] = 500,
     limit: Annotated[
         int | None, typer.Option(help="At most this many pairs a dataset.", min=1)
     ] = None,
-    families: Annotated[
-        str, typer.Option(help=f"Pairs of the sections: {', '.join(FAMILIES)}.")
-    ] = ",".join(Sizes.families),
-    departures: Annotated[
-        str, typer.Option(help="Pairs of the departures, by the same names.")
-    ] = ",".join(Sizes.departures),
-    width: Width = 1024,
-    sections: Annotated[
-        str,
-        typer.Option(help=f"Of {', '.join(ALL_SECTIONS)}; the comparison is always there."),
-    ] = ",".join(ALL_SECTIONS),
     overrides: Set = None,
     workers: Workers = 1,
     any_code: AnyCode = False,
@@ -221,26 +208,24 @@ def paper(
     quiet: Quiet = False,
 ) -> None:
     """The paper's tables and figures by `preset: paper` and the defaults; can be continued."""
-    sizes = Sizes(
-        superpixels=superpixels,
-        analysis=analysis,
-        limit=limit,
-        width=width,
-        families=tuple(words(families, "--families", list(FAMILIES))),
-        departures=tuple(words(departures, "--departures", list(FAMILIES))),
-        overrides=tuple(overrides or ()),
-        sections=tuple(words(sections, "--sections", list(ALL_SECTIONS))),
-    )
-    given = {"superpixels": superpixels, "analysis": analysis, "families": families}
-    given |= {"width": width, "sections": sections, "departures": departures, "limit": limit}
+    changes = tuple(overrides or ())
     claim(out, FILES, overwrite)
-    plan, progress = make_plan(data, sizes, out), RowProgress(quiet, mre_of)
-    run = partial(measure_all, workers=workers, say=progress, any_code=any_code)
-    frame = measure_cells(plan.cells(), measure_paper, out / "paper.jsonl", run)
-    with staged(out) as new:
-        write_page(new, plan, frame, _command("paper", data, overrides, given))
-    print(f"files       {out}/: {', '.join(FILES)}")
-    raise typer.Exit(1 if _failed(frame) else 0)
+    plan = make_plan(data, out, superpixels, analysis, limit, changes)
+    given = {"superpixels": superpixels, "analysis": analysis, "limit": limit, "set": overrides}
+    note = f"Superpixels wanted: {superpixels} in the comparison, {analysis} elsewhere."
+    if changes:
+        note += f" Overrides of every row: {', '.join(f'`{o}`' for o in changes)}."
+    code = _study(
+        out / FILES[0],
+        partial(measure_cells, list(plan.drop_duplicates("key")["cell"]), measure_paper),
+        partial(write_paper, plan=plan, command=_command("paper", data, given), note=note),
+        quiet,
+        overwrite,
+        FILES[1:],
+        workers=workers,
+        any_code=any_code,
+    )
+    raise typer.Exit(code)
 
 
 def speed(
@@ -251,82 +236,40 @@ def speed(
         str, typer.Option("--superpixels", "--sizes", help="Superpixels N.")
     ] = "250,500,1000,2000",
     neighbours: Annotated[str, typer.Option(help="K of the K-NN graph.")] = "10,15,20",
-    seeds: Annotated[str, typer.Option(help="Seeds of the rendered scenes.")] = "0,1",
+    seeds: Seeds = "0,1",
     pairs: Annotated[
-        str | None, typer.Option(help="Pairs of the suite shared, comma separated.")
-    ] = None,
+        str, typer.Option(help="Pairs of the suite shared, comma separated words of their names.")
+    ] = "",
     data: Data = None,
     width: Width = 1024,
-    height: Annotated[
-        int, typer.Option(help="Rows of rendered scenes.", min=48, max=MAX_SIDE)
-    ] = 436,
     overrides: Set = None,
     out: Out = Path("out/bench/speed"),
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
-    chosen = Options(flows=("dis",), only=tuple((pairs or "").split(",")))
-    cells = timing.speed_cells(
-        words(scenes, "--scenes", [*SCENES, "motorcycle"]),
-        numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS),
-        numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS),
-        numbers(seeds, "--seeds"),
-        width,
-        height,
-        overrides or [],
-        list_suite("shared", data, chosen).items if pairs else (),
-    )
-    claim(out, ("table.md", "growth.png"), overwrite)
-    run = partial(measure_all, say=RowProgress(quiet, _result_of))
-    frame = measure_cells(cells, timing.measure_speed, out / "table.jsonl", run, own_process=True)
-    with staged(out) as new:
-        write_text(new / "table.md", timing.speed_page(frame))
-        timing.plot_growth(new / "growth.png", frame)
-    bad = _failed(frame)
-    print(f"{len(frame)} runs, {bad} failed, in {out / 'table.md'}")
-    raise typer.Exit(1 if bad else 0)
-
-
-def _result_of(row: Row) -> str:
-    """The result of a run as text for the progress line."""
-    reference = row["reference"]
-    return (
-        f"{row['status']}, {row['cpu']['nlp']:.1f} CPU s, {row['iterations']} iterations,"
-        f" E {row['energy']['total']:.4g}; LM {reference['cpu_seconds']:.1f} CPU s,"
-        f" E {reference['energy']['total']:.4g}"
-    )
+    chosen = words(scenes, "--scenes", [*RENDERED, MOTORCYCLE.name])
+    items = timing.timed_pairs(chosen, numbers(seeds, "--seeds"), width, listed(pairs), data)
+    n = numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS)
+    k = numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS)
+    cells = timing.speed_cells(items, n, k, overrides or [])
+    measured = partial(measure_cells, cells, timing.measure_speed, own_process=True)
+    page, files = out / "table.md", ["growth.png"]
+    write, line = timing.write_speed, timing.progress_line
+    raise typer.Exit(_study(page, measured, write, quiet, overwrite, files, line))
 
 
 def cost(
     out: Out = Path("out/bench/speed"), overwrite: Overwrite = False, quiet: Quiet = False
 ) -> None:
     """Time and memory of whole solves over N and image size, each in a process of its own."""
-    claim(out, ("cost.md",), overwrite)
-    say = RowProgress(quiet, lambda row: f"{show(row['seconds'], '.0f')} s")
-    _measure(cost_cells(), measure_pair, say, out / "cost.md", cost_page)
-
-
-def _measure(
-    cells: list[Cell],
-    measure: Measure,
-    say: RowProgress,
-    path: Path,
-    page: Callable[[pd.DataFrame], str],
-) -> NoReturn:
-    """Measure cells in processes of their own, write and print their page, and exit."""
-    run = partial(measure_all, say=say)
-    frame = measure_cells(cells, measure, path.with_suffix(".jsonl"), run, own_process=True)
-    with staged(path.parent) as new:
-        write_text(new / path.name, page(frame))
-    print(path.read_text(encoding="utf-8"))
-    raise typer.Exit(1 if _failed(frame) else 0)
+    measured = partial(measure_cells, cost_cells(), measure_pair, own_process=True)
+    raise typer.Exit(_study(out / "cost.md", measured, _text(cost_page), quiet, overwrite))
 
 
 def chain(
     data: Data = None,
     only: Only = None,
-    frames: Annotated[int, typer.Option(help="Most frames of a sequence.", min=3)] = 10,
     overrides: Set = None,
     out: Out = Path("out/bench/accuracy"),
     overwrite: Overwrite = False,
@@ -338,7 +281,8 @@ def chain(
     if not chosen:
         names = ", ".join(i.name for i in known)
         raise ConfigError("no sequence is left", where="--only", expected=names)
-    claim(out, ("chain.md",), overwrite)
-    cells = [Cell(item, tuple(overrides or ()), f"{frames} frames") for item in chosen]
-    say = RowProgress(quiet, lambda row: f"cost of one scale {show(row['cost'], '+.2%')}")
-    _measure(cells, partial(measure_chain, frames=frames), say, out / "chain.md", chain_page)
+    cells = [Cell(item, tuple(overrides or ())) for item in chosen]
+    measured = partial(measure_cells, cells, measure_chain, own_process=True)
+    page, write = out / "chain.md", _text(chain_page)
+    line = lambda row: f"cost of one scale {show(row['cost'], '+.2%')}"  # noqa: E731
+    raise typer.Exit(_study(page, measured, write, quiet, overwrite, result_of=line))

@@ -10,8 +10,7 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import RowProgress, SolveLog
-from soup_nlp.errors import StoppedError
+from soup_nlp.cli.options import RowProgress, SolveLog, resumable
 from soup_nlp.sequence.folder import CHAIN, SINGLE
 from soup_nlp.sequence.frames import Frames
 from soup_nlp.sequence.score import chain_lines
@@ -71,30 +70,24 @@ def chain(
         "segmentation.neighbours": neighbours,
         "max_size": max_size,
     }
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = SolveLog(quiet).warn
-            done = solve_chain(
-                frames_of,
-                out,
-                intrinsics=options.camera(intrinsics, "--intrinsics"),
-                fov=fov,
-                undistort=undistort,
-                stride=stride,
-                most=frames,
-                two_frame=two_frame,
-                depth_scale=depth_scale,
-                overrides=options.changed(preset, overrides, short),
-                workers=workers,
-                overwrite=overwrite,
-                begin=begin,
-                say=RowProgress(quiet),
-            )
-    except KeyboardInterrupt:
-        raise StoppedError(
-            "interrupted: the pairs that were finished are kept",
-            where=f"{out}/pairs",
-            hint="the same command goes on",
-        ) from None
+    kept = resumable("the pairs that were finished are kept", f"{out}/pairs")
+    with kept, warnings.catch_warnings():
+        warnings.showwarning = SolveLog(quiet).warn
+        done = solve_chain(
+            frames_of,
+            out,
+            intrinsics=options.camera(intrinsics, "--intrinsics"),
+            fov=fov,
+            undistort=undistort,
+            stride=stride,
+            most=frames,
+            two_frame=two_frame,
+            depth_scale=depth_scale,
+            overrides=options.changed(preset, overrides, short),
+            workers=workers,
+            overwrite=overwrite,
+            begin=begin,
+            say=RowProgress(quiet),
+        )
     print("\n".join(chain_lines(done, read_json(out / CHAIN, CHAIN))))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "points/", "pairs/"]))

@@ -2,27 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
+import pandas as pd
 import typer
 
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.solvers.page import by_start, conclusion, frame_of_runs, neutral, page, summary
+from soup_nlp.bench.solvers.page import (
+    by_start,
+    conclusion,
+    frame_of_runs,
+    neutral,
+    of_family,
+    page,
+    summary,
+)
 from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import family_tasks, is_family, make_tasks
-from soup_nlp.cli.options import Coordinates, Formulations, Overwrite, Set, Superpixels, listed
+from soup_nlp.cli.options import (
+    Coordinates,
+    Formulations,
+    Overwrite,
+    Set,
+    Superpixels,
+    listed,
+    resumable,
+)
 from soup_nlp.config.problem import load_problem, title
-from soup_nlp.errors import ConfigError, StoppedError
+from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import parse_formulations
 from soup_nlp.export.verify import Limits
 from soup_nlp.family.describe import write_results
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.files import write_text
 from soup_nlp.storage.folders import claim, default_folder, scratch, staged
+from soup_nlp.storage.rows import Row
 from soup_nlp.storage.store import write_json
 
 FILES = ("README.md", "profile.png", "curves.png")
@@ -80,35 +99,33 @@ def compare(
     names_of = dict.fromkeys([*(path.name for path in sets), *(p.name for p in chosen)])
     out = out or default_folder(title(f"solvers-{'-'.join(names_of)}"), subject)
     folder = claim(out, written, overwrite, subject)
-    # rows of the problems before, and all rows so far
-    before: list[dict[str, Any]] = []
-    rows: list[dict[str, Any]] = []
-    runs = folder / "runs.jsonl"
 
-    def keep(more: list[dict[str, Any]]) -> None:
+    def tasks() -> Iterator[list[Any]]:
+        """Tasks of one scene and size, or of one problem, at a time."""
+        for path in sets:
+            yield from family_tasks(path, limits)
+        for problem in chosen:
+            yield list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
+
+    before: list[Row] = []
+    rows: list[Row] = []
+
+    def keep(more: list[Row]) -> None:
         """The page after every run: a run may take minutes, and a command may be killed."""
         rows[:] = [*before, *more]
         with staged(folder, subject=subject) as new:
-            write_text(new / "README.md", page(frame_of_runs(rows), family=bool(sets)))
+            write_text(new / "README.md", page(frame_of_runs(rows)))
 
+    kept = resumable("the runs that were finished are kept, with a page of them", folder)
     try:
-        with scratch() as temporary:
-            for path in sets:
-                for tasks in family_tasks(path, limits):
-                    before += run_all(tasks, names, limits, runs, temporary, print, keep)
-            for problem in chosen:
-                tasks = list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
-                before += run_all(tasks, names, limits, runs, temporary, print, keep)
-    except KeyboardInterrupt:
-        raise StoppedError(
-            "interrupted: the runs that were finished are kept, with a page of them",
-            where=folder,
-            hint="the same command goes on",
-        ) from None
+        with kept, scratch() as temporary:
+            for own in tasks():
+                runs = folder / "runs.jsonl"
+                before += run_all(own, names, limits, runs, temporary, print, keep)
     finally:
         # write the page of the finished runs even after an error
         if rows:
-            _write(folder, rows, [r for r in rows if "best_known" in r], limits, subject)
+            _write(folder, frame_of_runs(rows), limits, subject)
     print("\n".join(conclusion(frame_of_runs(rows))))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     verified = sum(bool(r["verified"]) for r in rows)
@@ -116,21 +133,14 @@ def compare(
     raise typer.Exit(int(not verified))
 
 
-def _write(
-    folder: Path,
-    rows: list[dict[str, Any]],
-    of_family: list[dict[str, Any]],
-    limits: Limits,
-    subject: str,
-) -> None:
-    """Write FILES from all rows, and OF_FAMILY from the rows of the family."""
-    frame = frame_of_runs(rows)
+def _write(folder: Path, frame: pd.DataFrame, limits: Limits, subject: str) -> None:
+    """Write FILES from all runs, and OF_FAMILY from those of the family."""
+    family = of_family(frame)
     with staged(folder, subject=subject) as new:
-        write_text(new / "README.md", page(frame, family=bool(of_family)))
+        write_text(new / "README.md", page(frame))
         draw_profiles(new / "profile.png", {"": frame}, ("seconds", "energy"))
         draw_curves(new / "curves.png", frame)
-        if of_family:
-            family = frame_of_runs(of_family)
+        if len(family):
             measures = "cpu_seconds", "objective"
             draw_profiles(new / "profiles.png", by_start(family), measures)
             note = {"limits": asdict(limits), "machine": machine()}

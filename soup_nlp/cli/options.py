@@ -7,7 +7,8 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Any
@@ -20,7 +21,7 @@ from rich.progress import Progress as Bars
 from soup_nlp.config.presets import PRESETS
 from soup_nlp.config.problem import Problem as ProblemFile
 from soup_nlp.data.formats.images import DataWarning
-from soup_nlp.errors import ConfigError
+from soup_nlp.errors import ConfigError, StoppedError
 from soup_nlp.schema.limits import MAX_SEED
 from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.progress import Progress
@@ -175,26 +176,35 @@ def camera(text: str | None, option: str) -> list[float] | str | None:
     return values
 
 
+@contextmanager
+def resumable(kept: str, where: object) -> Iterator[None]:
+    """Have Ctrl-C end the block with a message on what is kept.
+
+    Raises:
+        StoppedError: there was a Ctrl-C.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        hint = "the same command goes on"
+        raise StoppedError(f"interrupted: {kept}", where=where, hint=hint) from None
+
+
 class RowProgress:
     """Prints finished rows and time left: one updated line on a terminal, else a line per row.
 
     Args:
         quiet: Print nothing.
         result_of: Makes a short text from a row that did not fail.
-
-    Attributes:
-        failed: Number of new rows that failed.
     """
 
     def __init__(self, quiet: bool, result_of: Callable[[Row], str] = lambda row: "done") -> None:
         self.quiet, self.result_of = quiet, result_of
         self.live = sys.stderr.isatty()
         self.spent: list[float] = []
-        self.failed = 0
 
     def __call__(self, done: int, total: int, row: Row) -> None:
         """Print a new row."""
-        self.failed += failed(row)
         if self.quiet:
             return
         self.spent.append(float(row.get("seconds") or 0.0))

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from soup_nlp.bench.paper import DATASETS, METHODS, SECTIONS, Sizes, make_plan, measure_paper
+from soup_nlp.bench.paper import DATASETS, METHODS, make_plan, measure_paper
 from soup_nlp.bench.paper_page import PICTURES
 from soup_nlp.bench.studies import DEPARTURES, PAPER, STUDIES, default
-from soup_nlp.bench.study import Item
+from soup_nlp.bench.study import Cell, Item
 from soup_nlp.cli import bench
 from soup_nlp.cli.main import main
 from soup_nlp.config.presets import PRESETS, leaves
@@ -63,23 +63,22 @@ def test_a_departure_changes_the_defaults_and_the_preset(departure):
         assert attrgetter(key)(off) == attrgetter(key)(paper)
 
 
-def fake(job: Item, overrides: tuple[str, ...] = (), maps: Path | None = None) -> Row:
+def fake(cell: Cell) -> Row:
     """A row whose numbers identify its cell."""
-    if any("orient" in o for o in overrides) and job.suite == "shared":
-        raise DataError("made to fail", where=job.key)
-    value = 0.5 if overrides[:1] == PAPER else 0.25
+    if any("orient" in o for o in cell.overrides) and cell.item.suite == "shared":
+        raise DataError("made to fail", where=cell.item.key)
+    value = 0.5 if cell.overrides[:1] == PAPER else 0.25
     told = {"mre": value, "median_relative": value / 2}
     methods = ("solution", "nlp", "start", "constant", "rigid")
-    if maps is not None:
-        image = np.zeros((6, 8), np.float32) + 2
-        maps.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(maps, image=np.zeros((6, 8, 3), np.uint8), start=image, solution=image)
+    if cell.keep is not None:
+        image, z = np.zeros((6, 8, 3), np.uint8), np.full((6, 8), 2.0)
+        cell.keep.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(cell.keep, image=image, start=z, solution=z)
     return {
         "status": "Solve_Succeeded",
-        "size": [6, 8],
         "stages": {"flow": 1.0, "nlp": 2.0},
         "iterations": 7,
-        "metrics": {p: dict.fromkeys(methods, told) for p in job.presets},
+        "metrics": {p: dict.fromkeys(methods, told) for p in cell.item.presets},
         "curve": {
             "names": ["presolve"],
             "values": [[3.0, 2.0, 1.5]],
@@ -106,18 +105,16 @@ def dataset(tmp_path: Path) -> Path:
 def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench, "measure_paper", fake)
     out = tmp_path / "out"
-    words = ["bench", "paper", "--data", str(dataset), "-o", str(out), "-q", "--width", "128"]
-    words += ["--families", "street,kinect_paper,motorcycle"]
-    words += ["--departures", "street,rgbd,sheet"]
+    words = ["bench", "paper", "--data", str(dataset), "-o", str(out), "-q"]
     assert main(words) == 1
     text = (out / "README.md").read_text()
-    for name in SECTIONS:
-        assert f"## {STUDIES[name].text[0].upper()}{STUDIES[name].text[1:]}" in text
+    for study in STUDIES.values():
+        assert f"## {study.text[0].upper()}{study.text[1:]}" in text
     for section in ("Mean relative error per dataset", "Depth maps", "Time", "Convergence of E"):
         assert f"## {section}" in text
     # a family without data has no column
-    columns = "mean | median | worse / better | street-s0-128x54 | sheet-s0-128x54"
-    assert f"| departure | {columns} |" in text
+    assert "| departure | mean | median | worse / better | street-s0-1024x436 | room-s0" in text
+    assert "tum_fr1" not in text
     assert {p.stem for p in out.glob("*.png")} == set(PICTURES)
     assert all(f"]({name}.png)" in text for name in PICTURES)
     # the pair with a truth alone, beside the published row
@@ -132,26 +129,27 @@ def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsy
     assert "http://sintel.is.tue.mpg.de" in missing
     assert "Back sequence" in missing
     assert "made to fail" in text
-    rows = [json.loads(line) for line in (out / "paper.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (out / "README.jsonl").read_text().splitlines()]
     good = sum(row["ok"] for row in rows)
     assert good < len(rows)
     assert f"{good} of the {len(rows)} rows were measured." in text
     capsys.readouterr()
-    assert "alley_1 (published)" in text
+    assert "| alley_1 | 0.2248 | 0.2022 | 0.1697 | 0.1606 |" in text
 
 
 def test_a_plan_measures_nothing_twice(tmp_path):
-    plan = make_plan(None, Sizes(superpixels=60, analysis=60, families=("street",)), tmp_path)
-    names = [json.dumps(cell.identity(), sort_keys=True) for cell in plan.cells()]
-    assert len(names) == len(set(names))
-    assert all(not group for group in plan.datasets.values())
-    assert set(plan.table["section"]) == {"comparison", *SECTIONS, "departures"}
-    assert set(plan.table.groupby("section")["method"].nunique()) == {len(METHODS)}
+    plan = make_plan(None, tmp_path, superpixels=60, analysis=60)
+    cells = plan.drop_duplicates("key")["cell"]
+    names = {json.dumps(cell.identity(), sort_keys=True) for cell in cells}
+    assert len(names) == len(cells) < len(plan)
+    assert set(plan["dataset"]) == {""}
+    assert set(plan["section"]) == {"comparison", *STUDIES, "departures"}
+    assert set(plan.groupby("section")["method"].nunique()) == {len(METHODS)}
 
 
 def test_a_row_has_energies_on_the_way_and_small_maps(tmp_path):
     path = tmp_path / "maps" / "a.npz"
-    row = measure_paper(item(), (*PAPER, *QUICK), path)
+    row = measure_paper(Cell(item(), (*PAPER, *QUICK), keep=path))
     json.dumps(row["curve"], allow_nan=False)
     assert len(row["curve"]["rounds"]) == 2
     assert row["curve"]["rounds"][1] <= row["curve"]["rounds"][0]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from typer.main import get_command
 
+from soup_nlp.bench import search as searching
 from soup_nlp.bench.search import (
     DEFAULT,
     DEFAULT_SPACE,
@@ -27,7 +27,6 @@ from soup_nlp.bench.study import Cell, Item, frame_of
 from soup_nlp.bench.suites import Options, list_suite
 from soup_nlp.cli.main import app, main
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.storage.rows import measure_all
 
 pytestmark = pytest.mark.slow
 
@@ -35,26 +34,23 @@ TEXTS = ("energy.weights.cont=log:1e-5:1e-1", "segmentation.neighbours=int:4:20"
 SPACE = parse_space(TEXTS)
 
 
-def fake(item: Item, overrides: tuple[str, ...] = (), keep: Path | None = None) -> dict:
+def fake(cell: Cell) -> dict:
     """A row whose MRE is least at cont = 1e-3 and K = 12."""
-    given = dict(o.split("=", 1) for o in overrides)
+    given = dict(o.split("=", 1) for o in cell.overrides)
     cont = float(given.get("energy.weights.cont", "0.1"))
     k = float(given.get("segmentation.neighbours", "20"))
     mre = 0.02 * (1 + abs(math.log10(cont) + 3) + 0.1 * abs(k - 12))
-    solution = {"mre": mre, "median_relative": mre / 2, "skill": 1 - mre / 0.4}
-    return {
-        "metrics": {item.presets[0]: {"solution": solution, "constant": {"mre": 0.4}}},
-        "energy": {"solution": {"total": 10.0}},
-    }
+    own = {"solution": {"mre": mre}, "constant": {"mre": 0.4}}
+    return {"metrics": {cell.item.presets[0]: own}}
 
 
-def broken(item: Item, overrides: tuple[str, ...] = (), keep: Path | None = None) -> dict:
+def broken(cell: Cell) -> dict:
     """No pair is measured without its files."""
     raise DataError("image is missing", where="a/0.png", found="nothing", expected="a file")
 
 
 def items(*seeds: int) -> list[Item]:
-    return list(list_suite("rendered", None, Options(width=128, seeds=seeds)).items)
+    return list_suite("rendered", None, Options(width=128, seeds=seeds))
 
 
 def test_parameters_are_distributions():
@@ -69,24 +65,17 @@ def test_parameters_are_distributions():
             parse_space([text])
 
 
-def test_search_finds_the_minimum_and_can_be_continued(tmp_path):
+def test_search_finds_the_minimum_and_can_be_continued(tmp_path, monkeypatch):
     calls = []
-
-    def counted(*args):
-        calls.append(args)
-        return fake(*args)
-
-    def go() -> pd.DataFrame:
-        path = tmp_path / "rows.jsonl"
-        return search(SPACE, items(0)[:2], path, measure_all, trials=40, measure=counted)
-
-    frame = go()
+    monkeypatch.setattr(searching, "measure_pair", lambda cell: calls.append(cell) or fake(cell))
+    path = tmp_path / "rows.jsonl"
+    frame = search(SPACE, items(0)[:2], path, trials=40)
     losses = frame.groupby("variant")["loss"].mean()
     assert len(losses) == 41
     assert losses[DEFAULT] == pytest.approx(math.log(0.02 * (1 + 2 + 0.8) / 0.4))
     assert losses.min() < losses[DEFAULT] - 0.6
     before = len(calls)
-    again = go()
+    again = search(SPACE, items(0)[:2], path, trials=40)
     assert len(calls) == before
     assert again["overrides"].tolist() == frame["overrides"].tolist()
     text = search_page(frame, TEXTS, "soup-nlp bench search")
@@ -95,19 +84,17 @@ def test_search_finds_the_minimum_and_can_be_continued(tmp_path):
     assert f"| {losses.idxmin()} |" in text
 
 
-def test_search_rejects_invalid_input(tmp_path):
-    run = partial(search, path=tmp_path / "r.jsonl", measure_rows=measure_all, measure=fake)
-    with pytest.raises(ConfigError, match="no pair"):
-        run(SPACE, [])
+def test_search_rejects_unknown_parameters(tmp_path, monkeypatch):
+    monkeypatch.setattr(searching, "measure_pair", fake)
     with pytest.raises(ConfigError):
-        run(parse_space(["energy.wieghts=linear:0:1"]), items(0))
+        search(parse_space(["energy.wieghts=linear:0:1"]), items(0), tmp_path / "r.jsonl")
     # every default range is accepted at both ends
-    run(parse_space(DEFAULT_SPACE), items(0)[:1], trials=0)
+    search(parse_space(DEFAULT_SPACE), items(0)[:1], tmp_path / "r.jsonl", trials=0)
 
 
 def test_loss_charges_failures():
     cells = [Cell(i) for i in items(0)[:3]]
-    rows = [{**c.identity(), "ok": True, "code": "c", **fake(c.item)} for c in cells]
+    rows = [{**c.identity(), "ok": True, "code": "c", **fake(c)} for c in cells]
     rows[1]["metrics"]["paper"]["solution"]["mre"] = 9.0
     rows[2] |= {"ok": False, "metrics": {}}
     loss = pair_loss(frame_of(rows)).tolist()
@@ -143,8 +130,7 @@ def test_command_line_of_the_search(tmp_path, capsys, monkeypatch):
     words += ["--param", "segmentation.neighbours=int:4:19"]
     # what failed is measured again
     for measure, code in ((broken, 1), (fake, 0)):
-        kwdefaults = {**search.__kwdefaults__, "measure": measure}
-        monkeypatch.setattr(search, "__kwdefaults__", kwdefaults)
+        monkeypatch.setattr(searching, "measure_pair", measure)
         assert main(words) == code
     out = capsys.readouterr()
     assert "image is missing, where: a/0.png" in out.err

@@ -18,6 +18,7 @@ from soup_nlp.bench.speed import (
     schedule,
     speed_cells,
     speed_page,
+    timed_pairs,
     with_costs,
 )
 from soup_nlp.bench.study import Cell, frame_of
@@ -32,7 +33,7 @@ EXPONENT = 1.3
 
 
 def speed_cell(scene: str = "street", superpixels: int = 250, neighbours: int = 10) -> Cell:
-    return speed_cells([scene], [superpixels], [neighbours], [0])[0]
+    return speed_cells(timed_pairs([scene], [0]), [superpixels], [neighbours])[0]
 
 
 def made(scene: str = "street", superpixels: int = 250, neighbours: int = 10, **changes) -> dict:
@@ -63,17 +64,18 @@ def failed(reason: str) -> dict:
 
 
 def test_the_plan_has_every_run_once_small_ones_first():
-    cells = speed_cells(["street", "motorcycle"], [500, 250], [20, 10], [3, 4], width=512)
+    items = timed_pairs(["street", "motorcycle"], [3, 4], 512)
+    cells = speed_cells(items, [500, 250], [20, 10], ["solver.tol=0.5"])
     assert len({c.identity()["key"] for c in cells}) == len(cells) == 2 * 2 * (2 + 1)
-    sizes = [c.item.problem(c.overrides).segmentation.superpixels for c in cells]
+    problems = [c.item.problem(c.overrides) for c in cells]
+    sizes = [p.segmentation.superpixels for p in problems]
     assert sizes == sorted(sizes)
-    assert sum(c.item.input["kind"] == "motorcycle" for c in cells) == 4
-    (cell,) = speed_cells(["room"], [300], [12], [5], 512, 218, ["solver.tol=0.5"])
-    p = cell.item.problem(cell.overrides)
-    assert (p.input.scene, p.input.seed, p.input.width, p.seed) == ("room", 5, 512, 5)
-    assert (p.segmentation.superpixels, p.segmentation.neighbours) == (300, 12)
-    assert p.solver.tol == 0.5
-    assert not p.refine.enabled
+    assert [c.item.sequence for c in cells[:3]] == ["street", "street", "motorcycle"]
+    assert [(p.input.seed, p.seed, p.input.width) for p in problems[:2]] == [
+        (3, 3, 512), (4, 4, 512),
+    ]  # fmt: skip
+    assert (problems[0].segmentation.neighbours, problems[0].solver.tol) == (10, 0.5)
+    assert not problems[0].refine.enabled
 
 
 def test_work_in_a_process_of_its_own(monkeypatch):
@@ -84,7 +86,7 @@ def test_work_in_a_process_of_its_own(monkeypatch):
     assert "out of numbers" in alone(partial(square, 4, breaks=True))["error"]
     monkeypatch.setattr("soup_nlp.bench.processes.GRACE", 0.0)
     cell = speed_cell("street", 60, 8)
-    late = alone(partial(measure_speed, cell.item, cell.overrides), seconds=0.2)
+    late = alone(partial(measure_speed, cell), seconds=0.2)
     assert late["error"] == "no answer after 0.2 s"
     assert {"processor", "cores", "memory", "code"} <= machine().keys()
 
@@ -157,7 +159,7 @@ def test_bad_input_ends_with_2(tmp_path, capsys, words):
 def test_a_real_run_and_its_table(tmp_path):
     out = tmp_path / "out"
     size = ["--scenes", "street", "--sizes", "24", "--neighbours", "4", "--seeds", "0"]
-    small = ["--width", "128", "--height", "96", "--set", "solver.max_iter=5"]
+    small = ["--width", "128", "--set", "solver.max_iter=5"]
     small += ["--set", "formulation.compiled=false", "--set", "solver.eps=0.3"]
     small += ["--set", "solver.presolve_eps=[0.3]"]
     words = ["bench", "speed", *size, *small, "--quiet", "--out", str(out)]

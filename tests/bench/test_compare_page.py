@@ -162,7 +162,7 @@ def test_a_minimum_is_reached_when_it_is_verified_and_near():
 def test_rows_belong_to_a_start_and_a_size(tmp_path):
     frame = frame_of_runs(OF_FAMILY)
     assert list(by_start(frame)) == ["confirmation, N = 100", "hard, N = 100"]
-    text = page_of(frame, family=True)
+    text = page_of(frame)
     assert "| one | 1 of 1 (1), 1.0 s | 1 of 1 (0), 1.0 s |" in text
     assert "| three | 0 of 1 (0) | - |" in text
     assert text.index("## By start and size") < text.index("## By run")

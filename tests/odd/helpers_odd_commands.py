@@ -60,9 +60,7 @@ DATASETS = {
     "kitti2015": 'root: {}, index: "000001"',
     "vkitti2": "root: {}, scene: Scene01, frame: 0",
 }
-SMALL_SPEED = (
-    "bench speed --scenes street --sizes 12 --neighbours 4 --seeds 0 --width 64 --height 48"
-)
+SMALL_SPEED = "bench speed --scenes street --sizes 12 --neighbours 4 --seeds 0 --width 64"
 WRITE = {
     "solve": "{solve} -o {odd}",
     "export": "export {p} -q -o {odd}",

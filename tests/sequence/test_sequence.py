@@ -293,7 +293,7 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     # the table of chains has the same numbers
     monkeypatch.setattr(chain_study, "scratch", lambda: nullcontext(tmp_path / "out"))
     item = chain_study.sequences(None)[0]
-    row = chain_study.measure_chain(item, SMALL, frames=3)
+    row = chain_study.measure_chain(Cell(item, tuple(SMALL)), frames=3)
     assert row["cost"] == told["score"]["cost"]
     assert row["path"] == told["score"]["path"]["share"]
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows

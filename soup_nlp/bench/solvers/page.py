@@ -25,9 +25,8 @@ LIMITS = (
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
     "Options are those of `soup_nlp/bench/solvers/plugins.py`, the package's own ones being tuned "
-    "on such problems. alpaqa and sleqp differentiate an expanded graph, which costs set-up time.",
+    "on such problems.",
     "lm, the reference solver on the manifold, claims no optimum; its points are verified alike.",
-    "SCIP is a global solver: here it shows what its time limit allows from the same start.",
 )
 COLUMNS = {
     "problem": ("problem", ""),
@@ -46,26 +45,34 @@ COLUMNS = {
     "ended": ("status", ""),
 }
 """Title and format of every column of the table of runs."""
+FURTHER = ("objective", "peak_bytes", "status", "best_known")
+"""Further columns that the page and the records need."""
 
 
 def frame_of_runs(rows: Sequence[Row]) -> pd.DataFrame:
     """A line for each run, with every column that the page needs."""
     frame = pd.DataFrame(list(rows))
-    frame = frame.reindex(
-        columns=list(dict.fromkeys([*frame.columns, *COLUMNS, "objective", "peak_bytes", "status"]))
-    )
+    frame = frame.reindex(columns=list(dict.fromkeys([*frame.columns, *COLUMNS, *FURTHER])))
     frame["MB"] = frame["peak_bytes"].where(frame["peak_bytes"] > 0) / 2**20
     frame["iterations"] = frame["iterations"].where(frame["iterations"] >= 0).astype(float)
     false = np.where(frame["claimed"], "claim is FALSE", "no")
+    frame[["claimed", "verified"]] = frame[["claimed", "verified"]].astype(bool)
     frame["word"] = np.where(frame["verified"], "yes", false)
     frame["ended"] = [" ".join(str(s)[:50].replace("|", "/").split()) for s in frame["status"]]
     return frame
 
 
-def page(frame: pd.DataFrame, family: bool = False) -> str:
-    """Markdown page of all runs; `family` adds a table by start and size of the SOUP family."""
+def page(frame: pd.DataFrame) -> str:
+    """Markdown page of all runs, those of the SOUP family with a table by start and size."""
     packages = {f"{k} {v}" for versions in frame["versions"] for k, v in versions.items()}
     code = ", ".join(sorted(frame["code"].astype(str).unique()))
+    limits = frame["limits"].iloc[0]
+    seconds = " or ".join(f"{s:g}" for s in sorted({v["seconds"] for v in frame["limits"]}))
+    limit = (
+        f"A run has {seconds} CPU seconds, {limits['iterations']} iterations and"
+        f" {limits['memory'] / 2**30:g} GiB, and is asked for a dual infeasibility of"
+        f" {limits['tol']:g}."
+    )
     note = (
         "Verified: KKT residuals and exact energy, recomputed from the solver's point, are those of"
         " an optimum, to one tolerance for all, whether or not it claims one."
@@ -75,12 +82,12 @@ def page(frame: pd.DataFrame, family: bool = False) -> str:
     lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(frame), ""]
     lines += ["![performance profiles](profile.png)", "", "![energy against time](curves.png)"]
     sections = {
-        "By start and size": _by_start(frame) if family else [],
+        "By start and size": _by_start(of_family(frame)),
         "By problem": _by_problem(frame),
         "By solver": [note, "", *_by_solver(frame)],
         "By run": _by_run(frame[~begun]),
         "Confirmation: runs that begin at a solution": _by_run(frame[begun]),
-        "Limits": [f"- {text}" for text in (_limits(frame), *LIMITS)],
+        "Limits": [f"- {text}" for text in (limit, *LIMITS)],
         "Machine and versions": [f"- {text}" for text in facts],
     }
     for title, body in sections.items():
@@ -88,15 +95,9 @@ def page(frame: pd.DataFrame, family: bool = False) -> str:
     return page_text(lines)
 
 
-def _limits(frame: pd.DataFrame) -> str:
-    """Sentence on the limits of the runs, whose time limits may differ."""
-    limits = frame["limits"].iloc[0]
-    seconds = " or ".join(f"{s:g}" for s in sorted({v["seconds"] for v in frame["limits"]}))
-    return (
-        f"A run has {seconds} CPU seconds, {limits['iterations']} iterations and"
-        f" {limits['memory'] / 2**30:g} GiB, and is asked for a dual infeasibility of"
-        f" {limits['tol']:g}."
-    )
+def of_family(frame: pd.DataFrame) -> pd.DataFrame:
+    """The runs on instances of the SOUP family, whose best known objectives are recorded."""
+    return frame[frame["best_known"].notna()]
 
 
 def conclusion(frame: pd.DataFrame) -> list[str]:
@@ -105,32 +106,23 @@ def conclusion(frame: pd.DataFrame) -> list[str]:
     some = solved[solved > 0].sort_values(ascending=False, kind="stable")
     problems = frame.groupby(PROBLEM).ngroups
     told = ", ".join(f"{name} {count}" for name, count in some.items()) or "none"
-    out = [
+    claims = frame[frame["claimed"]]
+    false = sorted(claims.loc[~claims["verified"], "solver"].unique())
+    more = f"; not always those of {', '.join(false)}" if false else ""
+    true = f"{int(claims['verified'].sum())} of {len(claims)}{more}"
+    return [
         f"**{problems} problems, {len(solved)} solvers, {len(frame)} runs:"
-        f" {int(frame['verified'].sum())} verified.** Verified problems by solver: {told}."
+        f" {int(frame['verified'].sum())} verified.** Verified problems by solver: {told}.",
+        *([f"Claims of an optimum that were true: {true}."] if len(claims) else []),
     ]
-    claims = frame[frame["claimed"].astype(bool)]
-    if len(claims):
-        true = claims["verified"].astype(bool)
-        false = sorted(claims.loc[~true, "solver"].unique())
-        more = f"; not always those of {', '.join(false)}" if false else ""
-        count = f"{int(true.sum())} of {len(claims)}"
-        out.append(f"Claims of an optimum that were true: {count}{more}.")
-    return out
 
 
 def _by_problem(frame: pd.DataFrame) -> list[str]:
     """Exact energy that every solver reached, by problem; brackets where it is not verified."""
-    shown = frame.assign(
-        energy=[
-            "-" if not np.isfinite(e) else f"{e:.6g}" if good else f"({e:.6g})"
-            for e, good in zip(
-                frame["energy"].where(frame["primal"] <= FEASIBLE).astype(float),
-                frame["verified"].astype(bool),
-                strict=True,
-            )
-        ]
-    )
+    feasible = frame["energy"].where(frame["primal"] <= FEASIBLE).astype(float)
+    texts = feasible.map(lambda e: show(e, ".6g"))
+    texts = texts.where(frame["verified"] | feasible.isna(), "(" + texts + ")")
+    shown = frame.assign(energy=texts)
     # problems of one name may have different contents
     keys = [*PROBLEM, "energy_start"]
     table = shown.pivot_table(
@@ -147,27 +139,23 @@ def _by_problem(frame: pd.DataFrame) -> list[str]:
 
 def _by_solver(frame: pd.DataFrame) -> list[str]:
     """Table of the numbers of runs, claims and verified claims of each solver."""
-    lines = {}
-    for solver, group in frame.groupby("solver"):
-        claimed, verified = int(group["claimed"].sum()), int(group["verified"].sum())
-        true = int((group["claimed"].astype(bool) & group["verified"].astype(bool)).sum())
-        others = sorted(group.loc[~group["claimed"].astype(bool), "ended"].unique())
-        lines[solver] = {
-            "runs": str(len(group)),
-            "claimed": str(claimed),
-            "verified": str(verified),
-            "claims that were true": f"{true} of {claimed}" if claimed else "-",
-            "ended otherwise": "; ".join(others),
-        }
-    return markdown(pd.DataFrame.from_dict(lines, orient="index").rename_axis("solver"))
+    groups = frame.assign(true=frame["claimed"] & frame["verified"]).groupby("solver")
+    table = groups.agg(
+        runs=("solver", "size"), claimed=("claimed", "sum"), verified=("verified", "sum")
+    )
+    true = groups["true"].sum().astype(str) + " of " + table["claimed"].astype(str)
+    table["claims that were true"] = true.where(table["claimed"] > 0, "-")
+    ends = frame[~frame["claimed"]].groupby("solver")["ended"].agg(lambda e: sorted(e.unique()))
+    table["ended otherwise"] = ends.str.join("; ").reindex(table.index, fill_value="")
+    return markdown(table, "")
 
 
 def _by_run(frame: pd.DataFrame) -> list[str]:
     """Table of every run; nothing without runs."""
     if frame.empty:
         return []
-    order = frame.assign(failed=~frame["verified"].astype(bool))
-    order = order.sort_values([*PROBLEM, "failed", "seconds"])
+    ascending = [True] * len(PROBLEM) + [False, True]
+    order = frame.sort_values([*PROBLEM, "verified", "seconds"], ascending=ascending)
     return titled(order.set_index("problem"), {k: v for k, v in COLUMNS.items() if k != "problem"})
 
 
@@ -175,7 +163,7 @@ def reached(frame: pd.DataFrame) -> pd.Series:
     """Whether a run is verified and has reached the best known objective."""
     best = frame["best_known"].astype(float)
     near = frame["objective"].astype(float) <= best + REACHED * best.abs()
-    return frame["verified"].astype(bool) & near
+    return frame["verified"] & near
 
 
 def by_start(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
@@ -187,11 +175,13 @@ def by_start(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 
 def _by_start(frame: pd.DataFrame) -> list[str]:
-    """Table of the verified runs by start and size of the family."""
+    """Table of the verified runs by start and size of the family; nothing without runs."""
+    if frame.empty:
+        return []
 
     def cell(runs: pd.DataFrame) -> str:
-        good = runs[runs["verified"].astype(bool)]
-        time = f", {show(float(good['cpu_seconds'].median()), '.1f')} s" if len(good) else ""
+        good = runs[runs["verified"]]
+        time = f", {good['cpu_seconds'].median():.1f} s" if len(good) else ""
         return f"{len(good)} of {len(runs)} ({int(reached(runs).sum())}){time}"
 
     text = (
@@ -203,13 +193,12 @@ def _by_start(frame: pd.DataFrame) -> list[str]:
         for title, group in by_start(frame).items()
     }
     table = pd.DataFrame(cells).sort_index().rename_axis("solver")
-    picture = ["", "![profiles by start and size](profiles.png)"]
-    return [text, "", *markdown(table), *picture]
+    return [text, "", *markdown(table), "", "![profiles by start and size](profiles.png)"]
 
 
 # --- records of the family -----------------------------------------------------------------------
 
-CASADI = ("ipopt", "sqpmethod", "uno", "alpaqa", "sleqp", "bonmin", "fatrop")
+CASADI = ("ipopt", "sqpmethod", "uno", "bonmin", "fatrop")
 
 
 def neutral(frame: pd.DataFrame) -> list[dict[str, Any]]:
@@ -233,23 +222,22 @@ def summary(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     "runs" has objective, CPU seconds, their limit and whether the point is verified, by start and
     solver: what `records/published.json` takes for the README of the set.
     """
+
+    def entry(row: pd.Series) -> list[Any]:
+        objective = float(row["objective"])
+        value = float(f"{objective:.9g}") if np.isfinite(objective) else None
+        limit = float(row["limits"]["seconds"])
+        return [value, round(float(row["cpu_seconds"]), 1), limit, bool(row["verified"])]
+
     names = frame["name"].str.rpartition("-")[0]
     return {
         str(name): {
             "tried_by": list(group["solver"].unique()),
             "reached_by": list(group.loc[reached(group), "solver"].unique()),
             "runs": {
-                str(start): {str(row["solver"]): _run(row) for _, row in runs.iterrows()}
+                str(start): {str(row["solver"]): entry(row) for _, row in runs.iterrows()}
                 for start, runs in group.groupby("start", sort=False)
             },
         }
         for name, group in frame.groupby(names, sort=False)
     }
-
-
-def _run(row: pd.Series) -> list[Any]:
-    """Objective or None, CPU seconds, their limit, verified."""
-    objective = float(row["objective"])
-    value = float(f"{objective:.9g}") if np.isfinite(objective) else None
-    limit = float(row["limits"]["seconds"])
-    return [value, round(float(row["cpu_seconds"]), 1), limit, bool(row["verified"])]

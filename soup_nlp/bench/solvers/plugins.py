@@ -125,8 +125,6 @@ class Trace:
 
 # --- CasADi's plug-ins ---------------------------------------------------------------------------
 
-Options = Mapping[str, Any]
-
 
 class Plugin(NamedTuple):
     """A plug-in of nlpsol with its options.
@@ -140,7 +138,7 @@ class Plugin(NamedTuple):
 
     library: str
     limits: Mapping[str, str]
-    options: Options
+    options: Mapping[str, Any]
     hessian: str = "exact"
 
     def made_for(self, limits: Limits) -> dict[str, Any]:
@@ -160,6 +158,13 @@ TOLERANCES = {
 }
 """Attribute of `Limits` by name of Ipopt's option."""
 TWO_LIMITS = {"max_iter": "iterations", "tol": "tol"}
+SQP_LIMITS = {"max_iter": "iterations", "tol_du": "tol", "tol_pr": "feasibility"}
+UNO_LIMITS = {
+    "max_iterations": "iterations",
+    "dual_tolerance": "tol",
+    "primal_tolerance": "feasibility",
+}
+QUIET = {"print_level": 0}
 COMMON = {"acceptable_iter": 0, "print_level": 0, "sb": "yes"}
 NEAR_START = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
 """Options for a start near the minimum, for solvers with the options of Ipopt."""
@@ -177,29 +182,11 @@ PLUGINS: Mapping[str, Plugin] = {
     "ipopt-lbfgs": Plugin(
         "ipopt", TOLERANCES, {**COMMON, "hessian_approximation": "limited-memory"}
     ),
-    "sqpmethod": Plugin(
-        "sqpmethod",
-        {"max_iter": "iterations", "tol_du": "tol", "tol_pr": "feasibility"},
-        SQP,
-        "gauss-newton",
-    ),
-    "uno": Plugin(
-        "uno",
-        {
-            "max_iterations": "iterations",
-            "dual_tolerance": "tol",
-            "primal_tolerance": "feasibility",
-        },
-        {"logger": "SILENT"},
-    ),
-    "alpaqa": Plugin("alpaqa", {}, {}),
-    "sleqp": Plugin("sleqp", {"max_iter": "iterations"}, {}),
-    "bonmin": Plugin("bonmin", TWO_LIMITS, {"print_level": 0}),
-    "fatrop": Plugin("fatrop", TWO_LIMITS, {"print_level": 0}),
-    "bonmin-tuned": Plugin("bonmin", TWO_LIMITS, {**NEAR_START, "print_level": 0}),
-    "fatrop-tuned": Plugin(
-        "fatrop", TWO_LIMITS, {"mu_init": NEAR_START["mu_init"], "print_level": 0}
-    ),
+    "sqpmethod": Plugin("sqpmethod", SQP_LIMITS, SQP, "gauss-newton"),
+    "uno": Plugin("uno", UNO_LIMITS, {"logger": "SILENT"}),
+    "fatrop": Plugin("fatrop", TWO_LIMITS, QUIET),
+    "fatrop-tuned": Plugin("fatrop", TWO_LIMITS, {**QUIET, "mu_init": NEAR_START["mu_init"]}),
+    "bonmin-tuned": Plugin("bonmin", TWO_LIMITS, {**QUIET, **NEAR_START}),
 }
 """"ipopt" has the default options of Ipopt. "ipopt-soup" has those that `solve` uses for a start
 that is no KKT point, and "ipopt-tuned" the same with the exact Hessian. Other names with "-tuned"
@@ -242,30 +229,24 @@ class _Watch(IterationCallback):
 
 
 def plugin(name: str, task: Task) -> Answer:
-    """Solve with a plug-in of nlpsol, with the derivatives of this package if it accepts them."""
+    """Solve with a plug-in of nlpsol and the derivatives of this package."""
     chosen = PLUGINS[name]
     library = chosen.library
     nlp = task.gauss_newton if chosen.hessian == "gauss-newton" else task.nlp
     trace = Trace(task.folder / "trace", nlp.nx)
     watch = _Watch(trace, task.limits.seconds)
+    # parameters are replaced by numbers, since bonmin has no parameters
+    x, functions = ca.MX.sym("x", nlp.nx), Functions(nlp)
+    # these differentiate f and g when they are made, in spite of cached derivatives
+    symbolic = library in ("bonmin", "uno")
+    f, g = nlp.oracle(x, nlp.p) if symbolic else functions.oracle(x, nlp.thetas())
     common: dict[str, Any] = {
         "print_time": False,
         "show_eval_warnings": False,
         "error_on_fail": False,
-        "no_nlp_grad": library in ("ipopt", "sqpmethod"),
+        "no_nlp_grad": library in CALLS_BACK,
+        "cache": _derivatives(nlp, functions, CACHED[library]),
     }
-    # parameters are replaced by numbers, since bonmin has no parameters
-    if library in CACHED:
-        x = ca.MX.sym("x", nlp.nx)
-        functions = Functions(nlp)
-        # these differentiate f and g when they are made, in spite of cached derivatives
-        symbolic = library in ("bonmin", "uno")
-        f, g = nlp.oracle(x, nlp.p) if symbolic else functions.oracle(x, nlp.thetas())
-        common["cache"] = _derivatives(nlp, functions, CACHED[library])
-    else:
-        x = ca.SX.sym("x", nlp.nx)
-        f, g = nlp.oracle.expand()(x, nlp.p)
-        g = ca.densify(g)
     if library in CALLS_BACK:
         watch.start("watch", nlp.nx, nlp.ng, 0)
         common["iteration_callback"] = watch

@@ -33,7 +33,7 @@ def cost_table(frame: pd.DataFrame, measure: str) -> pd.DataFrame:
 
     `measure` is a column: "seconds", "cpu_seconds", "energy" or "objective".
     """
-    cost = frame[measure].astype(float).where(frame["verified"].astype(bool), np.inf)
+    cost = frame[measure].astype(float).where(frame["verified"], np.inf)
     if "seconds" in measure:
         cost = cost.clip(lower=MIN_SECONDS)
     table = frame[[*PROBLEM, "solver"]].assign(cost=cost)

@@ -1,8 +1,7 @@
-"""Solvers by name: CasADi's plug-ins, executables that read .nl, SCIP, the reference solver."""
+"""Solvers by name: CasADi's plug-ins, executables that read .nl, the reference solver."""
 
 from __future__ import annotations
 
-import importlib.util
 import shlex
 import shutil
 import subprocess
@@ -12,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 import casadi as ca
-import numpy as np
 
 from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
 from soup_nlp.bench.solvers.plugins import (
@@ -80,36 +78,6 @@ def pounce(command: str, task: Task, near: bool = False) -> Answer:
     return executable(command, task, [f"{k}={v}" for k, v in options.items()])
 
 
-def scip(task: Task) -> Answer:
-    """Solve the .nl file with SCIP, a global solver for small problems."""
-    import pyscipopt
-
-    begin = clock()
-    write_nl(task.folder / "soup.nl", task.nlp)
-    names = (task.folder / "soup.col").read_text().split()
-    place = {name: k for k, name in enumerate(task.nlp.x_names())}
-    model = pyscipopt.Model()
-    model.hideOutput()
-    model.readProblem(str(task.folder / "soup.nl"))
-    model.setParam("limits/time", max(1.0, task.limits.seconds - (clock() - begin)))
-    model.setParam("numerics/feastol", max(task.limits.feasibility, 1e-9))
-    found = {v.name: v for v in model.getVars()}
-    start = model.createPartialSol()
-    for name in names:
-        model.setSolVal(start, found[name], float(task.nlp.x0[place[name]]))
-    model.addSol(start)
-    model.optimize()
-    status, best = str(model.getStatus()), model.getBestSol()
-    if best is None or not model.getNSols():
-        seconds = clock() - begin
-        return Answer(None, None, f"{status}, no point", False, -1, seconds)
-    x = np.empty(task.nlp.nx)
-    for name in names:
-        x[place[name]] = best[found[name]]
-    nodes = int(model.getNTotalNodes())
-    return Answer(x, None, status, status == "optimal", nodes, clock() - begin)
-
-
 def reference(task: Task) -> Answer:
     """Solve with Levenberg-Marquardt on the manifold; the answer has no multipliers.
 
@@ -161,8 +129,6 @@ def available() -> dict[str, Solver]:
         out["pounce-tuned"] = partial(pounce, command, near=True)
     out["lm"] = reference
     out["soup-nlp"] = package
-    if importlib.util.find_spec("pyscipopt"):
-        out["scip"] = scip
     return out
 
 
@@ -175,13 +141,12 @@ def find_solver(name: str) -> Solver:
     known = available()
     if name in known:
         return known[name]
-    options: list[str] = []
-    command = None if name in PLUGINS or name == "scip" else _find(name)
-    if command is None and name not in PLUGINS and name != "scip":
-        # options may follow the name of the program
+    # options may follow the name of the program, whose path may have spaces
+    command, options = _find(name), list[str]()
+    if command is None:
         program, *options = shlex.split(name) or [""]
         command = _find(program)
-    if command is None:
+    if command is None or name in PLUGINS:
         raise SolverError(
             "solver is not here",
             where="--solvers",

@@ -70,14 +70,7 @@ def make_tasks(
 
 
 def task_maker(case: Case, build: Build, limits: Limits) -> Maker:
-    """Maker of the task of a case.
-
-    Args:
-        case: Data and weights.
-        build: Makes the NLP with a Hessian, its layout and formulation; the start is that of the
-            NLP.
-        limits: Limits of every solver.
-    """
+    """Maker of the task of a case, whose `build` makes the NLP with a Hessian."""
 
     @cache
     def built() -> Task:
@@ -97,9 +90,8 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
     `label` has the entries that identify the task, and "energy_limit".
     """
     work = find_solver(solver)
-    trace = Trace(task.folder / "trace", task.nlp.nx)
+    trace, limits = Trace(task.folder / "trace", task.nlp.nx), task.limits
     trace.path.unlink(missing_ok=True)
-    limits = task.limits
     ended = isolated(
         lambda: work(task),
         task.folder,
