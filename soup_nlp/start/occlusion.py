@@ -13,7 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from soup_nlp.arrays import Float, Image, Int, Mask
+from soup_nlp.arrays import Float, Image, Int
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
@@ -74,10 +74,10 @@ def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
     rows = np.flatnonzero(fitted.jump >= CLOSING_PX)
     if not len(rows):
         return out
-    blurred = [
+    before, after = (
         cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8)
         for image in (pair.image_ref, pair.image_next)
-    ]
+    )
     ends, edge = seg.pairs[rows], seg.boundary[rows]
     normal = _normals(edge, seg.anchors[ends[:, 1]] - seg.anchors[ends[:, 0]])
 
@@ -92,23 +92,19 @@ def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
     inside = step <= np.clip(np.abs(closing) + 1.5, 2, WIDEST)[:, None, None]
     share = (np.arange(WIDEST) + 0.5)[:, None] / WIDEST
     between = landed[0][:, :, None] + (landed[1] - landed[0])[:, :, None] * share
-    gap = _flat(_look_up(blurred[1], between))
-    there = _within(between, pair.image_next).reshape(len(rows), -1)
+    gap = _colours(after, between)
     covered, alike = np.full((2, len(rows), 2), np.nan)
     for e, side in ((0, -1.0), (1, 1.0)):
         at = edge[:, :, None] + side * normal[:, None, None] * step[:, None]
-        own = _within(at, pair.image_ref) & inside
-        own[own] &= (
-            seg.labels[tuple(np.rint(at[own]).astype(int).T[::-1])]
-            == np.broadcast_to(ends[:, e, None, None], own.shape)[own]
+        u, v = np.moveaxis(np.rint(at).astype(int), -1, 0)
+        own = inside & (
+            seg.labels.take(v * seg.labels.shape[1] + u, mode="clip") == ends[:, e, None, None]
         )
-        colour, after = _look_up(blurred[0], at), target(ends[:, e], at)
-        change = np.abs(colour - _look_up(blurred[1], after)).mean(axis=-1)
-        covered[:, e] = _mean(change, own & _within(after, pair.image_next))
-        off = np.abs(gap[:, :, None] - _flat(colour)[:, None]).mean(axis=-1)
-        nearest = np.where(own.reshape(len(own), 1, -1), off, MOST_GREY).min(axis=2)
-        enough = there & (own.sum(axis=(1, 2)) >= FEWEST)[:, None]
-        alike[:, e] = _mean(nearest, enough)
+        strip = np.where(own.reshape(len(own), -1, 1), _colours(before, at), np.nan)
+        covered[:, e] = _cost(np.abs(strip - _colours(after, target(ends[:, e], at))).mean(axis=-1))
+        off = np.abs(gap[:, :, None] - strip[:, None]).mean(axis=-1)
+        enough = np.isfinite(strip[..., 0]).sum(axis=1) >= FEWEST
+        alike[enough, e] = _cost(np.fmin.reduce(off[enough], axis=2))
     contrast = np.where(closing > 0, covered @ [1.0, -1.0], alike @ [-1.0, 1.0])
     out[rows] = np.where(np.abs(closing) > CLOSING_PX, np.nan_to_num(contrast), 0.0)
     return out
@@ -117,36 +113,28 @@ def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
 def _normals(edge: Float, way: Float) -> Float:
     """(M, 2) normals of boundaries (M, B, 2) that point along `way` (M, 2)."""
     off = edge - edge.mean(axis=1, keepdims=True)
-    (xx, xy), (_, yy) = np.moveaxis(np.einsum("mbi,mbj->mij", off, off), 0, -1)
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)
-    normal = np.where((xx + yy < 1)[:, None], way, np.stack([-np.sin(angle), np.cos(angle)], 1))
+    scatter = np.einsum("mbi,mbj->mij", off, off)
+    point = np.trace(scatter, axis1=1, axis2=2) < 1
+    normal = np.where(point[:, None], way, np.linalg.eigh(scatter)[1][:, :, 0])
     normal = normal * np.where(np.sum(normal * way, axis=1) < 0, -1.0, 1.0)[:, None]
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
-def _look_up(image: Image, at: Float) -> Float:
-    """(M, B, T, 3) values of an image between its pixels, at (M, B, T, 2)."""
+def _colours(image: Image, at: Float) -> Float:
+    """(M, B T, 3) values of an image between its pixels, at (M, B, T, 2); NaN outside."""
     u, v = np.moveaxis(at.astype(np.float32).reshape(len(at), -1, 2), -1, 0)
     found = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found.reshape(*at.shape[:-1], -1), float)
+    rows, columns = image.shape[:2]
+    there = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
+    return np.where(there[..., None], found, np.nan)
 
 
-def _within(at: Float, image: Image) -> Mask:
-    """Whether pixels (..., 2) lie in an image."""
-    return np.asarray(((at >= 0) & (at <= np.array(image.shape[1::-1]) - 1.0)).all(axis=-1))
-
-
-def _flat(values: Float) -> Float:
-    """(M, B T, C) of (M, B, T, C)."""
-    return values.reshape(len(values), -1, values.shape[-1])
-
-
-def _mean(cost: Float, used: Mask) -> Float:
-    """(M,) mean of limited costs where they are used; NaN for too few."""
-    cost = np.minimum(cost, MOST_GREY).reshape(len(cost), -1)
-    used = used.reshape(len(used), -1)
-    count = used.sum(axis=1)
-    return np.where(count >= FEWEST, (cost * used).sum(axis=1) / np.maximum(count, 1), np.nan)
+def _cost(change: Float) -> Float:
+    """(M,) mean of limited changes (M, T), which are NaN where unknown; NaN for too few."""
+    known = np.isfinite(change)
+    count = known.sum(axis=1)
+    total = np.where(known, np.minimum(change, MOST_GREY), 0.0).sum(axis=1)
+    return np.where(count >= FEWEST, total / np.maximum(count, 1), np.nan)
 
 
 def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
