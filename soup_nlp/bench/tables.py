@@ -25,8 +25,8 @@ from soup_nlp.bench.study import (
 from soup_nlp.errors import DataError
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import Frames, find_depths, find_images, scene_frames
-from soup_nlp.sequence.pairs import ROWS, solve_pairs
 from soup_nlp.sequence.score import score
+from soup_nlp.sequence.solve import ROWS, solve_pairs
 from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.rows import Row, read_rows
 

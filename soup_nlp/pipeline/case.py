@@ -13,7 +13,7 @@ from soup_nlp.data.flow.borders import follow_depth, follow_flow
 from soup_nlp.data.flow.layers import corrected, still, without_still_layer
 from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
-from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.pair import Pair
 from soup_nlp.data.working_size import resized_flow, working_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
@@ -171,7 +171,11 @@ def _with_flow(
         pair: The pair at the size that is solved.
         log: Called with a line where there is such a layer.
     """
-    flow = _flow(problem, full, pair)
+    flow = pair.flow
+    if flow is None and pair is not full and problem.flow.is_file():
+        # a file has the size of the images
+        flow = resized_flow(problem.flow.load(full, problem.path), full, pair)
+    flow = flow or problem.flow.load(pair, problem.path)
     pair = pair.with_flow(flow)
     computed = is_named(flow.source) and not flow.source.startswith("truth")
     seen = see_through(pair, problem.seed) if problem.flow.see_through and computed else None
@@ -182,15 +186,6 @@ def _with_flow(
     return pair.with_flow(seen.flow), seen
 
 
-def _flow(problem: Problem, full: Pair, pair: Pair) -> Flow:
-    """The flow of a pair that was made smaller, or not; a file has the size of the images."""
-    if pair.flow is not None:
-        return pair.flow
-    if pair is full or not problem.flow.is_file():
-        return problem.flow.load(pair, problem.path)
-    return resized_flow(problem.flow.load(full, problem.path), full, pair)
-
-
 def superpixels(problem: Problem, pair: Pair, count: int | None = None) -> Labels:
     """The superpixels that a problem asks for, or so many, on a pair that carries its flow."""
     assert pair.flow is not None
@@ -199,15 +194,10 @@ def superpixels(problem: Problem, pair: Pair, count: int | None = None) -> Label
     return labels if s.follow_flow_px is None else follow_flow(labels, pair.flow, s.follow_flow_px)
 
 
-def _bends(problem: Problem, start: Start) -> bool:
-    """Whether the energy for surfaces that bend is in force anywhere."""
-    return start.bending and problem.energy.units == "pixel"
-
-
 def solver_options(problem: Problem, start: Start) -> SolverOptions:
     """The solver's options of a problem, its smoothing no wider than surfaces allow."""
     solver = problem.solver
-    if not _bends(problem, start):
+    if not start.bending or problem.energy.units != "pixel":
         return solver
     # widths above the limit become the limit, which then occurs once
     eps = dict.fromkeys(min(e, WIDEST_BENDING_EPS) for e in solver.presolve_eps)
@@ -272,12 +262,21 @@ NEIGHBOURS = 3
 """Neighbour pairs per superpixel; a planar graph has no more."""
 
 
-def estimate(problem: Problem, pair: Pair) -> dict[str, float]:
-    """Bytes that a solve takes, by what takes them; sums of measured parts, right within a factor
-    of two."""
+def check_fits(problem: Problem, pair: Pair) -> None:
+    """Raise DataError for more superpixels than the image has room for, or too little memory.
+
+    The bytes of a solve are sums of measured parts, right within a factor of two.
+    """
     s, r = problem.segmentation, problem.refine
     height, width = pair.size
     pixels, n = height * width, s.superpixels
+    if n > pixels // 4:
+        raise DataError(
+            "number of superpixels does not fit the image",
+            where="segmentation.superpixels",
+            found=n,
+            expected=f"1 to {pixels // 4} for {width}x{height}",
+        )
     graph = n * (s.neighbours + NEIGHBOURS)
     # a superpixel cannot have more samples than pixels, nor more boundary than its own
     sampled = problem.energy.pixel_samples
@@ -285,39 +284,25 @@ def estimate(problem: Problem, pair: Pair) -> dict[str, float]:
     around = 4 * (pixels / n) ** 0.5
     points = around if s.boundary_samples == "all" else min(around, s.boundary_samples)
     tables = 2.0 * graph * r.particles**2 * 8 if r.enabled else 0.0
-    return {
-        "images": float(PIXEL * pixels),
-        "sampled pixels": float(ROW * inside),
-        "boundary points": ROW * n * NEIGHBOURS * points,
-        "graph": float(EDGE * graph),
-        "particles": tables,
+    parts = {
+        "images": (PIXEL * pixels, "smaller images, with their intrinsics"),
+        "sampled pixels": (ROW * inside, "a lower energy.pixel_samples"),
+        "boundary points": (
+            ROW * n * NEIGHBOURS * points,
+            "a lower segmentation.boundary_samples",
+        ),
+        "graph": (
+            EDGE * graph,
+            "a lower segmentation.superpixels or segmentation.neighbours",
+        ),
+        "particles": (
+            tables,
+            "a lower refine.particles, segmentation.superpixels or segmentation.neighbours",
+        ),
     }
-
-
-LOWER = {
-    "images": "smaller images, with their intrinsics",
-    "sampled pixels": "a lower energy.pixel_samples",
-    "boundary points": "a lower segmentation.boundary_samples",
-    "graph": "a lower segmentation.superpixels or segmentation.neighbours",
-    "particles": "a lower refine.particles, segmentation.superpixels or segmentation.neighbours",
-}
-"""What makes each part smaller."""
-
-
-def check_fits(problem: Problem, pair: Pair) -> None:
-    """Raise DataError for more superpixels than the image has room for, or too little memory."""
-    n, height, width = problem.segmentation.superpixels, *pair.size
-    if n > height * width // 4:
-        raise DataError(
-            "number of superpixels does not fit the image",
-            where="segmentation.superpixels",
-            found=n,
-            expected=f"1 to {height * width // 4} for {width}x{height}",
-        )
-    parts = estimate(problem, pair)
-    most = max(parts, key=lambda name: parts[name])
-    shares = ", ".join(f"{name} {value / 1e9:.3g} GB" for name, value in parts.items())
-    require_memory(sum(parts.values()), "this problem", shares, LOWER[most])
+    total, (_, hint) = sum(size for size, _ in parts.values()), max(parts.values())
+    shares = ", ".join(f"{name} {size / 1e9:.3g} GB" for name, (size, _) in parts.items())
+    require_memory(total, "this problem", shares, hint)
 
 
 # --- a layer that stands still before the scene --------------------------------------------------

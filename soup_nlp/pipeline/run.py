@@ -5,26 +5,19 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from types import FunctionType, NoneType
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel
 
-from soup_nlp.config.problem import (
-    Expected,
-    OutputOptions,
-    Problem,
-    SegmentationOptions,
-    make_problem,
-    title,
-)
+from soup_nlp.config.problem import Problem, make_problem, title
 from soup_nlp.data.accept import prior_of
 from soup_nlp.data.flow.consistency import check_flow
-from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.formats.cameras import check_cameras
-from soup_nlp.data.inputs import PriorOptions, pair_hash, resized_prior
+from soup_nlp.data.inputs import pair_hash, resized_prior
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import StoppedError, expect
 from soup_nlp.evaluate.baselines import rigid_depth
@@ -33,18 +26,13 @@ from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
-from soup_nlp.model.energy_options import EnergyOptions
-from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run, full_size
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
-from soup_nlp.refine.records import Refined, RefineOptions
+from soup_nlp.refine.records import Refined
 from soup_nlp.solve.kkt import constraint_residuals
-from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
-from soup_nlp.start.propose import Start
-from soup_nlp.start.start_options import StartOptions
 from soup_nlp.storage.progress import Listener, Watch
 
 EXACT, EXACT_PARALLAX = 0.015, 1.0
@@ -140,9 +128,14 @@ def run(
 
 
 def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
-    """The refinement of the NLP's solution or the start, with the images unless flow is exact."""
-    problem, photo = case.problem, None
-    if not flow_is_exact(case.start):
+    """The refinement of the NLP's solution or the start.
+
+    The images count unless rigid motions explain the flow better than images could tell. Flow that
+    stands still does not count as exact: anything explains it.
+    """
+    problem, start, photo = case.problem, case.start, None
+    exact = np.median(start.parallax) > EXACT_PARALLAX and np.median(start.error) < EXACT
+    if not exact:
         photo = photometric_term(
             case.seen, case.segmentation.labels, soup, case.data, problem.refine
         )
@@ -151,22 +144,13 @@ def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
         case.data,
         case.weights,
         problem.refine,
-        start=case.start.soup,
+        start=start.soup,
         photo=photo,
         seed=problem.seed,
         min_facing=problem.formulation.min_facing,
         depth_ratio=problem.formulation.depth_ratio,
         watch=watch,
     )
-
-
-def flow_is_exact(start: Start) -> bool:
-    """Whether rigid motions explain the flow better than images could tell: it is a true flow.
-
-    A scene without parallax does not count: flow that stands still is explained by anything.
-    """
-    moves = float(np.median(start.parallax)) > EXACT_PARALLAX
-    return moves and float(np.median(start.error)) < EXACT
 
 
 def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> Run:
@@ -237,70 +221,32 @@ def skipped(case: Case) -> Solution:
     )
 
 
-Options = Mapping[str, Any]
-"""Keys of a section of a problem file."""
-
-
 def solve_pair(
     pair: Pair,
     *,
     prior_ref: object = None,
     progress: bool | Listener = False,
-    preset: str | None = None,
-    seed: int = 0,
-    max_size: float | None = 1.5,
     cropped: bool = False,
-    segmentation: Options | SegmentationOptions | None = None,
-    flow: Options | FlowOptions | None = None,
-    depth_prior: Options | PriorOptions | None = None,
-    start: Options | StartOptions | None = None,
-    energy: Options | EnergyOptions | None = None,
-    formulation: Options | FormulationOptions | None = None,
-    solver: Options | SolverOptions | None = None,
-    refine: Options | RefineOptions | None = None,
-    expected: Options | Expected | None = None,
-    output: Options | OutputOptions | None = None,
+    **keys: object,
 ) -> Run:
     """Solve a pair that is in memory.
 
     The problem of the run holds a hash of the pair, so its config.yaml cannot be solved again.
-    `soup-nlp show street` lists the keys of every section.
+    `soup-nlp show street` lists the keys of a problem.
 
     Args:
         pair: Images, cameras, and a flow if there is one (else OpenCV DIS).
         prior_ref: Depth of the reference frame from elsewhere, (H, W) or a file.
         progress: True prints a line after every stage; a function is called at every iteration.
-        preset: "paper" for the method as printed.
-        seed: Of every random draw.
-        max_size: Largest image that is solved as it is, megapixels; None for no limit.
         cropped: The images are parts of larger ones: the principal points may be anywhere.
-        segmentation: E.g. `{"superpixels": 500}` or `SegmentationOptions(superpixels=500)`.
-        flow: Where the flow comes from, if the pair has none.
-        depth_prior: What the values of `prior_ref` are, e.g. `{"kind": "inverse"}`.
-        start: How the start is made.
-        energy: Terms, weights, units.
-        formulation: How the energy is written for the solver.
-        solver: Stages and limits.
-        refine: Discrete refinement.
-        expected: What the run should score.
-        output: What a result folder holds.
+        keys: Keys of a problem file: `preset`, `seed`, `max_size`, and sections such as
+            `segmentation={"superpixels": 500}` or `segmentation=SegmentationOptions(...)`. A
+            section that is None has its defaults.
 
     Raises:
         ConfigError: an option is wrong.
         DataError: the pair cannot be used.
     """
-    sections = {
-        "segmentation": segmentation,
-        "flow": flow,
-        "depth_prior": depth_prior,
-        "start": start,
-        "energy": energy,
-        "formulation": formulation,
-        "solver": solver,
-        "refine": refine,
-        "expected": expected,
-        "output": output,
-    }
     expect(pair, Pair, "pair", PAIR)
     if prior_ref is not None:
         prior = resized_prior(prior_of(prior_ref), pair, "prior_ref")
@@ -309,14 +255,11 @@ def solve_pair(
     check_cameras((pair.K_ref, pair.K_next), images, names, cropped)
     if pair.flow is not None:
         check_flow(pair.flow, pair)
-    raw: dict[str, Any] = {"preset": preset, "seed": seed}
-    if max_size != Problem.model_fields["max_size"].default:
-        # the default is that of the preset
-        raw["max_size"] = max_size
-    for key, section in sections.items():
-        if section is not None:
-            dump = getattr(section, "model_dump", None)
-            raw[key] = section if dump is None else dump(exclude_unset=True)
+    raw: dict[str, Any] = {
+        key: value.model_dump(exclude_unset=True) if isinstance(value, BaseModel) else value
+        for key, value in keys.items()
+        if value is not None or key == "max_size"
+    }
     raw |= {"name": title(pair.name), "input": {"kind": "memory", "hash": pair_hash(pair)}}
     begin = time.perf_counter()
 

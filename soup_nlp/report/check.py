@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,8 @@ ROUNDINGS = 16
 LOST = 1e-4
 """Share of the pixels that may lie on either side of a horizon."""
 RECOMPUTED, WRITTEN = "recomputed", "as written"
+MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, MemoryError)
+"""Errors of claims and arrays that are missing or do not fit together."""
 LEFT = (
     "dual infeasibility and complementarity, which need the model's derivatives",
     "whether images, flow, labels, truth, data of the energy, multipliers and E_photo are right",
@@ -80,10 +82,9 @@ class Claim:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Claims that were checked, and descriptions of what was not recomputed."""
+    """Claims that were checked."""
 
     rows: tuple[Claim, ...]
-    left: tuple[str, ...] = LEFT
 
     @property
     def ok(self) -> bool:
@@ -96,7 +97,7 @@ class CheckReport:
         lines = [
             f"     {counts[RECOMPUTED]} claims are recomputed from the arrays",
             f"     {counts[WRITTEN]} are compared with the SHA-256 or the copy in result.h5",
-            *(f"     left: {text}" for text in self.left),
+            *(f"     left: {text}" for text in LEFT),
         ]
         return "\n".join([head, *map(str, self.rows), *lines])
 
@@ -139,14 +140,10 @@ def check_folder(folder: str | Path) -> CheckReport:
         require_layout(tree)
         stored = Stored(folder, claims, tree, attrs)
         return CheckReport(tuple(claim for check in CHECKS for claim in check(stored)))
-    except KeyError as error:
-        raise DataError("result lacks a claim or an array", where=folder, found=error) from error
-    except (ValueError, IndexError, TypeError, AttributeError, ArithmeticError) as error:
-        raise DataError(
-            "claims and arrays of a result do not fit together", where=folder, found=error
-        ) from error
-    except (np.linalg.LinAlgError, MemoryError) as error:
-        raise DataError("arrays of a result cannot be used", where=folder, found=error) from error
+    except MISFITS as error:
+        lacks = isinstance(error, KeyError)
+        what = "lacks a claim or an array" if lacks else "has claims and arrays that do not fit"
+        raise DataError(f"result {what}", where=folder, found=error) from error
 
 
 def _number(value: Any) -> float:
@@ -224,9 +221,11 @@ def _scores(r: Stored) -> Iterator[Claim]:
         constant = mre if name == "constant" else constant
         if "skill" in claim and constant > 0:
             found["skill"] = 1 - mre / constant
-        yield Claim(f"mre {name}", _number(claim["mre"]), mre, RELATIVE * abs(mre) + ABSOLUTE)
-        claimed = {k: _number(claim[k]) for k in found}
-        rows = [Claim(k, claimed[k], v, RELATIVE * abs(v) + ABSOLUTE) for k, v in found.items()]
+        first, *rows = [
+            Claim(k, _number(claim[k]), v, RELATIVE * abs(v) + ABSOLUTE)
+            for k, v in {"mre": mre, **found}.items()
+        ]
+        yield replace(first, name=f"mre {name}")
         note = ", ".join(f"{c.name} is {c.found:.6g}" for c in rows if not c.ok)
         right = float(sum(c.ok for c in rows))
         yield Claim(f"other scores {name}", float(len(rows)), right, note=note)
@@ -250,16 +249,13 @@ def _compared(tree: Entries, name: str) -> tuple[Float, Float]:
     return (np.ones_like(gt) if name == "constant" else z), gt
 
 
-def _agree(name: str, ok: bool, note: str = "") -> Claim:
-    return Claim(name, 1.0, float(ok), note=note, how=WRITTEN)
-
-
 def _entries(r: Stored) -> Iterator[Claim]:
     """Every entry of summary.json against the copy in result.h5."""
     written = _leaves(json.loads(str(require(r.tree, f"{RECORD}/summary"))))
     now = _leaves(r.claims)
     changed = sorted(k for k in written.keys() | now.keys() if written.get(k, k) != now.get(k, k))
-    yield _agree("entries of summary.json", not changed, ", ".join(changed[:3]))
+    note = ", ".join(changed[:3])
+    yield Claim("entries of summary.json", 1.0, float(not changed), note=note, how=WRITTEN)
 
 
 def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
@@ -272,18 +268,20 @@ def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
 
 def _files(r: Stored) -> Iterator[Claim]:
     """Every other file against its SHA-256, and the arrays and attributes of result.h5."""
+    digest = read_digest(r.folder / "result.h5")
+    notes = {"contents of result.h5": "" if r.attrs.get(DIGEST) == digest else "changed"}
     files = recorded_files(r.tree)
     if not files:
-        yield _agree("files as written", False, "result.h5 has no record of the files")
-    for name, digest in files.items():
-        # another claim compares the entries of summary.json
-        if name != "summary.json":
-            path = r.folder / name
-            ok = ".." not in name and path.is_file() and digest_of(path) == digest
-            note = "" if ok else "changed" if path.is_file() else "missing"
-            yield _agree(f"{name} as written", ok, note)
-    good = r.attrs.get(DIGEST) == read_digest(r.folder / "result.h5")
-    yield _agree("contents of result.h5 as written", good)
+        notes["files"] = "result.h5 has no record of the files"
+    # another claim compares the entries of summary.json
+    for name in sorted(files.keys() - {"summary.json"}):
+        path = r.folder / name
+        if ".." in name or not path.is_file():
+            notes[name] = "missing"
+        else:
+            notes[name] = "" if digest_of(path) == files[name] else "changed"
+    for name, note in notes.items():
+        yield Claim(f"{name} as written", 1.0, float(not note), note=note, how=WRITTEN)
 
 
 CHECKS: tuple[Callable[[Stored], Iterator[Claim]], ...] = (

@@ -139,18 +139,16 @@ def _place(sheet: Pil.Image, image: Image, left: int, top: int, width: int, heig
     sheet.paste(Pil.fromarray(scaled), (left, top))
 
 
-def overview(path: PathLike, found: Mapping[str, Picture], title: str) -> None:
-    """Write the overview of a result: its pictures in a grid of three columns without gaps."""
-    write_png(path, strip(without_gaps(found), title))
+def overview(found: Mapping[str, Picture], title: str) -> Image:
+    """The pictures of a result in a grid of three columns.
 
-
-def without_gaps(found: Mapping[str, Picture]) -> list[Picture]:
-    """The pictures of an overview, without `_SPARE` ones if they would leave a row incomplete."""
+    `_SPARE` ones are left out if they would leave a row incomplete.
+    """
     panels = dict(found)
     for name in _SPARE:
         if len(panels) % 3:
             panels.pop(name, None)
-    return [*panels.values()]
+    return strip([*panels.values()], title)
 
 
 def write_png(path: PathLike, rgb: Image) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from functools import wraps
@@ -14,22 +14,22 @@ from typing import Any, ParamSpec
 
 from PIL.Image import Image, fromarray
 
+from soup_nlp.arrays import AnyFloat
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import DataError
 from soup_nlp.pipeline import run as pipeline
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.figures import (
     overview,
-    strip,
-    without_gaps,
     write_clipped_depth_png16,
     write_picture,
+    write_png,
 )
 from soup_nlp.report.findings import summary
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import record_of, recorded_files, result_tree
 from soup_nlp.report.page import page
-from soup_nlp.report.pictures import Picture, pictures
+from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import PAGE, html, load, result_of
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.files import as_path, write_text
@@ -37,26 +37,27 @@ from soup_nlp.storage.folders import claim, digest_of, files_in, staged
 from soup_nlp.storage.h5_files import RECORD, read_h5
 from soup_nlp.storage.store import replace_group, write_h5, write_json
 
-FULL = {"ref_full": "depth_ref_full.png", "next_full": "depth_next_full.png"}
+FULL = ("depth_ref_full.png", "depth_next_full.png")
 """Files of the depth at the size of the images, for a pair that was solved at a smaller size."""
+
+PICTURES = {
+    **{name: f"{name}_colour.png" for name in ("depth_ref", "depth_next")},
+    "superpixels": "superpixels.png",
+    "components": "components.png",
+    "flow": "flow.png",
+    "flow_confidence": "flow_confidence.png",
+    "normals": "normals.png",
+    "confidence": "confidence.png",
+    "error": "error.png",
+}
+"""Files of the pictures that are also written alone, by name of the picture."""
 
 FILES = (
     *("config.yaml", "result.h5", "summary.json", "log.txt", "ipopt.log"),
-    *("depth_ref.png", "depth_next.png", "depth_ref_colour.png", "depth_next_colour.png"),
-    *("superpixels.png", "components.png", "flow.png", "flow_confidence.png", "normals.png"),
-    *("confidence.png", "error.png", "overview.png", PAGE, "motions.json", "trajectory.tum"),
-    *("points_ref.ply", "points_next.ply"),
+    *("depth_ref.png", "depth_next.png", *PICTURES.values(), "overview.png", PAGE),
+    *("motions.json", "trajectory.tum", "points_ref.ply", "points_next.ply"),
 )
 """Files of a result folder. error.png needs a dense truth, confidence.png a known uncertainty."""
-
-PICTURES = {name: f"{name}_colour.png" for name in ("depth_ref", "depth_next")} | {
-    name: f"{name}.png"
-    for name in (
-        *("superpixels", "components", "flow", "flow_confidence", "normals", "confidence"),
-        "error",
-    )
-}
-"""Files of the pictures that are also written alone, by name of the picture."""
 
 FAILED = "failed.log"
 """Log of a solve that failed; the next result removes it."""
@@ -80,33 +81,25 @@ def prepare_folder(
         DataError: the folder cannot be written, or holds a file that must not be overwritten.
     """
     folder = as_path(folder, "output folder")
-    if inputs is not None:
-        _keep_inputs(folder, inputs)
-    return claim(folder, (*FILES, *FULL.values(), FAILED), overwrite, subject)
-
-
-def _keep_inputs(folder: Path, inputs: Iterable[Path]) -> None:
-    """Raise DataError if a result would overwrite its inputs or be in the same folder."""
-
-    def refuse(what: str, expected: str, found: str | None = None) -> DataError:
-        return DataError(
-            what, where=folder, found=found, expected=expected, hint="choose another --out"
-        )
-
     # realpath, unlike resolve, accepts a link to itself
     here = Path(os.path.realpath(folder))
-    for place in inputs:
+    for place in inputs or ():
         if place == here:
-            raise refuse(
+            raise DataError(
                 "output folder is the input's folder",
-                "a folder of its own: depth and flow of a result would pass for truth",
+                where=folder,
+                expected="a folder of its own: depth and flow of a result would pass for truth",
+                hint="choose another --out",
             )
-        if place.parent == here and place.name in (*FILES, *FULL.values()):
-            raise refuse(
+        if place.parent == here and place.name in (*FILES, *FULL):
+            raise DataError(
                 "an input would be overwritten by the result",
-                "a folder that holds none of the inputs under the name of a result's file",
-                place.name,
+                where=folder,
+                found=place.name,
+                expected="a folder that holds no input under the name of a result's file",
+                hint="choose another --out",
             )
+    return claim(folder, (*FILES, *FULL, FAILED), overwrite, subject)
 
 
 def write_folder(
@@ -182,30 +175,22 @@ def _write_files(
     contents = summary(run)
     result = result_of(run, contents, facts(run) if verdict is None else verdict)
     drawn = pictures(result)
-    scales = _pictures(folder, run, drawn)
+    rec = run.reconstruction
+    depths: dict[str, AnyFloat] = {"ref": rec.depth_ref, "next": rec.depth_next}
+    if run.full is not None:
+        depths |= {"ref_full": run.full.depth_ref, "next_full": run.full.depth_next}
+    scales = {
+        name: write_clipped_depth_png16(folder / f"depth_{name}.png", z)
+        for name, z in depths.items()
+    }
+    for name, file in PICTURES.items():
+        if name in drawn:
+            write_picture(folder / file, drawn[name])
+    write_png(folder / "overview.png", overview(drawn, run.problem.name))
     write_formats(folder, result, ("motions", "ply", *formats))
     if run.problem.output.page:
         write_text(folder / PAGE, page(result, drawn))
     write_json(folder / "summary.json", {**contents, "depth_png_scale": scales})
-
-
-def _pictures(folder: Path, run: Run, drawn: Mapping[str, Picture]) -> dict[str, float]:
-    """Write the pictures; returns the values per unit of length of the 16-bit depth maps."""
-    rec = run.reconstruction
-    scales = {
-        name: write_clipped_depth_png16(folder / f"depth_{name}.png", depth)
-        for name, depth in (("ref", rec.depth_ref), ("next", rec.depth_next))
-    }
-    for name, file in FULL.items():
-        (folder / file).unlink(missing_ok=True)
-        if run.full is not None:
-            depth = getattr(run.full, f"depth_{name.removesuffix('_full')}")
-            scales[name] = write_clipped_depth_png16(folder / file, depth)
-    for name, file in PICTURES.items():
-        if name in drawn:
-            write_picture(folder / file, drawn[name])
-    overview(folder / "overview.png", drawn, run.problem.name)
-    return scales
 
 
 def renew_page(folder: Path) -> Path:
@@ -266,11 +251,10 @@ def convert(
         ConfigError: a format is not known.
         DataError: the folder holds no result, or the other one cannot be written.
     """
-    names = check_formats(formats)
     result = load(folder)
     where = extended(folder, overwrite) if out is None else staged(out, overwrite=overwrite)
     with where as new:
-        return write_formats(new, result, names)
+        return write_formats(new, result, formats)
 
 
 # --- the run that Python gets --------------------------------------------------------------------
@@ -309,7 +293,7 @@ class WritableRun(Run):
     def plot(self) -> Image:
         """The overview as a picture: notebooks show it, `.save` writes it."""
         drawn = pictures(result_of(self, summary(self)))
-        return fromarray(strip(without_gaps(drawn), self.problem.name))
+        return fromarray(overview(drawn, self.problem.name))
 
     def _repr_html_(self) -> str:
         """Text and overview, for notebooks."""

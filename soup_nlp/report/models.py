@@ -125,6 +125,14 @@ def surface_mesh(result: Result, frame: int) -> tuple[Float, Int, Float]:
     return points.reshape(-1, 3)[used], faces.reshape(-1, 3), pixels
 
 
+def thinned(mask: Mask, most: float) -> Mask:
+    """The pixels of a mask (H, W) in every k-th row and column, about `most` of them or fewer."""
+    step = max(1, int(np.ceil(np.sqrt(mask.sum() / most))))
+    out = np.zeros_like(mask)
+    out[::step, ::step] = mask[::step, ::step]
+    return out
+
+
 def write_glb(path: PathLike, result: Result, frame: int) -> int:
     """Write the mesh of frame 0 or 1, textured with the image; returns the number of triangles.
 
@@ -278,11 +286,7 @@ def _images(
 
 def _points(result: Result, still: Mask) -> tuple[tuple[Float, Float], Float, NDArray[np.uint8]]:
     """Pixels (P, 2) in both images, points (P, 3) and colours (P, 3) on an even grid."""
-    keep = still & result.sure
-    step = max(1, int(np.ceil(np.sqrt(keep.sum() / POINTS))))
-    grid = np.zeros_like(keep)
-    grid[step // 2 :: step, step // 2 :: step] = True
-    v, u = np.nonzero(keep & grid)
+    v, u = np.nonzero(thinned(still & result.sure, POINTS))
     rec = result.reconstruction
     uv = np.stack([u, v], axis=1).astype(float)
     return (uv, uv + rec.flow[v, u]), rec.points_ref[v, u], result.images[0][v, u]

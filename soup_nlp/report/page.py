@@ -5,10 +5,11 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from html import escape
 from importlib.resources import files
+from string import Template
 from typing import Any
 
 import cv2
@@ -21,7 +22,6 @@ from soup_nlp.report.findings import limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.result import Result
 from soup_nlp.report.scene3d import make_scene
-from soup_nlp.report.verdict import energy_table, score_rows
 from soup_nlp.storage.store import plain
 
 MODES = {
@@ -65,8 +65,6 @@ def page(result: Result, found: Mapping[str, Picture]) -> str:
         "summary": _summary(result),
         "gallery": "\n".join(_figure(picture, images[name]) for name, picture in found.items()),
         "limits": "\n".join(f"<li>{escape(line)}</li>" for line in limits(result)),
-        "energy": _energy(result),
-        "accuracy": _accuracy(result),
         "components": _components(result),
         "verdict": escape(result.verdict) or "not recorded",
         "three": web_file("three.js"),
@@ -74,12 +72,7 @@ def page(result: Result, found: Mapping[str, Picture]) -> str:
         # "<" could end the script element
         "data": json.dumps(plain(data)).replace("<", "\\u003c"),
     }
-    head, *rest = web_file("page.html").split("{{")
-    out = [head]
-    for piece in rest:
-        name, _, text = piece.partition("}}")
-        out += [parts[name], text]
-    return "".join(out)
+    return Template(web_file("page.html")).substitute(parts)
 
 
 @cache
@@ -96,20 +89,27 @@ def packed(array: NDArray[Any]) -> str:
 
 def _data_uri(picture: Picture) -> str:
     """A picture as a data URI: photographs as JPEG, pictures with a legend as lossless WebP."""
-    image, side = picture.image, max(picture.image.shape[:2])
-    if side > SIDE:
-        size = [round(x * SIDE / side) for x in image.shape[1::-1]]
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     photo = picture.legend is None
     # a quality above 100 is lossless
     kind, options = ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, 90]) if photo else (
         "webp", [cv2.IMWRITE_WEBP_QUALITY, 101])  # fmt: skip
-    return encoded(image, kind, options)
+    return encoded(picture.image, kind, options)
 
 
-def encoded(image: Image, kind: str, options: list[int] | None = None) -> str:
-    """A picture (H, W, 3) as a data URI; `kind` is "jpeg", "png" or "webp"."""
-    _, data = cv2.imencode(f".{kind}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options or [])
+def encoded(image: Image, kind: str, options: Sequence[int] = (), most: int = SIDE) -> str:
+    """A picture (H, W, 3) as a data URI.
+
+    Args:
+        image: The picture.
+        kind: "jpeg", "png" or "webp".
+        options: Those of OpenCV's encoder.
+        most: Largest side, pixels; larger pictures are resized.
+    """
+    side = max(image.shape[:2])
+    if side > most:
+        size = [round(x * most / side) for x in image.shape[1::-1]]
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    _, data = cv2.imencode(f".{kind}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), list(options))
     return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 
@@ -154,10 +154,6 @@ def _figure(picture: Picture, source: str) -> str:
     )
 
 
-def _number(value: Any) -> str:
-    return "" if value is None else f"{float(value):.4g}"
-
-
 def table(head: list[str], rows: list[list[str]]) -> str:
     """A table in HTML; cells are HTML."""
     top = "".join(f"<th>{escape(h)}</th>" for h in head)
@@ -178,45 +174,6 @@ def _summary(result: Result) -> str:
     if whole:
         words.append(f"{whole:.1f} s")
     return " &middot; ".join(escape(word) for word in words)
-
-
-def _energy(result: Result) -> str:
-    """Exact energy by stage, with a bar for each total, or for what the refinement minimises."""
-    refinement = result.summary.get("refinement")
-    columns, rows = energy_table(result.summary["energy"], refinement)
-    note = ""
-    if refinement and "photo" in refinement["end"]:
-        note = (
-            "<p>The NLP minimises E, its total; the refinement minimises E + E_photo, in which the"
-            " images outweigh the flow where they contradict it (at"
-            f" {refinement['contradicted']} superpixels). E may rise there.</p>"
-        )
-    # the bars are of E + E_photo where there is one
-    at = -1 if note else columns.index("total")
-    most = max(float(row[at] or 0) for row in rows.values()) or 1.0
-    cells = []
-    for title, row in rows.items():
-        width = 100 * float(row[at] or 0) / most
-        bar = f'<div class="length" style="width:{width:.1f}%"></div>'
-        cells.append([title, *map(_number, row), bar])
-    return table(["stage", *columns, ""], cells) + note
-
-
-def _accuracy(result: Result) -> str:
-    """Scores of the solution and of the baselines."""
-    if not result.metrics:
-        return "<p>There is no truth to compare with.</p>"
-    rows = [
-        [
-            escape(title),
-            f"{m.mre:.4g}",
-            f"{m.median_relative:.4g}",
-            "" if np.isnan(gain) else f"{gain:.3f}",
-            f"{100 * m.coverage:.1f} %",
-        ]
-        for title, m, gain in score_rows(result.metrics)
-    ]
-    return table(["depth", "MRE", "median error", "skill", "coverage"], rows)
 
 
 def _components(result: Result) -> str:

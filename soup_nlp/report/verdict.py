@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from soup_nlp.report.findings import (
     flow_words,
     found_words,
     hints,
-    refinement_summary,
 )
 from soup_nlp.report.result import PAGE
 
@@ -43,8 +41,6 @@ TITLES = {
     "solution_next": "next frame",
 }
 """Rows of the table of scores; the others have their own names."""
-STAGES = {"start": "start", "nlp": "NLP", "solution": "solution"}
-"""Rows of the table of energies."""
 DELIVERED = {
     "constrained NLP": "its answer, retracted to the constraints",
     "presolve": "the presolve's answer, whose exact energy is lower",
@@ -173,36 +169,25 @@ def _refinement(run: Run) -> list[str]:
     return lines
 
 
-def energy_table(
-    energy: Mapping[str, Mapping[str, Any]], refinement: Mapping[str, Any] | None
-) -> tuple[list[str], dict[str, list[Any]]]:
-    """Columns and rows (by title) of E by stage and term.
-
-    The last column is what the refinement minimised, where that is not E.
-
-    Args:
-        energy: E by term and stage ("start", "nlp", "solution").
-        refinement: Entry of summary.json; None without a refinement.
-    """
-    columns = list(energy["solution"])
-    rows = {k: [energy[k].get(term) for term in columns] for k in STAGES if k in energy}
-    if refinement and "photo" in refinement["end"]:
-        columns.append("E + E_photo")
-        for key, stage in zip(STAGES, ("start", "begin", "end"), strict=True):
-            rows.get(key, []).append(refinement[stage]["total"])
-    return columns, {STAGES[k]: row for k, row in rows.items()}
-
-
 def _energies(run: Run) -> list[str]:
-    s = run.solution
-    energy = {"start": s.energy_start, "nlp": s.energy, "solution": run.energy}
-    columns, rows = energy_table(energy, refinement_summary(run))
-    if run.refined is None or not s.stages:
-        del rows[STAGES["nlp"]]
+    """Table of E by stage and term.
+
+    Its last column is what the refinement minimised, where that is not E.
+    """
+    s, r = run.solution, run.refined
+    given = {"start": s.energy_start, "NLP": s.energy, "solution": run.energy}
+    rows = {title: dict(energy) for title, energy in given.items()}
+    if r is not None and "photo" in r.energy:
+        for row, energy in zip(rows.values(), (r.energy_start, r.energy_begin, r.energy)):
+            row["E + E_photo"] = energy["total"]
+    columns = list(rows["solution"])
+    if r is None or not s.stages:
+        del rows["NLP"]
     widths = [max(11, len(name) + 2) for name in columns]
     lines = [" " * 9 + "".join(f"{k:>{w}}" for k, w in zip(columns, widths))]
     for title, row in rows.items():
-        lines.append(f"{title:<9}" + "".join(f"{x:>{w}.5g}" for x, w in zip(row, widths)))
+        cells = (f"{row[k]:>{w}.5g}" for k, w in zip(columns, widths))
+        lines.append(f"{title:<9}" + "".join(cells))
     return lines
 
 
@@ -215,28 +200,22 @@ def protocol(metrics: Mapping[str, DepthMetrics]) -> str:
     return f"depth of the {frame} frame, {rule}, {cap}"
 
 
-def score_rows(metrics: Mapping[str, DepthMetrics]) -> list[tuple[str, DepthMetrics, float]]:
-    """Title, scores and skill (NaN for the next frame) of solution, start and baselines."""
-    worst = metrics["constant"].mre if "constant" in metrics else np.nan
-    order = ("solution", *SURE, "nlp", "start", "rigid", "constant", "solution_next")
-    return [
-        (TITLES.get(k, k), m, np.nan if k == "solution_next" else skill(m.mre, worst))
-        for k in order
-        if (m := metrics.get(k)) is not None
-    ]
-
-
 def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
-    """Table of the scores; the next frame is listed where only that one has a truth."""
-    listed = {k: m for k, m in metrics.items() if k != "solution_next" or "constant" not in metrics}
-    return [
-        f"{'':<17}{'MRE':>8}{'median':>9}{'skill':>8}{'coverage':>10}",
-        *(
-            f"{title:<17}{m.mre:>8.4f}{m.median_relative:>9.4f}"
-            f"{'' if np.isnan(gain) else f'{gain:.3f}':>8}{m.coverage:>10.1%}"
-            for title, m, gain in score_rows(listed)
-        ),
-    ]
+    """Table of the scores; the next frame is listed where only that one has a truth.
+
+    Skill is blank for the next frame.
+    """
+    worst = metrics["constant"].mre if "constant" in metrics else np.nan
+    order = ["solution", *SURE, "nlp", "start", "rigid", "constant"]
+    lines = [f"{'':<17}{'MRE':>8}{'median':>9}{'skill':>8}{'coverage':>10}"]
+    for name in order if "constant" in metrics else [*order, "solution_next"]:
+        if (m := metrics.get(name)) is not None:
+            gain = np.nan if name == "solution_next" else skill(m.mre, worst)
+            lines.append(
+                f"{TITLES.get(name, name):<17}{m.mre:>8.4f}{m.median_relative:>9.4f}"
+                f"{'' if np.isnan(gain) else f'{gain:.3f}':>8}{m.coverage:>10.1%}"
+            )
+    return lines
 
 
 def missed(run: Run) -> bool:

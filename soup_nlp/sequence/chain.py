@@ -3,24 +3,71 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import count, pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, linear_sum_assignment
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError, expect
 from soup_nlp.evaluate.metrics import overlap_shares
 from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.geometry.superpixels import Labels
-from soup_nlp.sequence.pairs import SolvedPair, carried
+from soup_nlp.report.result import Result, load
 
 MIN_PIXELS = 200
 """Links with fewer pixels are flagged."""
 LEAST_SPREAD = 0.005
 """Smallest spread of a log ratio in the weight of a link."""
+MAX_GUESSED = 0.5
+"""A pair has no parallax if the depth of a larger share of its background is a guess."""
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPair:
+    """A pair of frames with its result.
+
+    Attributes:
+        first: Index of the reference frame.
+        second: Index of the next frame.
+        result: Result of the solve.
+        truth: Arrays of the truth by name, as in result.h5; empty if unknown.
+        parallax_px: Median displacement that the camera's translation causes, pixels.
+    """
+
+    first: int
+    second: int
+    result: Result
+    truth: dict[str, np.ndarray]
+    parallax_px: float
+
+    @property
+    def still(self) -> bool:
+        """Whether most of the background has no parallax, so that its depth is a guess."""
+        return self.result.components.background.borrowed > MAX_GUESSED
+
+
+def read_pair(first: int, second: int, place: Path) -> SolvedPair:
+    """The pair of two frames from its result folder."""
+    result = load(place)
+    tree = result.tree
+    static = result.components.of_superpixel == 0
+    parallax = float(np.median(tree["start"]["parallax"][static]))
+    # a chain holds many pairs, whose other arrays it does not need
+    kept = replace(result, tree={})
+    return SolvedPair(first, second, kept, dict(tree.get("truth", {})), parallax)
+
+
+def carried(of_pixel: NDArray[np.generic], rec: Reconstruction) -> NDArray[Any]:
+    """(H', W') labels of the reference frame in the next frame; -1 where not visible."""
+    source = rec.source_next
+    return np.where(source >= 0, of_pixel.ravel()[source], -1)
 
 
 @dataclass(frozen=True)
@@ -67,8 +114,8 @@ def link(
     ratio = np.log(one[both] / other[both])
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
-    count = int(both.sum())
-    return Link(first, second, middle, spread, count, bridge, flagged or count < MIN_PIXELS)
+    pixels = int(both.sum())
+    return Link(first, second, middle, spread, pixels, bridge, flagged or pixels < MIN_PIXELS)
 
 
 def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
@@ -117,8 +164,8 @@ def _carry(z: Float, keep: Mask, still: SolvedPair) -> tuple[Float, Mask]:
     return np.where(there, z.ravel()[source], np.nan), there
 
 
-def solve_scales(count: int, links: Sequence[Link]) -> Float:
-    """(count,) scales of all pairs, 1 for the first, by robust least squares of their logarithms.
+def solve_scales(total: int, links: Sequence[Link]) -> Float:
+    """(total,) scales of all pairs, 1 for the first, by robust least squares of their logarithms.
 
     A link is weighted by its spread; the Cauchy loss lowers the weight of contradictory links.
 
@@ -126,13 +173,13 @@ def solve_scales(count: int, links: Sequence[Link]) -> Float:
         DataError: a pair is linked to no other.
     """
     ends = np.array([(k.first, k.second) for k in links], np.int64).reshape(-1, 2)
-    part = connected(ends, count)
+    part = connected(ends, total)
     if part.any():
         alone = int(np.argmax(part > 0))
         raise DataError("a pair shares no pixel with the others", where=f"pair {alone}")
-    if count == 1:
+    if total == 1:
         return np.ones(1)
-    rows = np.zeros((len(links), count))
+    rows = np.zeros((len(links), total))
     at = np.arange(len(links))
     rows[at, ends[:, 1]] += 1
     rows[at, ends[:, 0]] -= 1
@@ -142,13 +189,13 @@ def solve_scales(count: int, links: Sequence[Link]) -> Float:
     sigma = np.where([k.flagged for k in links], 10 * np.maximum(sigma, 0.1), sigma)
     A, b = rows[:, 1:] / sigma[:, None], value / sigma
     first = np.linalg.lstsq(A, b, rcond=None)[0]
-    if len(links) > count - 1:
+    if len(links) > total - 1:
         answer = least_squares(lambda x: A @ x - b, first, jac=lambda x: A, loss="cauchy")
         first = answer.x
     return np.exp(np.concatenate([[0.0], first]))
 
 
-MADE_BY = "soup_nlp.sequence.pairs.solve_pairs(...)"
+MADE_BY = "soup_nlp.sequence.solve.solve_pairs(...)"
 """Where pairs of a chain come from, for messages."""
 SAME = 0.3
 """Smallest intersection over union of two components of one track."""
@@ -274,25 +321,22 @@ def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> 
 
 
 def follow(before: Labels, after: Labels) -> dict[int, int]:
-    """Matches of the components of consecutive pairs by overlap in their common frame.
+    """Matches of the components of consecutive pairs with the largest sum of overlaps.
 
     Args:
         before: (H, W) labels of the first pair in the common frame; -1 unknown, 0 background.
         after: (H, W) labels of the second pair.
 
     Returns:
-        Label after by label before, matched greedily by overlap.
+        Label after by label before.
     """
     known = before >= 0
     share = overlap_shares(before[known], after[known])
     # the background has no track
     share[0], share[:, 0] = 0, 0
-    out: dict[int, int] = {}
-    while share.max(initial=0.0) >= SAME:
-        i, k = (int(x) for x in np.unravel_index(int(share.argmax()), share.shape))
-        out[i] = k
-        share[i], share[:, k] = 0, 0
-    return out
+    share[share < SAME] = 0
+    found = zip(*linear_sum_assignment(share, maximize=True))
+    return {int(i): int(k) for i, k in found if share[i, k] > 0}
 
 
 def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:
@@ -303,15 +347,9 @@ def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dic
         counts: Number of components of every pair, with the background.
     """
     out: list[dict[int, int]] = []
-    fresh = 1
-    for k, count in enumerate(counts):
-        numbers = {0: 0}
-        back = {new: old for old, new in matches[k - 1].items()} if k else {}
-        for label in range(1, count):
-            if label in back:
-                numbers[label] = out[k - 1][back[label]]
-            else:
-                numbers[label] = fresh
-                fresh += 1
-        out.append(numbers)
+    fresh = count(1)
+    for known, total in zip([{}, *matches], counts, strict=True):
+        numbers = {new: out[-1][old] for old, new in known.items()}
+        rest = {label: next(fresh) for label in range(1, total) if label not in numbers}
+        out.append({0: 0, **numbers, **rest})
     return out

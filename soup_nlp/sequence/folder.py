@@ -15,14 +15,12 @@ import numpy as np
 from soup_nlp.arrays import Float, Image
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.check import check_folder
-from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
 from soup_nlp.report.formats import tum_text
-from soup_nlp.report.models import AXES, write_model, write_ply
-from soup_nlp.sequence.chain import Chain, make_chain
+from soup_nlp.report.models import AXES, thinned, write_model, write_ply
+from soup_nlp.sequence.chain import Chain, make_chain, read_pair
 from soup_nlp.sequence.fused import fuse, projected
-from soup_nlp.sequence.page import RATE, chain_page, write_animation
-from soup_nlp.sequence.pairs import read_pair
+from soup_nlp.sequence.page import RATE, chain_page, depth_pictures, write_animation
 from soup_nlp.sequence.score import score
 from soup_nlp.storage.files import as_path, is_file, read_json, write_bytes, write_text
 from soup_nlp.storage.folders import scratch, staged
@@ -82,7 +80,7 @@ def _same(stored: Float, found: Float) -> bool:
     return stored.shape == found.shape and bool(np.abs(stored - found).max() <= SAME * size)
 
 
-def write_fused(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> str:
+def write_fused(path: Path, chain: Chain, contents: Mapping[str, Any]) -> None:
     """The static scene of all frames as one cloud."""
     cloud = fuse(chain)
     comments = [
@@ -92,17 +90,10 @@ def write_fused(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> str:
         "sigma_log_depth: of the frame that the point is from; guesses are left out",
     ]
     scalars = {"sigma_log_depth": cloud.sigma, "frame": cloud.label}
-    write_ply(folder / "scene.ply", cloud.points, cloud.colours, None, scalars, comments)
-    return "scene.ply"
+    write_ply(path, cloud.points, cloud.colours, None, scalars, comments)
 
 
-def _write_glb(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> str:
-    """The static scene, with what moves and the camera as an animation."""
-    write_animation(folder / "scene.glb", chain, str(contents["unit"]))
-    return "scene.glb"
-
-
-def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> str:
+def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> None:
     """COLMAP's model of the sequence: all frames and the fused cloud."""
     cloud = fuse(chain).thinned(COLMAP_POINTS)
     frames, seen = range(len(chain)), []
@@ -113,7 +104,7 @@ def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> st
         at = np.flatnonzero(inside & near)
         seen.append((at, np.stack([u[at], v[at]], 1).astype(float)))
     write_model(
-        folder / "colmap",
+        folder,
         [f"{k:04d}.png" for k in frames],
         [chain.image(k) for k in frames],
         [chain.camera(k) for k in frames],
@@ -123,12 +114,14 @@ def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> st
         seen,
         f"{contents['name']}; unit: {contents['unit']}",
     )
-    return "colmap"
 
 
-Writer = Callable[[Path, Chain, Mapping[str, Any]], str]
-FORMATS: Mapping[str, Writer] = {"ply": write_fused, "glb": _write_glb, "colmap": _write_colmap}
-"""Writers of the formats that a chain has beside trajectory.tum and its clouds by frame."""
+FORMATS: Mapping[str, tuple[str, Callable[[Path, Chain, Mapping[str, Any]], None]]] = {
+    "ply": ("scene.ply", write_fused),
+    "glb": ("scene.glb", write_animation),
+    "colmap": ("colmap", _write_colmap),
+}
+"""Name and writer of the formats of a chain beside trajectory.tum and its clouds by frame."""
 
 
 def convert_chain(
@@ -149,7 +142,10 @@ def convert_chain(
         )
     chain, contents = read_chain(folder)
     with staged(folder if out is None else out, overwrite=overwrite) as new:
-        return [FORMATS[name](new, chain, contents) for name in dict.fromkeys(names)]
+        chosen = [FORMATS[name] for name in dict.fromkeys(names)]
+        for name, write in chosen:
+            write(new / name, chain, contents)
+        return [name for name, _ in chosen]
 
 
 CHAIN_PAGE = "chain.html"
@@ -194,28 +190,21 @@ def write_chain(
     contents |= {"depth_png_scale": scale, "score": score(chain)}
     write_json(folder / "chain.json", contents)
     write_text(folder / "trajectory.tum", trajectory(chain))
-    write_fused(folder, chain, contents)
-    pictures, text = _page(chain, contents)
-    write_video(folder / "depth.mp4", pictures)
-    write_text(folder / CHAIN_PAGE, text)
+    write_fused(folder / "scene.ply", chain, contents)
+    pictures, _ = depth_pictures(chain)
+    write_video(
+        folder / "depth.mp4",
+        [np.vstack([chain.image(k), picture]) for k, picture in enumerate(pictures)],
+    )
+    write_text(folder / CHAIN_PAGE, chain_page(chain, contents))
 
 
 def renew_chain_page(folder: Path) -> Path:
     """Make the page of a chain's folder again; returns its file."""
-    _, text = _page(*read_chain(folder))
+    text = chain_page(*read_chain(folder))
     with staged(folder, overwrite=True) as new:
         write_text(new / CHAIN_PAGE, text)
     return folder / CHAIN_PAGE
-
-
-def _page(chain: Chain, contents: dict[str, Any]) -> tuple[list[Image], str]:
-    """Images of all frames above their depth in colour, and the page."""
-    frames = range(len(chain))
-    depths, shown = [chain.depth(k) for k in frames], [chain.image(k) for k in frames]
-    span = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
-    pictures = [colourise_depth(z, *span) for z in depths]
-    text = chain_page(chain, contents, shown, pictures, span)
-    return [np.vstack(both) for both in zip(shown, pictures)], text
 
 
 def summary(chain: Chain) -> dict[str, Any]:
@@ -284,9 +273,7 @@ def write_video(path: Path, pictures: list[Image]) -> None:
 def _cloud(path: Path, chain: Chain, frame: int, name: str) -> None:
     """Write the points of a frame in world coordinates, subsampled."""
     result = chain.pairs[frame].result
-    step = max(1, int(np.ceil(np.sqrt(result.sure.sum() / POINTS))))
-    keep = np.zeros_like(result.sure)
-    keep[::step, ::step] = result.sure[::step, ::step]
+    keep = thinned(result.sure, POINTS)
     tracks = np.array([chain.tracks[frame][k] for k in range(len(result.components))])
     normals = result.normals[0][keep] @ chain.world_from_camera[frame].R.T
     comments = [

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.report.models import thinned
 from soup_nlp.sequence.chain import Chain
 
 VOXEL = 0.004
@@ -57,11 +58,11 @@ def fuse(chain: Chain) -> Cloud:
     A point that stands before the static surface which a neighbouring frame sees gives way where
     that frame is surer. In a voxel the surest point is kept.
     """
-    total = sum(int(_static(chain, k).sum()) for k in range(len(chain.pairs)))
-    step = max(1, int(np.ceil(np.sqrt(total / MOST))))
+    masks = [_static(chain, k) for k in range(len(chain.pairs))]
+    share = MOST / max(sum(int(mask.sum()) for mask in masks), 1)
     clouds = []
-    for k in range(len(chain.pairs)):
-        cloud = _cloud(chain, k, _static(chain, k), step, k)
+    for k, mask in enumerate(masks):
+        cloud = _cloud(chain, k, thinned(mask, max(share * mask.sum(), 1)), k)
         fits = np.ones(len(cloud), bool)
         for other in (k - 2, k - 1, k + 1, k + 2):
             if 0 <= other < len(chain.pairs):
@@ -91,8 +92,7 @@ def movers(chain: Chain, frame: int) -> Cloud:
     for label, track in chain.tracks[pair].items():
         mask = result.sure & (result.components.of_pixel == label)
         if track in shown and mask.any():
-            step = max(1, int(np.ceil(np.sqrt(mask.sum() / OF_MOVER))))
-            cloud = _cloud(chain, pair, mask, step, track)
+            cloud = _cloud(chain, pair, thinned(mask, OF_MOVER), track)
             points = cloud.points if pair == frame else chain.motion(pair, label)(cloud.points)
             clouds.append(replace(cloud, points=points))
     return _joined(clouds)
@@ -104,19 +104,17 @@ def _static(chain: Chain, frame: int) -> Mask:
     return np.asarray(result.sure & (result.components.of_pixel == 0))
 
 
-def _cloud(chain: Chain, frame: int, mask: Mask, step: int, label: int) -> Cloud:
-    """The points of a mask, every `step`-th pixel in both directions."""
-    result, keep = chain.pairs[frame].result, np.zeros_like(mask)
-    keep[::step, ::step] = mask[::step, ::step]
+def _cloud(chain: Chain, frame: int, mask: Mask, label: int) -> Cloud:
+    """The points of a mask."""
+    result = chain.pairs[frame].result
     sigma = np.zeros(mask.shape) if result.sigma is None else result.sigma
-    points = chain.points(frame)[keep]
-    return Cloud(points, result.images[0][keep], sigma[keep], np.full(len(points), label))
+    points = chain.points(frame)[mask]
+    return Cloud(points, result.images[0][mask], sigma[mask], np.full(len(points), label))
 
 
 def _joined(clouds: list[Cloud]) -> Cloud:
-    if not clouds:
-        return Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int))
-    parts = [(c.points, c.colours, c.sigma, c.label) for c in clouds]
+    nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int))
+    parts = [(c.points, c.colours, c.sigma, c.label) for c in (nothing, *clouds)]
     return Cloud(*(np.concatenate(part) for part in zip(*parts)))
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image
 from soup_nlp.geometry.motion import RigidMotion
-from soup_nlp.report.colour import colourise_depth
+from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.models import GLTF
 from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
 from soup_nlp.report.pictures import Bar
@@ -31,7 +31,7 @@ from soup_nlp.storage.files import PathLike, write_bytes
 from soup_nlp.storage.store import plain
 
 WIDTH = 720
-"""Largest width of an image in the page, pixels."""
+"""Larger side of an image in the page, pixels."""
 MANY = 24
 """Frames above which the images have half the width."""
 STILL, MOVING = 120_000, 60_000
@@ -41,31 +41,28 @@ QUALITY = 80
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf")
 
 
-def chain_page(
-    chain: Chain,
-    contents: Mapping[str, Any],
-    images: Sequence[Image],
-    depths: Sequence[Image],
-    span: tuple[float, float],
-) -> str:
-    """The page as one HTML file.
+def depth_pictures(chain: Chain) -> tuple[list[Image], tuple[float, float]]:
+    """Depth of every frame in colour, and the range of the colours (near, far), one for all."""
+    depths = [chain.depth(k) for k in range(len(chain))]
+    span = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
+    return [colourise_depth(z, *span) for z in depths], span
 
-    Args:
-        chain: The chain.
-        contents: Contents of chain.json.
-        images: (H, W, 3) image of every frame.
-        depths: (H, W, 3) its depth in colour, one range for all.
-        span: That range, (near, far).
-    """
+
+def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
+    """The page as one HTML file, with the contents of chain.json."""
+    pictures, (near, far) = depth_pictures(chain)
     # long sequences have smaller pictures
-    width = WIDTH if len(images) <= MANY else WIDTH // 2
+    width = WIDTH if len(chain) <= MANY else WIDTH // 2
+    quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     scene = _scene(chain)
     data = {
-        "frames": [[_jpeg(a, width), _jpeg(b, width)] for a, b in zip(images, depths)],
+        "frames": [
+            [encoded(image, "jpeg", quality, width) for image in (chain.image(k), picture)]
+            for k, picture in enumerate(pictures)
+        ],
         "names": [Path(x).name for x in contents["sources"]],
         "scene": scene,
     }
-    near, far = span
     z = 1 / np.linspace(1 / far, 1 / near, 25)
     ticks = tuple(f"{x:.3g}" for x in z[::6])
     links = table(LINK_HEADS, link_rows(contents))
@@ -89,11 +86,15 @@ def _scene(chain: Chain) -> dict[str, Any]:
     """The 3D view: clouds, paths and cameras as numbers and packed arrays."""
     still = fuse(chain).thinned(STILL)
     K, (height, width) = chain.camera(0), chain.image(0).shape[:2]
+
+    def points(cloud: Cloud) -> dict[str, str]:
+        numbers = packed(cloud.points.astype(np.float32))
+        return {"points": numbers, "colours": packed(cloud.colours)}
+
+    moving = [movers(chain, k).thinned(MOVING // len(chain)) for k in range(len(chain))]
     return {
-        "still": _cloud(still),
-        "moving": [
-            _cloud(movers(chain, k).thinned(MOVING // len(chain))) for k in range(len(chain))
-        ],
+        "still": points(still),
+        "moving": [*map(points, moving)],
         "tracks": [
             {"track": t, "path": [*chain.path(t).values()], "colour": COLOURS[k % len(COLOURS)]}
             for k, t in enumerate(shown_tracks(chain))
@@ -104,20 +105,6 @@ def _scene(chain: Chain) -> dict[str, Any]:
         "middle": float(np.median(still.points[:, 2])) if len(still) else 1.0,
         "far": float(np.abs(still.points).max(initial=1.0)),
     }
-
-
-def _cloud(cloud: Cloud) -> dict[str, str]:
-    points, colours = packed(cloud.points.astype(np.float32)), packed(cloud.colours)
-    return {"points": points, "colours": colours}
-
-
-def _jpeg(image: Image, most: int) -> str:
-    """A picture of at most so many columns as the address of its data."""
-    height, width = image.shape[:2]
-    if width > most:
-        size = (most, round(height * most / width))
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return encoded(image, "jpeg", [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
 def _tracks(chain: Chain, tracks: Sequence[Mapping[str, Any]]) -> str:
@@ -150,8 +137,8 @@ class _Buffer:
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
 
-    def add(self, array: NDArray[Any], limits: bool = False) -> int:
-        """Number of the accessor of an array (M, ...) of float32 or uint8."""
+    def add(self, array: NDArray[Any]) -> int:
+        """Number of the accessor of an array (M, ...) of float32, with its limits, or uint8."""
         kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[1 if array.ndim == 1 else array.shape[1]]
         raw = np.ascontiguousarray(array).tobytes()
         self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(raw)})
@@ -164,21 +151,21 @@ class _Buffer:
         }
         if array.dtype == np.uint8:
             accessor["normalized"] = True
-        if limits:
+        else:
             low, high = np.atleast_1d(array.min(axis=0)), np.atleast_1d(array.max(axis=0))
             accessor |= {"min": low.tolist(), "max": high.tolist()}
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
 
-def write_animation(path: PathLike, chain: Chain, unit: str) -> None:
+def write_animation(path: PathLike, chain: Chain, contents: Mapping[str, Any]) -> None:
     """Write the sequence; axes of glTF, world = the first frame's camera, five frames a second.
 
     Nodes are "static scene", "track N" for what moves, and "camera". A track has the points of its
     first frame, which move rigidly from frame to frame as its component does.
     """
     buffer, meshes, nodes, channels, samplers = _Buffer(), [], [], [], []
-    times = buffer.add(np.arange(len(chain), dtype=np.float32) / np.float32(RATE), limits=True)
+    times = buffer.add(np.arange(len(chain), dtype=np.float32) / np.float32(RATE))
 
     def animate(node: int, poses: list[RigidMotion]) -> None:
         for what, values in (
@@ -193,7 +180,7 @@ def write_animation(path: PathLike, chain: Chain, unit: str) -> None:
     def mesh(cloud: Cloud, name: str) -> int:
         white = np.full((len(cloud), 1), 255, np.uint8)
         places = {
-            "POSITION": buffer.add((cloud.points @ GLTF).astype(np.float32), limits=True),
+            "POSITION": buffer.add((cloud.points @ GLTF).astype(np.float32)),
             "COLOR_0": buffer.add(np.hstack([cloud.colours, white])),
         }
         meshes.append({"name": name, "primitives": [{"attributes": places, "mode": 0}]})
@@ -216,7 +203,11 @@ def write_animation(path: PathLike, chain: Chain, unit: str) -> None:
     nodes.append({"name": "camera", "camera": 0})
     animate(len(nodes) - 1, list(chain.world_from_camera))
     tree = {
-        "asset": {"version": "2.0", "generator": "soup_nlp", "extras": {"unit": unit}},
+        "asset": {
+            "version": "2.0",
+            "generator": "soup_nlp",
+            "extras": {"unit": str(contents["unit"])},
+        },
         "scene": 0,
         "scenes": [{"nodes": list(range(len(nodes)))}],
         "nodes": nodes,
@@ -227,9 +218,7 @@ def write_animation(path: PathLike, chain: Chain, unit: str) -> None:
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": len(buffer.data)}],
     }
-    if not meshes:
-        del tree["meshes"]
-    text = json.dumps(tree).encode()
+    text = json.dumps({key: value for key, value in tree.items() if value != []}).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(buffer.data), b"BIN\0") + buffer.data

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,11 @@ import numpy as np
 from soup_nlp.config.problem import Problem, make_problem, title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import DataWarning, read_image
-from soup_nlp.errors import ConfigError, DataError, SoupError
+from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.figures import write_png
-from soup_nlp.sequence.chain import Chain, make_chain
+from soup_nlp.report.folder import run
+from soup_nlp.sequence.chain import Chain, SolvedPair, make_chain, read_pair
 from soup_nlp.sequence.folder import SINGLE, chain_files, write_chain
 from soup_nlp.sequence.frames import (
     MAX_STEP,
@@ -32,13 +34,17 @@ from soup_nlp.sequence.frames import (
     scene_frames,
     video_frames,
 )
-from soup_nlp.sequence.pairs import solve_pairs
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.rows import Say
+from soup_nlp.storage.rows import Job, Row, Say, attempt, failed, measure_all, read_rows
 
 SCENE = "scene:"
 """Prefix of the name of a rendered scene."""
+ROWS = "pairs.jsonl"
+"""File with a row for each pair of a sequence."""
+OF_PAIRS = "output.page=false", "refine.rounds=1"
+"""Overrides of every pair: the sequence has its own page, and one round of the refinement does most
+of its work."""
 AUTO = "auto"
 """Stride that is chosen by parallax."""
 
@@ -115,6 +121,75 @@ def solve_chain(
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
         write_chain(new, chain, name, found.names, over)
     return chain
+
+
+def solve_pairs(
+    frames: Frames,
+    which: Sequence[tuple[int, int]],
+    folder: Path,
+    overrides: Sequence[str] = (),
+    workers: int = 1,
+    say: Say | None = None,
+) -> list[SolvedPair]:
+    """Solve pairs of frames in parallel processes; stored results are read.
+
+    Args:
+        frames: The sequence.
+        which: Indices of the frames of every pair.
+        folder: Output folder for `pairs/000_001/` ... and `pairs.jsonl`.
+        overrides: Overrides of the problems, such as segmentation.superpixels=500.
+        workers: Number of processes.
+        say: Called with (done, total, row) after every solve.
+
+    Raises:
+        SolverError: a pair cannot be solved.
+    """
+    jobs, places = [], []
+    overrides = [*OF_PAIRS, *overrides]
+    # the last row of a pair describes its folder
+    last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
+    for first, second in which:
+        place = folder.resolve() / "pairs" / f"{first:03d}_{second:03d}"
+        raw = {"name": place.name, "input": frames.pair(first, second), "base": str(Path.cwd())}
+        name = {"key": place.name, "input": raw["input"], "overrides": overrides}
+        stored = last.get(place.name, {})
+        same = (place / "result.h5").is_file() and all(stored.get(k) == name[k] for k in name)
+        work = partial(attempt, partial(_solve, raw, tuple(overrides), place))
+        jobs.append(Job(name, work, stale=not same))
+        places.append(place)
+
+    def told(done: int, total: int, row: Row) -> None:
+        # those of a worker process would be printed as Python prints them
+        for text in row.get("warnings", ()):
+            warnings.warn(text, DataWarning, stacklevel=2)
+        if say:
+            say(done, total, row)
+
+    rows = measure_all(jobs, folder / ROWS, workers, say=told)
+    wrong = [row for row in rows if failed(row)]
+    if wrong:
+        raise SolverError(
+            f"{len(wrong)} of {len(rows)} pairs cannot be solved",
+            where=wrong[0]["key"],
+            found=wrong[0]["error"],
+            hint="the others are kept: the same command goes on",
+        )
+    return [read_pair(*pair, place) for pair, place in zip(which, places, strict=True)]
+
+
+def _solve(raw: Raw, overrides: tuple[str, ...], place: Path) -> Row:
+    """Solve a pair into its folder."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        done = run(make_problem(raw, overrides, where="sequence"))
+        done.save(place)
+    said = {str(w.message): None for w in caught if issubclass(w.category, DataWarning)}
+    return {
+        "warnings": [*said],
+        "converged": done.solution.converged,
+        "components": len(done.components),
+        "mre": done.metrics["solution"].mre if "solution" in done.metrics else None,
+    }
 
 
 def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:

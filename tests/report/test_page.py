@@ -78,7 +78,7 @@ def test_the_page_has_every_part(text):
     data = data_of(text)
     names = [mode["name"] for mode in data["modes"]]
     assert names == list(MODES)
-    for word in ("What limits this result", "Energy by stage", "Verdict", "Components"):
+    for word in ("What limits this result", "Verdict", "Components"):
         assert word in text
     assert re.findall(r'data-name="(\w+)"', text)[:5] == [
         "image_ref", "image_next", "superpixels", "components", "flow",

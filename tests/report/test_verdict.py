@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from soup_nlp.report import findings
 from soup_nlp.report.findings import certainty
-from soup_nlp.report.verdict import energy_table, facts
+from soup_nlp.report.verdict import _energies, facts
 
 
 def titles(text):
@@ -68,9 +69,16 @@ def test_hints_name_what_would_help(small_run):
 
 
 def test_the_table_of_energies_ends_with_what_the_refinement_lowers():
-    energy = {k: {"total": v, "arap": 1.0} for k, v in zip(("start", "nlp", "solution"), (9, 5, 6))}
-    assert energy_table(energy, None)[0] == ["total", "arap"]
-    stages = {"start": {"total": 90.0}, "begin": {"total": 50.0}}
-    columns, rows = energy_table(energy, {**stages, "end": {"total": 40.0, "photo": 2.0}})
-    assert columns[-1] == "E + E_photo"
-    assert rows == {"start": [9, 1.0, 90.0], "NLP": [5, 1.0, 50.0], "solution": [6, 1.0, 40.0]}
+    start, nlp, end = ({"total": v, "arap": 1.0} for v in (9.0, 5.0, 6.0))
+    solution = SimpleNamespace(energy_start=start, energy=nlp, stages=("one",))
+    photo = {"energy_start": 90.0, "energy_begin": 50.0, "energy": 40.0}
+    refined = SimpleNamespace(**{k: {"total": v, "photo": 2.0} for k, v in photo.items()})
+    run = SimpleNamespace(solution=solution, refined=refined, energy=end)
+    head, *rows = _energies(run)
+    assert head.split()[-3:] == ["E", "+", "E_photo"]
+    assert [row.split() for row in rows] == [
+        ["start", "9", "1", "90"], ["NLP", "5", "1", "50"], ["solution", "6", "1", "40"],
+    ]  # fmt: skip
+    assert _energies(SimpleNamespace(solution=solution, refined=None, energy=end))[0].split() == [
+        "total", "arap",
+    ]  # fmt: skip

@@ -10,7 +10,7 @@ from PIL import ExifTags, Image
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.report.figures import write_png
-from soup_nlp.sequence import pairs
+from soup_nlp.sequence import solve as solving
 from soup_nlp.sequence.frames import (
     Frames,
     find_depths,
@@ -109,7 +109,7 @@ def test_an_unreadable_frame_is_found_before_the_first_solve(kind, tmp_path, cap
     def solve(*args):
         raise AssertionError("a pair was solved")
 
-    monkeypatch.setattr(pairs, "_solve", solve)
+    monkeypatch.setattr(solving, "_solve", solve)
     for k in range(3):
         write_png(tmp_path / f"{k}.png", IMAGE)
     last = tmp_path / "3.png"

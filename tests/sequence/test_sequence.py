@@ -22,12 +22,20 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.figures import write_png
-from soup_nlp.sequence import pairs
-from soup_nlp.sequence.chain import Link, follow, link, make_chain, number, solve_scales
+from soup_nlp.sequence import solve as solving
+from soup_nlp.sequence.chain import (
+    Link,
+    SolvedPair,
+    carried,
+    follow,
+    link,
+    make_chain,
+    number,
+    solve_scales,
+)
 from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
 from soup_nlp.sequence.frames import Frames, scene_frames
 from soup_nlp.sequence.fused import fuse, movers
-from soup_nlp.sequence.pairs import SolvedPair, carried
 from soup_nlp.sequence.score import aligned
 from soup_nlp.sequence.solve import one_camera
 
@@ -315,11 +323,11 @@ def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch)
         (place / "result.h5").touch()
         return {}
 
-    monkeypatch.setattr(pairs, "_solve", solve)
-    monkeypatch.setattr(pairs, "read_pair", lambda first, second, place: (first, second))
+    monkeypatch.setattr(solving, "_solve", solve)
+    monkeypatch.setattr(solving, "read_pair", lambda first, second, place: (first, second))
     for own in (["a"], ["a"], ["b"], ["a"]):
-        assert pairs.solve_pairs(scene_frames("street", 3), [(0, 1)], tmp_path, own) == [(0, 1)]
-    assert seen == [(*pairs.OF_PAIRS, own) for own in "aba"]
+        assert solving.solve_pairs(scene_frames("street", 3), [(0, 1)], tmp_path, own) == [(0, 1)]
+    assert seen == [(*solving.OF_PAIRS, own) for own in "aba"]
 
 
 @pytest.mark.filterwarnings("default:.*no intrinsics")
