@@ -118,21 +118,22 @@ def prepare(
         fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
         if log:
             log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
-    given = evidence = None
+    given, start = None, _begin(problem, pair, seg, fitted, options)
     if pair.depth_prior is not None and problem.energy.weights.depth > 0:
-        few = segmented(superpixels(problem, pair, min(PIECES, s.superpixels)))
-        own = FlowFit.of(few, flow, pair.K_ref, pair.K_next, options)
-        first = _begin(problem, pair, few, own, options)
-        evidence = judged(first, few, pair, own, problem.depth_prior.kind)
+        own = start, seg, pair, fitted
+        if s.superpixels > PIECES:
+            few = segmented(superpixels(problem, pair, PIECES))
+            fit = FlowFit.of(few, flow, pair.K_ref, pair.K_next, options)
+            own = _begin(problem, pair, few, fit, options), few, pair, fit
+        evidence = judged(*own, problem.depth_prior.kind)
         if evidence.used and not evidence.confirmed and s.follow_flow_px is not None:
             # no flow knows where surfaces end
             seg = segmented(follow_depth(labels, evidence.log_depth(pair.depth_prior)))
             fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
-    start = _begin(problem, pair, seg, fitted, options)
-    if evidence is not None:
+            start = _begin(problem, pair, seg, fitted, options)
         start, given = by_prior(start, seg, pair, fitted, evidence)
         if log:
-            log(str(given))
+            log(str(evidence))
     done("start", start)
     data, weights = build_energy(problem, pair, seg, start, given)
     stages = solver_options(problem, start)

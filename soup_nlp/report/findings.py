@@ -109,7 +109,7 @@ def found_words(run: Run) -> list[str]:
         by = "by the flow" if error <= UNSURE_FOCAL else "a guess"
         lines.append(f"the focal length is {focal:.0f} px, right to {error:.0%} ({by})")
     if run.given is not None:
-        lines.append(str(run.given))
+        lines.append(str(run.given.evidence))
     if run.full is not None:
         (height, width), (h, w) = run.full.depth_ref.shape, run.pair.size
         scored = "" if run.full.metrics is None else f": MRE {run.full.metrics.mre:.4f}"

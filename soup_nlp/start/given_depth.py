@@ -56,11 +56,6 @@ class Given:
     error: Float
     held: Mask
 
-    def __str__(self) -> str:
-        return str(self.evidence)
-
-    __repr__ = __str__
-
     def as_dict(self) -> dict[str, Any]:
         """Numbers for summary.json; NaN for the ratio where the flow says nothing."""
         e = self.evidence
@@ -86,7 +81,7 @@ def by_prior(
     if not evidence.used:
         never = np.full(n, np.inf)
         return start, Given(evidence, prior, never, np.zeros(n), never, np.zeros(n, bool))
-    seen, main = Seen.of(start, fitted), largest(start.component)
+    seen, main = Seen(start, fitted), largest(start.component)
     soup, anchor = start.soup, fitted.views.anchor
     before = np.log(soup.depth_at(anchor)) - prior
     contact = np.median(before[start.component == main])
@@ -107,7 +102,7 @@ def by_prior(
         off[at] = np.median(residual)
         local = _local(anchor[at, :2], strong[at], residual - off[firm], sigma)
         own[at] = np.where(known[at], local, np.inf)
-        flow = (start.noise / np.maximum(seen.views.parallax(soup)[at], 1e-3)) ** 2
+        flow = (start.noise / np.maximum(fitted.views.parallax(soup)[at], 1e-3)) ** 2
         opened[at] = np.where(strong[at], flow / (flow + local**2), 1.0)
         if c != main:
             gap = float(np.median(before[at])) - contact
@@ -170,7 +165,7 @@ def _settled(
     Returns:
         The soup, and for every member of the component whether the flow determines its depth.
     """
-    start, views = seen.start, seen.views
+    start, views = seen.start, seen.fitted.views
     mask = start.component == c
     at, use = np.flatnonzero(mask), seen.members(c)
     T = soup.translation[at[0]]
@@ -183,7 +178,7 @@ def _settled(
     if not determined:
         return soup.taking(views.soup(np.exp(-prior), flat, R, T_prior), mask), ~every
     error = min(SYSTEMATIC * start.noise, MOST_SYSTEMATIC_PX)
-    rest = views.anchor[use], seen.centre[use], np.ones(len(use)), views.focal[0], error
+    rest = views.anchor[use], seen.fitted.centre[use], np.ones(len(use)), views.focal[0], error
     tried = Motion(soup.R[at[0]], T / length), Motion(R, T_prior / np.linalg.norm(T_prior))
     best = most_probable(tried, *rest, prior[use], sigma)
     planes = views.fit([best])

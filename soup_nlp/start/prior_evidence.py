@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ from soup_nlp.start.choice import CLIP
 from soup_nlp.start.components import largest
 from soup_nlp.start.propose import Start
 from soup_nlp.start.settle import RELIEF
-from soup_nlp.start.views import FlowFit, Views
+from soup_nlp.start.views import FlowFit
 
 Kind = Literal["metric", "relative", "inverse", "ordinal"]
 
@@ -99,27 +99,17 @@ class Evidence:
         return self.sigma < np.inf
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """The flow at the anchors of a start, to which motions at given depths are compared.
-
-    Attributes:
-        start: Components and noise.
-        views: What planes are fitted to.
-        centre: (N, 3) rays to which the anchors move, by an affine flow.
-        usable: (N,) True where that is known.
-    """
+class Seen(NamedTuple):
+    """A start and its flow as affine maps, to which motions at given depths are compared."""
 
     start: Start
-    views: Views
-    centre: Float
-    usable: Mask
+    fitted: FlowFit
 
-    @classmethod
-    def of(cls, start: Start, fitted: FlowFit) -> Seen:
-        """The flow that the start was made of."""
-        usable = fitted.views.usable & ~start.wrong & ~start.bends & ~fitted.poor
-        return cls(start, fitted.views, fitted.centre, usable)
+    @property
+    def usable(self) -> Mask:
+        """(N,) True where the flow is known and not that of a surface that bends."""
+        start, fitted = self
+        return fitted.views.usable & ~start.wrong & ~start.bends & ~fitted.poor
 
     def members(self, c: int) -> Int:
         """Superpixels of a rigid component whose flow is known."""
@@ -134,13 +124,14 @@ class Seen:
             Error in pixels without the largest tenth, R and T of `X' = R X + T`, and what is added
             to all inverse depths, 0 unless `shifted`.
         """
-        ray, middle = self.views.anchor[at], float(np.median(np.abs(inverse)))
+        views, target = self.fitted.views, self.fitted.centre[at]
+        ray, middle = views.anchor[at], float(np.median(np.abs(inverse)))
 
         def miss(x: Float) -> Float:
             near = inverse / middle + (x[6] if shifted else 0.0)
             moved = ray @ rotation.exp(x[:3]).T + near[:, None] * x[3:6]
-            gap = moved / np.maximum(moved[:, 2:], 1e-3) - self.centre[at]
-            return gap[:, :2] * self.views.focal
+            gap = moved / np.maximum(moved[:, 2:], 1e-3) - target
+            return gap[:, :2] * views.focal
 
         x = fit_robustly(miss, 7 if shifted else 6)
         error = np.sort(np.minimum(np.linalg.norm(miss(x), axis=1), CLIP))
@@ -190,7 +181,7 @@ def judged(
         fitted: The flow as affine maps.
         kind: What the values of the prior are; None to find out.
     """
-    seen, main = Seen.of(start, fitted), largest(start.component)
+    seen, main = Seen(start, fitted), largest(start.component)
     value, known, whole = without_gaps(pair, seg)
     if np.ptp(value) < 1e-6 * value.max():
         return Evidence(kind or "relative", np.log, np.nan, np.inf, False)
@@ -237,7 +228,7 @@ def calibrated(
     }
     if len(at) < FEWEST or not relief > seen.tells / 3:
         # what is lower in an image is mostly nearer
-        below = np.corrcoef(rank, seen.views.anchor[:, 1])[0, 1] > 0
+        below = np.corrcoef(rank, seen.fitted.views.anchor[:, 1])[0, 1] > 0
         kind = kind or ("inverse" if below else "relative")
         return kind, logs[kind], np.nan
     tried: list[tuple[float, Kind, Callable[[Float], Float]]] = []

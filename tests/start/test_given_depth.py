@@ -163,7 +163,7 @@ def test_a_wrong_prior_changes_nothing(swing, pan, wrong):
         assert start is seen.start, wrong
         assert not given.evidence.used
         assert np.isinf(given.sigma).all()
-        assert "not used" in str(given)
+        assert "not used" in str(given.evidence)
 
 
 def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
