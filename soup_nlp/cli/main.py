@@ -8,6 +8,7 @@ import ast
 import errno
 import os
 import re
+import signal
 import sys
 import tempfile
 import traceback
@@ -24,7 +25,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from soup_nlp.errors import ConfigError, DataError, SoupError, StoppedError, printable
-from soup_nlp.storage.system import sigterm_as_ctrl_c
+from soup_nlp.storage.system import handling
 from soup_nlp.storage.versions import __version__, versions
 
 BUG = 70
@@ -156,7 +157,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # pictures go to files, so that the backend of the user does not matter
         os.environ["MPLBACKEND"] = "agg"
     try:
-        with sigterm_as_ctrl_c():
+        with handling(signal.default_int_handler, [signal.SIGTERM]):
             code = _run(argv)
         sys.stdout.flush()
     except BrokenPipeError:

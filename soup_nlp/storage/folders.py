@@ -1,7 +1,7 @@
 """Output folders: all files of a command appear at once, and no file of the user is overwritten.
 
 A command first checks the names that it will write (`claim`). Later it writes its files into a
-hidden folder in the target (`staged`). One rename marks that folder as complete; its files are then
+hidden folder in the target (`staged`). One rename gives that folder its mark; its files are then
 renamed to their places, and a later call finishes what a kill interrupts (`recover`).
 
 The hidden file MARK lists the files in a folder that the program made, with their SHA-256. A file
@@ -24,7 +24,7 @@ from pathlib import Path, PurePosixPath
 import psutil
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import PathLike, write_text
+from soup_nlp.storage.files import PathLike, as_path, write_text
 from soup_nlp.storage.system import deferred_signals
 
 MARK = ".soup_nlp"
@@ -103,11 +103,11 @@ def release(folder: Path, names: Iterable[str], overwrite: bool) -> None:
             hint="choose another --out, or --overwrite",
         )
     for path in (folder / name for name in foreign):
-        if path.is_dir() and not path.is_symlink():
-            raise DataError("cannot write a file over a folder", where=path)
         if path.is_symlink():
             # remove the link but not its target
             path.unlink()
+        elif path.is_dir():
+            raise DataError("cannot write a file over a folder", where=path)
     digests = {name: digest_of(folder / name) for name in foreign if (folder / name).is_file()}
     write_mark(folder, made_files(folder) | digests)
 
@@ -123,9 +123,8 @@ def write_mark(folder: Path, files: dict[str, str], subject: str = "") -> None:
 
 
 _STAGE = f"{MARK}-"
-"""First part of the names of temporary folders; the number of their process follows."""
-_COMMIT = f"{_STAGE}commit"
-"""Folder of complete new files that are being moved to their places."""
+"""First part of the names of temporary folders; the number of their process follows. One with a
+mark is complete: its files are being moved to their places."""
 
 _open: set[Path] = set()
 """Temporary folders that this process is filling."""
@@ -161,7 +160,7 @@ def claim(
             is the result of another subject.
     """
     with _named_errors(folder):
-        target = _resolved(folder)
+        target = Path(os.path.realpath(as_path(folder, "output folder")))
         there = next(p for p in (target, *target.parents) if os.path.lexists(p))
         # fails where nothing can be written
         with tempfile.TemporaryFile(dir=there):
@@ -197,7 +196,7 @@ def staged(
         DataError: a file cannot be written, or a file of the user has the name of a new one.
     """
     with _named_errors(folder):
-        target = _resolved(folder)
+        target = Path(os.path.realpath(as_path(folder, "output folder")))
         fresh = [p for p in (target, *target.parents) if not os.path.lexists(p)]
         target.mkdir(parents=True, exist_ok=True)
         recover(target)
@@ -238,13 +237,15 @@ def scratch() -> Iterator[Path]:
 
 def recover(folder: Path) -> None:
     """Finish moving new files into a folder and remove temporary folders, if a kill left them."""
-    _move_in(folder)
+    for stage in folder.glob(f"{_STAGE}*"):
+        if (stage / MARK).is_file() and not stage.is_symlink():
+            _move_in(stage, folder)
     _sweep(folder, _STAGE)
 
 
 @contextmanager
 def _temporary(parent: Path, prefix: str) -> Iterator[Path]:
-    """A temporary folder, whose name has the number of this process."""
+    """A temporary folder, whose name has the number of this process; one with a mark stays."""
     _sweep(parent, prefix)
     with deferred_signals():
         folder = Path(tempfile.mkdtemp(prefix=f"{prefix}{os.getpid()}-", dir=parent))
@@ -253,7 +254,8 @@ def _temporary(parent: Path, prefix: str) -> Iterator[Path]:
         yield folder
     finally:
         with deferred_signals():
-            shutil.rmtree(folder, ignore_errors=True)
+            if not (folder / MARK).is_file():
+                shutil.rmtree(folder, ignore_errors=True)
             _open.discard(folder)
 
 
@@ -272,38 +274,34 @@ def _commit(stage: Path, target: Path, whole: bool, overwrite: bool, subject: st
     new = {name: digest_of(stage / name) for name in files_in(stage)}
     release(target, new, overwrite)
     old = {k: v for k, v in made_files(target).items() if not is_foreign(target, k)}
-    write_mark(stage, new if whole else old | new, subject)
     for name in old.keys() & new.keys():
         # a file of the program may have been removed
         with suppress(FileNotFoundError):
             shutil.copymode(target / name, stage / name)
-    for name in [*new, MARK]:
+    for name in new:
         # wait until the file is on disk: some systems report a full disk only here
         with (stage / name).open("rb") as file:
             os.fsync(file.fileno())
-    os.rename(stage, target / _COMMIT)
-    _move_in(target)
+    # from here on, the new files are the result
+    write_mark(stage, new if whole else old | new, subject)
+    _move_in(stage, target)
 
 
-def _move_in(target: Path) -> None:
+def _move_in(stage: Path, target: Path) -> None:
     """Move complete new files to their places and remove old ones; may be repeated."""
-    commit = target / _COMMIT
-    if commit.is_symlink() or not commit.is_dir():
-        return
-    # the mark is moved last: without it, every file was moved
-    if (commit / MARK).exists():
-        for name in made_files(target).keys() - made_files(commit).keys():
-            if os.path.lexists(target / name) and not is_foreign(target, name):
-                (target / name).unlink(missing_ok=True)
-                with suppress(OSError):
-                    # removes empty folders only
-                    os.removedirs((target / name).parent)
-        # another process may be finishing the same moves
-        with suppress(FileNotFoundError):
-            for name in [*files_in(commit), MARK]:
-                (target / name).parent.mkdir(parents=True, exist_ok=True)
-                os.replace(commit / name, target / name)
-    shutil.rmtree(commit, ignore_errors=True)
+    for name in made_files(target).keys() - made_files(stage).keys():
+        if os.path.lexists(target / name) and not is_foreign(target, name):
+            (target / name).unlink(missing_ok=True)
+            with suppress(OSError):
+                # removes empty folders only
+                os.removedirs((target / name).parent)
+    # another process may be finishing the same moves
+    with suppress(FileNotFoundError):
+        # the mark is moved last: without it, every file was moved
+        for name in [*files_in(stage), MARK]:
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(stage / name, target / name)
+    shutil.rmtree(stage, ignore_errors=True)
 
 
 @contextmanager
@@ -318,11 +316,3 @@ def _named_errors(folder: PathLike) -> Iterator[None]:
             found=error.strerror or error,
             hint="choose another --out, or make room where the disk is full",
         ) from error
-
-
-def _resolved(folder: PathLike) -> Path:
-    try:
-        return Path(folder).resolve()
-    except (RuntimeError, ValueError) as error:
-        # a cyclic link, a NUL character
-        raise OSError(str(error)) from error

@@ -7,7 +7,8 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Any
+
+from soup_nlp.storage.system import SIGNALS, handling
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,6 @@ class Watch:
     log_file: str | None = None
 
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
 class interruptible:  # noqa: N801
     """Context in which Ctrl-C sets an event instead of raising (main thread only).
 
@@ -75,15 +73,13 @@ class interruptible:  # noqa: N801
     def __init__(
         self, say: Callable[[str], None] | None = None, numbers: Iterable[int] = SIGNALS
     ) -> None:
-        self.numbers = numbers
+        self._handling = handling(self._set, numbers)
         self.event = threading.Event()
         self.deferred = self.aborted = False
         self._say = say or (lambda line: None)
-        self._old: dict[int, Any] = {}
 
     def __enter__(self) -> threading.Event:
-        if threading.current_thread() is threading.main_thread():
-            self._old = {number: signal.signal(number, self._set) for number in self.numbers}
+        self._handling.__enter__()
         return self.event
 
     def _set(self, number: int, frame: FrameType | None) -> None:
@@ -100,8 +96,7 @@ class interruptible:  # noqa: N801
         self.event.set()
 
     def __exit__(self, *exc: object) -> None:
-        for number, handler in self._old.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        self._handling.__exit__(None, None, None)
 
 
 def raising() -> list[int]:

@@ -6,7 +6,7 @@ import ctypes
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -15,6 +15,7 @@ import psutil
 
 from soup_nlp.errors import DataError
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 """Files with the memory limit of a container."""
 
@@ -45,37 +46,29 @@ def require_memory(size: float, what: str, where: object = None, hint: str | Non
 
 
 @contextmanager
-def deferred_signals() -> Iterator[None]:
-    """Delay Ctrl-C and SIGTERM until the block ends (main thread only)."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        came.append(number)
-
-    old = {n: signal.signal(n, note) for n in (signal.SIGINT, signal.SIGTERM)}
+def handling(
+    handler: Callable[[int, FrameType | None], object], numbers: Iterable[int]
+) -> Iterator[None]:
+    """Have a function handle signals until the block ends (main thread only)."""
+    main = threading.current_thread() is threading.main_thread()
+    old = {number: signal.signal(number, handler) for number in numbers} if main else {}
     try:
         yield
     finally:
-        for number, handler in old.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
-        if came:
-            signal.raise_signal(came[0])
+        for number, before in old.items():
+            signal.signal(number, signal.SIG_DFL if before is None else before)
 
 
 @contextmanager
-def sigterm_as_ctrl_c() -> Iterator[None]:
-    """Let SIGTERM raise KeyboardInterrupt in the block, like Ctrl-C (main thread only)."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    old = signal.signal(signal.SIGTERM, signal.default_int_handler)
+def deferred_signals() -> Iterator[None]:
+    """Delay Ctrl-C and SIGTERM until the block ends (main thread only)."""
+    came: list[int] = []
     try:
-        yield
+        with handling(lambda number, frame: came.append(number), SIGNALS):
+            yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL if old is None else old)
+        if came:
+            signal.raise_signal(came[0])
 
 
 def end_with_parent() -> None:
