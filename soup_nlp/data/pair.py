@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import InitVar, dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +24,7 @@ from soup_nlp.data.accept import (
     prior_of,
 )
 from soup_nlp.data.formats.cameras import estimated_cameras
-from soup_nlp.errors import DataError, expect
+from soup_nlp.errors import DataError, expect, repr_of
 
 SHORTEST = 0.05
 """Smallest focal length relative to the side of the image (168 degrees of view)."""
@@ -243,63 +245,59 @@ class Pair:
         ) -> None: ...
 
     def __post_init__(self, fov: float | None) -> None:
+        put = partial(object.__setattr__, self)
         expect(self.name, str, "name of the pair", "text")
+        truths = "soup_nlp.Truth(depth_ref=..., ...) or None"
+        expect(self.truth, (Truth, NoneType), "truth of the pair", truths)
         given = self.image_ref, self.image_next
         for what in ("image_ref", "image_next"):
-            object.__setattr__(self, what, image_of(getattr(self, what), what))
+            put(what, image_of(getattr(self, what), what))
         if self.K_ref is None:
             # a file may have EXIF
             files = [Path(image) if is_path(image) else None for image in given]
             pictures = self.image_ref, self.image_next
             cameras, sigma = estimated_cameras(files, pictures, fov)
-            object.__setattr__(self, "focal_sigma", sigma)
-            object.__setattr__(self, "K_ref", cameras[0])
+            put("focal_sigma", sigma)
+            put("K_ref", cameras[0])
             if self.K_next is None:
-                object.__setattr__(self, "K_next", cameras[1])
+                put("K_next", cameras[1])
         elif fov is not None:
             raise DataError("two cameras are given", found="K_ref and fov", expected="one of them")
-        expect(
-            self.focal_sigma, (int, float), "focal_sigma of the pair", "0 for a known focal length"
-        )
-        if not 0 <= self.focal_sigma < np.inf:
+        sigma = self.focal_sigma
+        if not (isinstance(sigma, int | float) and 0 <= sigma < np.inf):
             raise DataError(
                 "standard deviation of the log focal length is out of range",
                 where="focal_sigma",
-                found=f"{self.focal_sigma:g}",
-                expected="a finite number, at least 0",
+                found=repr_of(sigma),
+                expected="a finite number, at least 0; 0 for a known focal length",
             )
         if self.K_next is None:
-            object.__setattr__(self, "K_next", self.K_ref)
+            put("K_next", self.K_ref)
         for what in ("K_ref", "K_next"):
             K = camera_of(getattr(self, what), what)
-            object.__setattr__(self, what, K)
+            put(what, K)
             _check_focal(K, getattr(self, what.replace("K", "image")), what)
-        if not isinstance(self.truth, Truth | None):
-            raise DataError(
-                "truth of a pair is no Truth",
-                where="truth",
-                found=type(self.truth).__name__,
-                expected="soup_nlp.Truth(depth_ref=..., ...) or None",
-            )
         if self.depth_prior is not None:
-            prior = prior_of(self.depth_prior)
-            check_size(
-                "depth prior and reference image", prior.shape, self.image_ref.shape, "prior"
-            )
-            object.__setattr__(self, "depth_prior", prior)
+            put("depth_prior", prior_of(self.depth_prior))
         if not isinstance(self.flow, Flow | None):
-            object.__setattr__(self, "flow", Flow(self.flow))
+            put("flow", Flow(self.flow))
+        self._check_sizes()
+
+    def _check_sizes(self) -> None:
+        """Raise DataError unless every map has the size of its image."""
+        size = self.image_ref.shape
+        if self.depth_prior is not None:
+            check_size("depth prior and reference image", self.depth_prior.shape, size, "prior")
         if self.flow is not None:
             hint = "compute the flow at the size of the image; it is not resized"
-            size, source = self.flow.uv.shape, self.flow.source
-            check_size("flow and reference image", size, self.image_ref.shape, source, hint)
-        for what in self.truth.known() if self.truth else []:
-            name, image = "reference image", self.image_ref
-            if what == "depth_next":
-                name, image = "next image", self.image_next
-            if what not in ("motions", "points"):
-                found = getattr(self.truth, what).shape
-                check_size(f"truth and {name}", found, image.shape, f"truth.{what}")
+            what = "flow and reference image"
+            check_size(what, self.flow.uv.shape, size, self.flow.source, hint)
+        for name in self.truth.known() if self.truth else []:
+            if name not in ("motions", "points"):
+                next_ = name == "depth_next"
+                what = f"truth and {'next' if next_ else 'reference'} image"
+                expected = self.image_next.shape if next_ else size
+                check_size(what, getattr(self.truth, name).shape, expected, f"truth.{name}")
 
     @property
     def size(self) -> tuple[int, int]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,15 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
-from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.pair import Flow, Pair, Truth
 
 Size = tuple[int, int]
 
 ALIKE = 1.1
 """Largest ratio of two focal lengths of which flow methods find displacements reliably."""
-FEW = 0.2
-"""Share of usable pixels below which the focal lengths are doubted."""
 
 
 def working_size(pair: Pair, megapixels: float | None) -> Pair:
@@ -33,21 +29,27 @@ def working_size(pair: Pair, megapixels: float | None) -> Pair:
     if megapixels is None or height * width <= megapixels * 1e6:
         return pair
     factor = np.sqrt(megapixels * 1e6 / (height * width))
-    ref, following = (_smaller(i.shape, factor) for i in (pair.image_ref, pair.image_next))
-    small = replace(
-        pair,
-        image_ref=resized(pair.image_ref, ref),
-        image_next=resized(pair.image_next, following),
-        K_ref=scaled_camera(pair.K_ref, pair.image_ref.shape, ref),
-        K_next=scaled_camera(pair.K_next, pair.image_next.shape, following),
-        flow=None,
-        truth=None if pair.truth is None else _truth(pair.truth, pair, ref, following),
-        depth_prior=None if pair.depth_prior is None else _nearest(pair.depth_prior, ref),
-    )
+    small = _at_sizes(pair, np.array([[factor], [factor]]))
+    truth, prior = pair.truth, pair.depth_prior
+    if truth is not None:
+        small = replace(small, truth=_truth(truth, pair, small))
+    if prior is not None:
+        small = replace(small, depth_prior=_nearest(prior, small.size))
     return small if pair.flow is None else small.with_flow(resized_flow(pair.flow, pair, small))
 
 
-def scaled_camera(K: Float, old: tuple[int, ...], new: Size) -> Float:
+def _at_sizes(pair: Pair, factors: Float) -> Pair:
+    """The pair with images reduced by factors (2, 2) or (2, 1) (height, width), and no more."""
+    images = pair.image_ref, pair.image_next
+    shapes = np.array([image.shape[:2] for image in images])
+    sizes = np.maximum(1, np.rint(shapes * factors)).astype(int)
+    ref, following = map(resized, images, sizes)
+    K_ref, K_next = map(scaled_camera, (pair.K_ref, pair.K_next), shapes, sizes)
+    small = replace(pair, flow=None, truth=None, depth_prior=None)
+    return replace(small, image_ref=ref, image_next=following, K_ref=K_ref, K_next=K_next)
+
+
+def scaled_camera(K: Float, old: Sequence[int], new: Sequence[int]) -> Float:
     """(3, 3) intrinsics of an image (height, width, ...) that is resized to (height, width)."""
     scale = np.array([new[1] / old[1], new[0] / old[0], 1.0])
     out: Float = K * scale[:, None]
@@ -73,10 +75,6 @@ def resized_flow(flow: Flow, pair: Pair, other: Pair) -> Flow:
     return Flow(uv, np.clip(confidence, 0, 1), flow.source)
 
 
-def _smaller(shape: tuple[int, ...], factor: float) -> Size:
-    return max(1, round(shape[0] * factor)), max(1, round(shape[1] * factor))
-
-
 def resized(image: NDArray[Any], size: Sequence[int]) -> NDArray[Any]:
     """An image or a flow at a size (height, width): the mean of pixels; if larger, the nearest one.
 
@@ -93,22 +91,22 @@ def _nearest(values: NDArray[Any], size: Size) -> NDArray[Any]:
     return values[rows[:, None], columns]
 
 
-def _truth(truth: Truth, pair: Pair, ref: Size, following: Size) -> Truth:
+def _truth(truth: Truth, pair: Pair, small: Pair) -> Truth:
     """The truth at the sizes of the smaller images."""
-    (height, width) = pair.size
+    ref, following = (
+        np.divide(image.shape[1::-1], old.shape[1::-1])
+        for image, old in ((small.image_ref, pair.image_ref), (small.image_next, pair.image_next))
+    )
     changed: dict[str, Any] = {}
     for name in truth.known():
         value = getattr(truth, name)
-        if name == "motions":
-            continue
         if name == "points":
-            scale = np.array([ref[1] / width, ref[0] / height])
-            changed[name] = np.column_stack([(value[:, :2] + 0.5) * scale - 0.5, value[:, 2:]])
-        else:
-            changed[name] = _nearest(value, following if name == "depth_next" else ref)
+            changed[name] = np.column_stack([(value[:, :2] + 0.5) * ref - 0.5, value[:, 2:]])
+        elif name != "motions":
+            image = small.image_next if name == "depth_next" else small.image_ref
+            changed[name] = _nearest(value, image.shape[:2])
     if truth.flow is not None:
-        scale = np.array([following[1], following[0]]) / pair.image_next.shape[1::-1]
-        changed["flow"] = changed["flow"] * scale
+        changed["flow"] = changed["flow"] * following
     return replace(truth, **changed)
 
 
@@ -121,42 +119,4 @@ def at_common_focal(pair: Pair) -> Pair:
     ratio = np.diag(pair.K_next)[1::-1] / np.diag(pair.K_ref)[1::-1]
     if 1 / ALIKE <= np.sqrt(ratio.prod()) <= ALIKE:
         return pair
-    shapes = np.array([pair.image_ref.shape[:2], pair.image_next.shape[:2]])
-    factors = np.minimum([ratio, 1 / ratio], 1.0)
-    sizes = np.maximum(1, np.rint(shapes * factors)).astype(int)
-    (ref, following), cameras = sizes, (pair.K_ref, pair.K_next)
-    K_ref, K_next = (scaled_camera(*own) for own in zip(cameras, shapes, sizes))
-    return replace(
-        pair,
-        image_ref=resized(pair.image_ref, ref),
-        image_next=resized(pair.image_next, following),
-        K_ref=K_ref,
-        K_next=K_next,
-        flow=None,
-        truth=None,
-    )
-
-
-def in_own_pixels(flow: Flow, near: Pair, pair: Pair, compute: Callable[[Pair], Flow]) -> Flow:
-    """The flow of `near`, which is `at_common_focal(pair)`, in the pixels of both frames.
-
-    Where hardly any of it is usable, but the images match as they are, that flow (of `compute`) is
-    taken.
-
-    Warns:
-        DataWarning: the images match as they are, which the focal lengths contradict.
-    """
-    found = resized_flow(flow, near, pair)
-    if found.usable >= FEW:
-        return found
-    plain = compute(pair)
-    if plain.usable < 2 * FEW:
-        return found
-    warnings.warn(
-        f"the images match as they are ({plain.usable:.0%} of the pixels), but not at their focal"
-        f" lengths, {pair.K_ref[0, 0]:g} and {pair.K_next[0, 0]:g} px ({found.usable:.0%}): these"
-        " are probably wrong",
-        DataWarning,
-        stacklevel=2,
-    )
-    return plain
+    return _at_sizes(pair, np.minimum([ratio, 1 / ratio], 1.0))

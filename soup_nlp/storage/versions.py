@@ -5,10 +5,20 @@ from __future__ import annotations
 import hashlib
 import platform
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 __version__ = "0.1.0"
+
+_PACKAGES = {
+    "casadi": "casadi",
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "opencv": "opencv-python-headless",
+    "skimage": "scikit-image",
+    "h5py": "h5py",
+}
+_OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
 
 
 @cache
@@ -24,11 +34,14 @@ def code_version() -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that a result depends on."""
-    # opencv-python and its variants are one module
-    import cv2
-
-    packages = {name: version(name) for name in ("casadi", "numpy", "scipy")}
-    packages |= {"opencv": cv2.__version__, "skimage": version("scikit-image")}
-    python = platform.python_version()
-    return {"soup_nlp": __version__, "python": python, **packages, "h5py": version("h5py")}
+    """Versions of the packages that a result depends on; "unknown" if not available."""
+    out = {"soup_nlp": __version__, "python": platform.python_version()}
+    for name, package in _PACKAGES.items():
+        out[name] = "unknown"
+        for candidate in _OPENCV if name == "opencv" else (package,):
+            try:
+                out[name] = version(candidate)
+                break
+            except PackageNotFoundError:
+                continue
+    return out

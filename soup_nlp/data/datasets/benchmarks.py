@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.datasets.layout import (
@@ -35,18 +36,18 @@ from soup_nlp.data.formats.map_files import (
 )
 from soup_nlp.data.pair import Pair, Truth, check_size
 from soup_nlp.errors import DataError
-from soup_nlp.geometry.camera import intrinsics, pixel_grid, rays
+from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Whole
 from soup_nlp.storage.files import is_file
 
 
 class _Kitti(NamedTuple):
-    """Folders and names of one KITTI benchmark; {} stands for occ or noc."""
+    """Folders and names of one KITTI benchmark."""
 
     images: str
     calibration: str
     projections: tuple[str, str]
-    disparities: tuple[str, str]
+    disparity: str
     layout: str
 
 
@@ -55,17 +56,17 @@ _KITTI = {
         "image_0",
         "calib",
         ("P0", "P1"),
-        ("disp_{}", "none"),
+        "disp_occ",
         "training/image_0/NNNNNN_10.png and _11.png, training/calib/NNNNNN.txt (P0, P1); optional "
-        "disp_occ, disp_noc, flow_occ, flow_noc with NNNNNN_10.png",
+        "disp_occ, flow_occ, flow_noc with NNNNNN_10.png",
     ),
     "kitti2015": _Kitti(
         "image_2",
         "calib_cam_to_cam",
         ("P_rect_02", "P_rect_03"),
-        ("disp_{}_0", "disp_{}_1"),
+        "disp_occ_0",
         "training/image_2/NNNNNN_10.png and _11.png, training/calib_cam_to_cam/NNNNNN.txt "
-        "(P_rect_02, P_rect_03); optional disp_occ_0, disp_occ_1, flow_occ, flow_noc, obj_map with "
+        "(P_rect_02, P_rect_03); optional disp_occ_0, flow_occ, flow_noc, obj_map with "
         "NNNNNN_10.png",
     ),
 }
@@ -101,98 +102,66 @@ DEFAULT_SCENE = "alley_1"
 class KittiInput(PairInput):
     """KITTI 2012 (grey camera 0) or 2015 (colour camera 2): frames 10 and 11 of a sequence.
 
-    Depth is f B / disparity. disp_occ_1 of 2015 has the disparity of the second frame at the pixels
-    of the first, so with the flow it gives the scene flow, not a depth map of the next frame. A
-    pixel is occluded where the flow is known but absent from flow_noc. The moving objects of the
-    obj_map of 2015 are components; 0 is the static scene.
+    Depth is f B / disparity. A pixel is occluded where the flow is known but absent from flow_noc.
+    The moving objects of the obj_map of 2015 are components; 0 is the static scene.
     """
 
     kind: Literal["kitti2012", "kitti2015"]
     """Kind of input."""
     root: str
     """Folder that holds training/."""
-    index: str
+    index: Annotated[str, Field(pattern=r"^\d{1,6}$")]
     """Six digits in quotes, such as "000138"."""
-    occ: bool = True
-    """Truth with occluded pixels (true) or without."""
 
     def load(self, path: Resolve) -> Pair:
-        """See `PairInput`.
-
-        Raises:
-            DataError: an image or the calibration is missing, or a file is malformed.
-        """
+        """See `PairInput`."""
         own = _KITTI[self.kind]
         base = training_folder(path(self.root), own.layout)
-        if not self.index.isdecimal():
-            raise DataError(
-                "KITTI pair index is not a number",
-                found=repr(self.index),
-                expected="'27' or '000027'",
-            )
-        stem, suffix = f"{int(self.index):06d}", "occ" if self.occ else "noc"
-        name = f"{stem}_10.png"
-        images = [need(base / own.images / f"{stem}_{k}.png", own.layout) for k in (10, 11)]
-        calibration = need(base / own.calibration / f"{stem}.txt", own.layout)
+        name = f"{int(self.index):06d}"
+        images = [need(base / own.images / f"{name}_{k}.png", own.layout) for k in (10, 11)]
+        calibration = need(base / own.calibration / f"{name}.txt", own.layout)
         left, right = read_kitti_projections(calibration, own.projections)
         K = left[:, :3].copy()
-        focal_baseline = K[0, 0] * _baseline(left, right, calibration)
-        disparities = (
-            read_if(read_depth_png16, base / folder.format(suffix) / name, KITTI_DISPARITY)
-            for folder in own.disparities
-        )
-        depth, depth_after = (None if d is None else focal_baseline / d for d in disparities)
-        objects = read_if(decode, base / "obj_map" / name, "object map")
-        flow, occluded = _kitti_flow(base, name, suffix)
+        baseline = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
+        if not baseline > 0:
+            raise DataError(
+                "calibration gives no baseline between the stereo cameras",
+                where=calibration,
+                found=f"{baseline:g} m",
+                expected="a positive length (0.53 to 0.55 m in KITTI)",
+            )
+        kinds = own.disparity, "flow_occ", "flow_noc", "obj_map"
+        files = [base / kind / f"{name}_10.png" for kind in kinds]
+        disparity = read_if(read_depth_png16, files[0], KITTI_DISPARITY)
+        flow, visible = (read_if(read_kitti_flow, file) for file in files[1:3])
+        occluded = None
+        if flow is not None and visible is not None:
+            check_size("flow_noc and flow_occ", visible.shape, flow.shape, files[2])
+            occluded = np.isfinite(flow[:, :, 0]) & ~np.isfinite(visible[:, :, 0])
+        objects = read_if(decode, files[3], "object map")
         truth = Truth(
-            depth_ref=depth,
+            depth_ref=None if disparity is None else K[0, 0] * baseline / disparity,
             flow=flow,
             occluded=occluded,
             components=None if objects is None else objects.astype(np.int32),
-            scene_flow=_scene_flow(K, depth, depth_after, flow, f"{base}, pair {stem}"),
         )
-        return make_pair(images, [K, K], truth, f"{self.kind}_{stem}")
+        return make_pair(images, [K, K], truth, f"{self.kind}_{name}")
 
 
-def _baseline(left: Float, right: Float, path: Path) -> float:
-    """Baseline of two rectified projections (3, 4), metres."""
-    baseline = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
-    if not baseline > 0:
-        raise DataError(
-            "calibration gives no baseline between the stereo cameras",
-            where=path,
-            found=f"{baseline:g} m",
-            expected="a positive length (0.53 to 0.55 m in KITTI)",
-        )
-    return baseline
+class SceneFrames(PairInput):
+    """Base of the inputs of two frames of a named scene."""
+
+    root: str
+    """Root folder of the dataset."""
+    scene: str
+    """Such as alley_1 of Sintel, "0001" (Virtual KITTI 1) or Scene01 (2)."""
+    frame: Index
+    """Number of the reference frame as in its file name; the first of Sintel is 1."""
+    step: Whole = 1
+    """Distance of the next frame; a true flow exists for 1 only."""
 
 
-def _kitti_flow(base: Path, name: str, suffix: str) -> tuple[Float | None, Mask | None]:
-    """True flow, and where it is known but not in the non-occluded version."""
-    flow = read_if(read_kitti_flow, base / f"flow_{suffix}" / name)
-    visible_file = base / "flow_noc" / name
-    visible = None if flow is None else read_if(read_kitti_flow, visible_file)
-    if flow is None or visible is None:
-        return flow, None
-    check_size("flow_noc and flow_occ", visible.shape, flow.shape, visible_file)
-    return flow, np.isfinite(flow[:, :, 0]) & ~np.isfinite(visible[:, :, 0])
-
-
-def _scene_flow(
-    K: Float, depth: Float | None, depth_after: Float | None, flow: Float | None, where: str
-) -> Float | None:
-    """(H, W, 3) difference of the points of a pixel, metres, where all three parts are known."""
-    if depth is None or depth_after is None or flow is None:
-        return None
-    for disparity in (depth, depth_after):
-        check_size("disparity and flow", disparity.shape, flow.shape, where)
-    uv = pixel_grid(*depth.shape)
-    return np.asarray(
-        rays(K, uv + flow) * depth_after[:, :, None] - rays(K, uv) * depth[:, :, None]
-    )
-
-
-class VkittiInput(PairInput):
+class VkittiInput(SceneFrames):
     """Virtual KITTI 1 (scene is the world, such as "0001") or 2 (left camera); no depth of the sky.
 
     The root holds vkitti_1.3.1_rgb and, for truth, _depthgt and _flowgt (1), or Scene01 and so on
@@ -201,23 +170,11 @@ class VkittiInput(PairInput):
 
     kind: Literal["vkitti1", "vkitti2"]
     """Kind of input."""
-    root: str
-    """Root folder of the dataset."""
-    scene: str
-    """Such as "0001" (1) or Scene01 (2)."""
-    frame: Index
-    """Number of the reference frame."""
     variation: str = "clone"
     """Weather or camera variation."""
-    step: Whole = 1
-    """Distance of the next frame; a true flow exists for 1 only."""
 
     def load(self, path: Resolve) -> Pair:
-        """See `PairInput`.
-
-        Raises:
-            DataError: an image or the intrinsics are missing, or a file is malformed.
-        """
+        """See `PairInput`."""
         image, depth, flow = _VKITTI[self.kind]
         layout = f"{image}; optional {depth}, {flow}"
         layout = layout.replace("{:05d}", "NNNNN").format(*["SCENE", "VARIATION"] * 3)
@@ -244,7 +201,7 @@ class VkittiInput(PairInput):
         return make_pair(images, cameras, truth, name)
 
 
-class SintelInput(PairInput):
+class SintelInput(SceneFrames):
     """MPI Sintel with its depth and camera extension; depth is in the scene's unit.
 
     A pixel is occluded by the occlusion mask, or if its flow leaves the image; pixels of the mask
@@ -254,34 +211,28 @@ class SintelInput(PairInput):
 
     kind: Literal["sintel"]
     """Kind of input."""
-    root: str
-    """Folder that holds training/."""
-    scene: str
-    """Such as alley_1."""
-    frame: Index
-    """Number of the reference frame as in its file name; the first is 1."""
     render: Literal["clean", "final", "albedo"] = "clean"
     """Rendering pass."""
-    step: Whole = 1
-    """Distance of the next frame; a true flow exists for 1 only."""
 
     def load(self, path: Resolve) -> Pair:
-        """See `PairInput`.
-
-        Raises:
-            DataError: an image is missing, or a file is malformed or has a wrong size.
-        """
+        """See `PairInput`."""
         base = training_folder(path(self.root), SINTEL_LAYOUT)
         names = [f"{self.scene}/frame_{k:04d}" for k in (self.frame, self.frame + self.step)]
         images = [need(base / self.render / f"{name}.png", SINTEL_LAYOUT) for name in names]
         depths = [read_if(read_dpt, base / "depth" / f"{name}.dpt") for name in names]
         flow, occluded = _sintel_flow(base, names[0]) if self.step == 1 else (None, None)
-        return make_pair(
-            images,
-            _sintel_cameras([base / "camdata_left" / f"{name}.cam" for name in names], self.scene),
-            Truth(depths[0], depths[1], flow, occluded),
-            f"sintel_{self.scene}_{self.frame:04d}",
-        )
+        files = [base / "camdata_left" / f"{name}.cam" for name in names]
+        absent = [file for file in files if not is_file(file)]
+        if absent:
+            doubt = f", which may be wrong for {self.scene}" * (self.scene != DEFAULT_SCENE)
+            assumed(
+                absent[0],
+                "no such camera file (camdata_left comes with Sintel's depth training data)",
+                f"the focal length of {DEFAULT_SCENE}, {DEFAULT_CAMERA[0]:g} pixels{doubt}",
+            )
+        cameras = [intrinsics(*DEFAULT_CAMERA) if f in absent else read_cam(f) for f in files]
+        truth = Truth(depths[0], depths[1], flow, occluded)
+        return make_pair(images, cameras, truth, f"sintel_{self.scene}_{self.frame:04d}")
 
 
 def _sintel_flow(base: Path, name: str) -> tuple[Float | None, Mask | None]:
@@ -299,16 +250,3 @@ def _sintel_flow(base: Path, name: str) -> tuple[Float | None, Mask | None]:
     if invalid is not None:
         flow[invalid] = np.nan
     return flow, occluded
-
-
-def _sintel_cameras(paths: list[Path], scene: str) -> list[Float]:
-    """Intrinsics of the frames; `DEFAULT_CAMERA` with a warning if a file is missing."""
-    absent = [path for path in paths if not is_file(path)]
-    if absent:
-        doubt = "" if scene == DEFAULT_SCENE else f", which may be wrong for {scene}"
-        assumed(
-            absent[0],
-            "no such camera file (camdata_left comes with Sintel's depth training data)",
-            f"the focal length of {DEFAULT_SCENE}, {DEFAULT_CAMERA[0]:g} pixels{doubt}",
-        )
-    return [intrinsics(*DEFAULT_CAMERA) if p in absent else read_cam(p) for p in paths]

@@ -88,12 +88,7 @@ class FolderInput(FramesInput):
     """The folder."""
 
     def load(self, path: Resolve) -> Pair:
-        """See `PairInput`.
-
-        Raises:
-            DataError: a required file is missing, a file is malformed or has a wrong size, or the
-                folder holds the result of a solve.
-        """
+        """See `PairInput`."""
         return _plain_folder(path(self.path), self)
 
 
@@ -174,11 +169,7 @@ class TumInput(PairInput):
     """Values per metre of the depth images; null for the 5000 of TUM, with a warning."""
 
     def load(self, path: Resolve) -> Pair:
-        """See `PairInput`.
-
-        Raises:
-            DataError: the layout is unknown, a file is missing or the frame does not exist.
-        """
+        """See `PairInput`."""
         folder = need_folder(path(self.path), TUM_LAYOUT)
         if _find(folder, ("frame_0", "image_ref"), _IMAGES) and not is_file(folder / "rgb.txt"):
             own = FolderInput(kind="folder", path=self.path, depth_scale=self.depth_scale)
@@ -261,11 +252,7 @@ class MotorcycleInput(PairInput):
     """Kind of input."""
 
     def load(self, path: Resolve) -> Pair:
-        """See `PairInput`.
-
-        Raises:
-            DataError: the images are not available (scikit-image fetches them once).
-        """
+        """See `PairInput`."""
         from skimage import data
 
         try:

@@ -30,7 +30,11 @@ class PairInput(Section, ABC):
 
     @abstractmethod
     def load(self, path: Resolve) -> Pair:
-        """The pair, without its flow; `path` resolves the names of files."""
+        """The pair, without its flow; `path` resolves the names of files.
+
+        Raises:
+            DataError: a required file is missing, or a file is malformed or has a wrong size.
+        """
 
     def files(self) -> list[str]:
         """Names of the files and folders that are read."""
@@ -127,7 +131,7 @@ def make_pair(
         white: Value of white in 16-bit images, see `read_images`.
         fov: Horizontal field of view, degrees, if the cameras are not known.
         focal_sigma: Standard deviation of the log focal length of `fov`.
-        cropped: The images are parts of larger ones, see `check_camera`.
+        cropped: The images are parts of larger ones, see `check_cameras`.
         distortion: Coefficients (n,) of both lenses, removed from the images, see `undistorted`.
 
     Raises:

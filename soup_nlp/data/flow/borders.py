@@ -7,7 +7,7 @@ are moved to the neighbouring superpixel with their flow. The flow of a superpix
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,24 +49,29 @@ def follow_flow(
     """
     current = labels.astype(np.int64)
     count = int(current.max()) + 1
-    fit, _ = fit_affine(flow, current)
-    changed = np.zeros(count, bool)
+    fit, _ = fit_affine(flow, current, count)
+    refit = False
     near = np.ones(current.shape, bool)
     for sweep in range(SWEEPS):
-        if changed.any() and sweep % REFIT == 0:
-            fit = refit_affine(fit, flow, current, changed)
-            changed[:], near[:] = False, True
+        if refit and sweep % REFIT == 0:
+            fit, _ = fit_affine(flow, current, count)
+            refit, near[:] = False, True
         framed = np.pad(current, 1, mode="edge")
         sides = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
         # only pixels near a change of the last sweep can change
         border = near & (flow.confidence > 0) & np.any([side != current for side in sides], axis=0)
         v, u = np.nonzero(border)
-        own = current[v, u]
-        best = _nearest(fit, flow, own, [side[v, u] for side in sides], u, v, margin_px)
+        own, uv = current[v, u], flow.uv[v, u].astype(np.float64)
+        best, least = own.copy(), fit.residual(own, u, v, uv) - margin_px
+        for side in sides:
+            other = side[v, u]
+            residual = fit.residual(other, u, v, uv)
+            better = (residual < least) & (other != own)
+            best[better], least[better] = other[better], residual[better]
         moved = best != own
         if not moved.any():
             break
-        changed[own[moved]] = changed[best[moved]] = True
+        refit = True
         current[v[moved], u[moved]] = best[moved]
         near[:] = False
         near[v[moved], u[moved]] = True
@@ -91,25 +96,6 @@ def follow_depth(labels: NDArray[np.integer], log_depth: Float) -> Labels:
     units = np.where(known, log_depth, 0.0) / LEAST_STEP
     both = np.stack([units, np.zeros_like(units)], axis=-1)
     return follow_flow(labels, Flow(both.astype(np.float32), known.astype(np.float32), "depth"))
-
-
-def _nearest(
-    fit: AffineFlow,
-    flow: Flow,
-    own: Int,
-    sides: list[Int],
-    u: Int,
-    v: Int,
-    margin_px: float,
-) -> Int:
-    """(P,) superpixel with the nearest affine flow, the present one or that of a side."""
-    uv = flow.uv[v, u].astype(np.float64)
-    best, least = own.copy(), fit.residual(own, u, v, uv) - margin_px
-    for other in sides:
-        residual = fit.residual(other, u, v, uv)
-        better = (residual < least) & (other != own)
-        best[better], least[better] = other[better], residual[better]
-    return best
 
 
 # --- affine flow of superpixels ---
@@ -142,7 +128,9 @@ class AffineFlow:
         return np.where(self.known[which], np.linalg.norm(uv - own, axis=1), np.inf)
 
 
-def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Float]:
+def fit_affine(
+    flow: Flow, labels: NDArray[np.integer], count: int | None = None
+) -> tuple[AffineFlow, Float]:
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
     s is the larger one of `SCALE_PX` and the spread of the superpixel, 1.48 times the weighted mean
@@ -152,35 +140,20 @@ def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Flo
     Args:
         flow: Flow, whose confidence multiplies the weights.
         labels: (H, W) superpixel labels 0..N-1.
+        count: N; None if the last label occurs.
 
     Returns:
         The fits, and the last weights (P,) of the pixels with positive confidence.
     """
     v, u = np.nonzero(flow.confidence > 0)
-    return _fit(flow, labels[v, u].astype(np.int64), u, v, int(labels.max()) + 1)
-
-
-def refit_affine(
-    fit: AffineFlow, flow: Flow, labels: NDArray[np.integer], changed: NDArray[np.bool_]
-) -> AffineFlow:
-    """The fits of `fit_affine`, recomputed for the superpixels that `changed` (N,) only."""
-    v, u = np.nonzero((flow.confidence > 0) & changed[labels])
-    number = np.cumsum(changed) - 1
-    new, _ = _fit(flow, number[labels[v, u]], u, v, int(changed.sum()))
-    merged = [np.copy(field) for field in astuple(fit)]
-    for field, own in zip(merged, astuple(new), strict=True):
-        field[changed] = own
-    return AffineFlow(*merged)
-
-
-def _fit(flow: Flow, which: Int, u: Int, v: Int, n: int) -> tuple[AffineFlow, Float]:
-    """Fits of n superpixels to pixels (P,) and the last weights, see `fit_affine`."""
+    which = labels[v, u].astype(np.int64)
+    n = int(labels.max()) + 1 if count is None else count
     base = flow.confidence[v, u].astype(np.float64)
     total = np.maximum(np.bincount(which, base, n), 1e-30)
     centre = np.stack([np.bincount(which, base * x, n) / total for x in (u, v)], axis=1)
-    count = np.bincount(which, minlength=n)
+    pixels = np.bincount(which, minlength=n)
     # coordinates are normalised by the size of the superpixel
-    fit = AffineFlow(np.zeros((n, 3, 2)), centre, np.sqrt(np.maximum(count, 1)), count >= 6)
+    fit = AffineFlow(np.zeros((n, 3, 2)), centre, np.sqrt(np.maximum(pixels, 1)), pixels >= 6)
     X = fit.basis(which, u, v)
     Y = flow.uv[v, u].astype(np.float64)
     r = np.linalg.norm(Y - np.stack([_medians(which, y, n) for y in Y.T], axis=1)[which], axis=1)
@@ -199,7 +172,9 @@ def _fit(flow: Flow, which: Int, u: Int, v: Int, n: int) -> tuple[AffineFlow, Fl
 
 def _medians(which: Int, values: Float, n: int) -> Float:
     """(N,) lower median of the values (P,) of every superpixel; 0 without values."""
-    order = np.lexsort((values, which))
+    order = np.argsort(values)
+    # numpy sorts 16 bits by their digits, which is much faster
+    order = order[np.argsort(which.astype(np.uint16)[order], kind="stable")]
     count = np.bincount(which, minlength=n)
     middle = np.cumsum(count) - count + np.maximum(count - 1, 0) // 2
     if not len(order):
@@ -209,13 +184,14 @@ def _medians(which: Int, values: Float, n: int) -> Float:
 
 def _weighted(which: Int, X: Float, Y: Float, w: Float, n: int) -> Float:
     """(N, 3, 2) weighted affine fits."""
-    A = np.empty((n, 3, 3))
+    A, right = np.empty((n, 3, 3)), np.empty((n, 3, 2))
+    x, y = np.ascontiguousarray(X.T), np.ascontiguousarray(Y.T)
     for a in range(3):
+        weighted = w * x[a]
         for b in range(a, 3):
-            A[:, a, b] = A[:, b, a] = np.bincount(which, w * X[:, a] * X[:, b], n)
-    right = np.stack(
-        [np.bincount(which, w * X[:, a] * Y[:, c], n) for a in range(3) for c in range(2)], axis=1
-    ).reshape(n, 3, 2)
+            A[:, a, b] = A[:, b, a] = np.bincount(which, weighted * x[b], n)
+        for c in range(2):
+            right[:, a, c] = np.bincount(which, weighted * y[c], n)
     # a small ridge makes the slopes of superpixels with few pixels 0
     A += np.eye(3) * (1e-6 * A[:, 0, 0] + 1e-12)[:, None, None]
     return np.asarray(np.linalg.solve(A, right), np.float64)

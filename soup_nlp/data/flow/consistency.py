@@ -8,6 +8,7 @@ without a flow (16 pairs, rendered and real); with a wrong flow, as much or more
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,16 +45,17 @@ def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
     inside = ~leaves(forward, (backward.shape[0], backward.shape[1]))
     x = np.where(inside, u + forward[:, :, 0], 0.0).astype(np.float32)
     y = np.where(inside, v + forward[:, :, 1], 0.0).astype(np.float32)
-    back = cv2.remap(
-        np.ascontiguousarray(backward, dtype=np.float32),
-        x,
-        y,
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    back = sampled(backward, x, y)
     error = np.hypot(x + back[:, :, 0] - u, y + back[:, :, 1] - v)
     error[~inside | ~np.isfinite(error)] = np.inf
     return np.asarray(error, dtype=np.float32)
+
+
+def sampled(image: NDArray[Any], x: FloatMap, y: FloatMap) -> FloatMap:
+    """(H, W) or (H, W, C) values of an image at pixels (x, y) of (H, W); the border repeats."""
+    given = np.ascontiguousarray(image, dtype=np.float32)
+    kind, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+    return np.asarray(cv2.remap(given, x, y, kind, borderMode=border))
 
 
 def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -63,17 +65,6 @@ def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.boo
     y = np.arange(height)[:, None] + flow[:, :, 1]
     inside = (x >= 0) & (x <= shape[1] - 1) & (y >= 0) & (y <= shape[0] - 1)
     return np.asarray(~inside)
-
-
-def checked_flow(forward: FloatMap, backward: FloatMap, source: str) -> Flow:
-    """A Flow from forward (H, W, 2) and backward (H', W', 2) displacements, pixels.
-
-    Its confidence is the forward-backward consistency, see `confidence_of`.
-    """
-    uv = np.ascontiguousarray(forward, dtype=np.float32)
-    confidence = confidence_of(round_trip_error(uv, backward))
-    uv[~np.isfinite(uv).all(axis=2)] = 0.0
-    return Flow(uv, confidence, source)
 
 
 def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:
@@ -136,8 +127,8 @@ def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
         """Difference of every pixel and its target; NaN where unknown or outside."""
         x, y = (np.asarray(p + uv[..., k], np.float32) for k, p in enumerate((u, v)))
         inside = (x >= 0) & (y >= 0) & (x < following.shape[1]) & (y < following.shape[0])
-        seen = cv2.remap(following, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.where(known & inside, np.minimum(np.abs(seen - ref), _CAP), np.nan)
+        gap = np.minimum(np.abs(sampled(following, x, y) - ref), _CAP)
+        return np.where(known & inside, gap, np.nan)
 
     def mean(of: FloatMap, other: FloatMap) -> float:
         """Mean over the pixels that have both differences; infinite if these are few."""
@@ -150,36 +141,33 @@ def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
     at = np.stack([u, v], axis=-1)
     without = differences(at @ A[:, :2].T + A[:, 2] - at)
     own, none = mean(along, along), mean(without, without)
-    cause, least = "", BETTER
-    for name, changed in _changes(uv, pair).items():
+    problem, hint, least = "", "", BETTER
+    if own > none + WORSE and not backward:
+        problem = "flow does not fit the images: it is worse than no flow"
+        hint = "is it of these two images, in this order, in pixels?"
+    for cause, changed in _changes(uv, pair).items():
         new = differences(changed)
         # pixels that leave the image along one flow only say nothing
         both = [(mean(new, old), mean(old, new)) for old in (along, without)]
         # images without contrast agree with every flow
         relative = max((a / b if b > WORSE else 1.0 for a, b in both if a < np.inf), default=np.inf)
         if relative < least:
-            cause, least = name, relative
-    if cause:
-        problem, hint = "flow does not fit the images", f"it does {cause}"
-    elif own > none + WORSE and not backward:
-        problem = "flow does not fit the images: it is worse than no flow"
-        hint = "is it of these two images, in this order, in pixels?"
-    else:
-        if not backward and none > WORSE and own > USELESS * none:
-            warnings.warn(
-                f"flow {flow.source} explains the images hardly better than no flow"
-                f" ({own:.3f} and {none:.3f}): is it of these images?",
-                DataWarning,
-                stacklevel=2,
-            )
-        return
-    raise DataError(
-        problem,
-        where=flow.source,
-        found=f"difference of the images {own:.3f} along the flow, {none:.3f} without a flow",
-        expected="displacements (u right, v down) in pixels, to the other image",
-        hint=hint,
-    )
+            problem, hint, least = "flow does not fit the images", f"it does {cause}", relative
+    if problem:
+        raise DataError(
+            problem,
+            where=flow.source,
+            found=f"difference of the images {own:.3f} along the flow, {none:.3f} without a flow",
+            expected="displacements (u right, v down) in pixels, to the other image",
+            hint=hint,
+        )
+    if not backward and none > WORSE and own > USELESS * none:
+        warnings.warn(
+            f"flow {flow.source} explains the images hardly better than no flow"
+            f" ({own:.3f} and {none:.3f}): is it of these images?",
+            DataWarning,
+            stacklevel=2,
+        )
 
 
 def _grey(image: Image) -> FloatMap:

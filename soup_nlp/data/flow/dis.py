@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap, Image
-from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
+from soup_nlp.data.flow.consistency import confidence_of, round_trip_error, sampled
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
@@ -60,12 +60,7 @@ def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> l
 
 
 def guided_flow(
-    ref: Image,
-    nxt: Image,
-    match: Match,
-    forward: FloatMap,
-    backward: FloatMap,
-    planes: int,
+    ref: Image, nxt: Image, match: Match, forward: FloatMap, backward: FloatMap
 ) -> tuple[FloatMap, FloatMap]:
     """The best, for each pixel, of a flow and of flows found under its dominant homographies.
 
@@ -79,13 +74,12 @@ def guided_flow(
         match: The flow method.
         forward: (H, W, 2) first flow.
         backward: (H', W', 2) first flow in the other direction.
-        planes: Number of homographies.
 
     Returns:
         (H, W, 2) flow and (H, W) its round-trip error, both in pixels.
     """
     gap = round_trip_error(forward, backward)
-    maps = dominant_homographies(forward, confidence_of(gap, support=5), planes) if planes else []
+    maps = dominant_homographies(forward, confidence_of(gap, support=5), PLANES)
     best, best_gap = forward.copy(), gap
     best_score = _score(ref, nxt, forward, gap)
     for H in maps:
@@ -120,10 +114,7 @@ def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, Fl
 def _score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap) -> FloatMap:
     height, width = ref.shape
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
-    x, y = u + flow[..., 0], v + flow[..., 1]
-    there = cv2.remap(
-        nxt.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    there = sampled(nxt, u + flow[..., 0], v + flow[..., 1])
     grey = np.minimum(np.abs(there - ref), _GREY_CAP)
     cost = np.minimum(gap, _ROUND_TRIP_CAP) + np.float32(_PER_GREY) * grey
     score = cv2.blur(cost.astype(np.float32), (_WINDOW, _WINDOW))
@@ -158,14 +149,22 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
     one grey level) gives a zero flow with confidence 0.
 
     Args:
-        image_ref: (H, W, 3) or (H, W) uint8 reference image.
-        image_next: (H', W', 3) or (H', W') uint8 next image; it may differ in size.
+        image_ref: (H, W, 3) uint8 RGB reference image.
+        image_next: (H', W', 3) uint8 RGB next image; it may differ in size.
         consistency: If false, the confidence is 1 wherever the round trip stays in the images.
 
     Raises:
-        DataError: an image is not uint8 or too small.
+        DataError: an image is too small.
     """
-    ref, nxt = _grey(image_ref, "image_ref"), _grey(image_next, "image_next")
+    for where, image in (("image_ref", image_ref), ("image_next", image_next)):
+        if min(image.shape[:2]) < MIN_SIDE:
+            raise DataError(
+                "image is too small for DIS flow",
+                where=where,
+                found=f"{image.shape[1]}x{image.shape[0]}",
+                expected=f"at least {MIN_SIDE} pixels on each side",
+            )
+    ref, nxt = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (image_ref, image_next))
     height, width = ref.shape
     if min(float(ref.std()), float(nxt.std())) < _FLAT:
         zero = np.zeros((height, width), np.float32)
@@ -191,30 +190,10 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
 
     try:
         forward, backward = match(ref, nxt)
-        uv, gap = guided_flow(ref, nxt, match, forward, backward, PLANES)
+        uv, gap = guided_flow(ref, nxt, match, forward, backward)
     except cv2.error as error:
         raise DataError(
             "DIS flow failed", where=f"images {width}x{height}", found=str(error).strip()
         ) from error
     confidence = confidence_of(gap) if consistency else np.isfinite(gap)
     return Flow(np.ascontiguousarray(uv), confidence.astype(np.float32), "dis")
-
-
-def _grey(image: Image, where: str) -> Image:
-    if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)) or image.ndim < 2:
-        raise DataError(
-            "image must be 8-bit, grey or RGB",
-            where=where,
-            found=f"{image.dtype} {image.shape}",
-            expected="uint8 (H, W) or (H, W, 3)",
-        )
-    if min(image.shape[:2]) < MIN_SIDE:
-        raise DataError(
-            "image is too small for DIS flow",
-            where=where,
-            found=f"{image.shape[1]}x{image.shape[0]}",
-            expected=f"at least {MIN_SIDE} pixels on each side",
-        )
-    if image.ndim == 3:
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-    return np.ascontiguousarray(image)

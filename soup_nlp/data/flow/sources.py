@@ -19,7 +19,7 @@ from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
-from soup_nlp.data.working_size import at_common_focal, in_own_pixels
+from soup_nlp.data.working_size import at_common_focal, resized_flow
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.schema.section import Section
 from soup_nlp.storage.files import PathLike, is_file
@@ -31,6 +31,9 @@ ENTRY_POINTS = "soup_nlp.flow"
 
 NOISE = "truth+noise:"
 """Prefix of the source "true flow with noise", followed by the standard deviation in pixels."""
+
+CORRELATION = 5.0
+"""Standard deviation of the Gaussian that blurs the noise, pixels."""
 
 
 def load_flow(path: PathLike) -> Flow:
@@ -61,40 +64,34 @@ def flow_from_truth(pair: Pair) -> Flow:
     return Flow(pair.truth.flow.astype(np.float32), source="truth")
 
 
-def add_noise(flow: Flow, sigma: float, correlation: float = 5.0) -> Flow:
-    """A flow with Gaussian noise that is correlated over a few pixels, like errors of real flows.
+def noisy_truth(pair: Pair, source: str) -> Flow:
+    """The true flow of a pair with Gaussian noise, of a source such as "truth+noise:0.5".
 
-    White noise would average out within a superpixel. Every call adds the same noise.
+    The number is the standard deviation of either component, pixels. The noise is correlated over a
+    few pixels, like errors of real flows: white noise would average out within a superpixel. Every
+    call adds the same noise.
 
-    Args:
-        flow: Any flow.
-        sigma: Standard deviation of either component, pixels.
-        correlation: Standard deviation of the Gaussian that blurs white noise, pixels; 0 for none.
+    Raises:
+        DataError: the pair has no true flow, or the source has no such number.
     """
-    height, width = flow.confidence.shape
-    pad = int(np.ceil(4 * correlation))
-    shape = (height + 2 * pad, width + 2 * pad, 2)
-    noise = np.random.default_rng(0).standard_normal(shape).astype(np.float32)
-    if correlation > 0:
-        noise = np.asarray(cv2.GaussianBlur(noise, (0, 0), correlation), np.float32)
-    noise = noise[pad : pad + height, pad : pad + width]
-    # normalise: the deviation of blurred noise differs from its expectation in a small image
-    noise = noise * np.float32(sigma / max(float(noise.std()), 1e-12))
-    uv = np.where(flow.confidence[:, :, None] > 0, flow.uv + noise, flow.uv)
-    return Flow(uv.astype(np.float32), flow.confidence.copy(), f"{flow.source}+noise:{sigma:g}")
-
-
-def _noise_level(source: str) -> float:
-    """Standard deviation in pixels of a source such as "truth+noise:0.5"."""
     try:
         sigma = float(source.removeprefix(NOISE))
     except ValueError:
         sigma = np.nan
     if not 0 <= sigma < 1000:
-        raise DataError(
-            "noise of the flow is not a number of pixels", found=source, expected=f"{NOISE}0.5"
-        )
-    return sigma
+        what = "noise of the flow is not a number of pixels"
+        raise DataError(what, found=source, expected=f"{NOISE}0.5")
+    flow = flow_from_truth(pair)
+    height, width = flow.confidence.shape
+    pad = int(np.ceil(4 * CORRELATION))
+    shape = (height + 2 * pad, width + 2 * pad, 2)
+    noise = np.random.default_rng(0).standard_normal(shape).astype(np.float32)
+    blurred = cv2.GaussianBlur(noise, (0, 0), CORRELATION)
+    noise = np.asarray(blurred, np.float32)[pad : pad + height, pad : pad + width]
+    # normalise: the deviation of blurred noise differs from its expectation in a small image
+    noise = noise * np.float32(sigma / max(float(noise.std()), 1e-12))
+    uv = np.where(flow.confidence[:, :, None] > 0, flow.uv + noise, flow.uv)
+    return Flow(uv.astype(np.float32), flow.confidence, f"{flow.source}+noise:{sigma:g}")
 
 
 class FlowOptions(Section):
@@ -125,20 +122,16 @@ class FlowOptions(Section):
         Raises:
             DataError: the source is unknown, or its flow is damaged or has another size.
         """
-        if self.backward or self.confidence:
-            return self._load_with_confidence(pair, path)
         source = str(path(self.source)) if is_path(self.source) else self.source
+        if self.backward or self.confidence:
+            return self._with_confidence(pair, source, path)
         if self.is_file() or source.startswith("truth"):
             return resolve_flow(pair, source)
         near = at_common_focal(pair)
         flow = resolve_flow(near, source, self.consistency)
-        if near is pair:
-            return flow
-        return in_own_pixels(
-            flow, near, pair, lambda pair: resolve_flow(pair, source, self.consistency)
-        )
+        return flow if near is pair else resized_flow(flow, near, pair)
 
-    def _load_with_confidence(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
+    def _with_confidence(self, pair: Pair, source: str, path: Callable[[str], Path]) -> Flow:
         """The flow of a file, its confidence from a backward flow and a map."""
         if not self.is_file():
             raise ConfigError(
@@ -148,21 +141,18 @@ class FlowOptions(Section):
                 expected="a .flo, KITTI .png or .npy file",
                 hint="every other source has a confidence of its own",
             )
-        flow = resolve_flow(pair, str(path(self.source)))
+        flow = resolve_flow(pair, source)
         own = flow.confidence.copy()
         if self.backward:
             back = load_flow(path(self.backward))
             size = pair.image_next.shape
             check_size("backward flow and next image", back.uv.shape, size, self.backward)
             check_flow(back, pair, backward=True)
-            gap = round_trip_error(
-                flow.uv, np.where(back.confidence[..., None] > 0, back.uv, np.nan)
-            )
+            known = np.where(back.confidence[..., None] > 0, back.uv, np.nan)
+            gap = round_trip_error(flow.uv, known)
             own *= confidence_of(gap) if self.consistency else np.isfinite(gap)
         if self.confidence:
-            given = read_confidence(path(self.confidence))
-            check_size("flow confidence and flow", given.shape, flow.uv.shape, self.confidence)
-            own *= given
+            own *= Flow(flow.uv, read_confidence(path(self.confidence)), self.confidence).confidence
         if not own.any():
             raise DataError(
                 "the flow has confidence 0 everywhere",
@@ -213,8 +203,8 @@ def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
 
     Args:
         pair: The pair; its `flow` is ignored.
-        source: One of `METHODS`, "truth+noise:SIGMA" (`add_noise`), the name of a plug-in, the path
-            of a network (.onnx) or of a flow file.
+        source: One of `METHODS`, "truth+noise:SIGMA" (`noisy_truth`), the name of a plug-in, the
+            path of a network (.onnx) or of a flow file.
         consistency: Whether DIS weights its flow by the forward-backward consistency.
 
     Raises:
@@ -223,7 +213,7 @@ def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
     if source in METHODS:
         return METHODS[source](pair, consistency)
     if source.startswith(NOISE):
-        return add_noise(flow_from_truth(pair), _noise_level(source))
+        return noisy_truth(pair, source)
     if is_network(source):
         return learned_flow(source, pair.image_ref, pair.image_next)
     plugins = flow_sources()

@@ -155,41 +155,36 @@ Size = tuple[int, int]
 def check_cameras(
     cameras: Sequence[Float], images: Sequence[Image], names: Sequence[object], cropped: bool
 ) -> None:
-    """Check the intrinsics of both frames, once where they are the same; see `check_camera`."""
-    alike = images[0].shape == images[1].shape and np.array_equal(cameras[0], cameras[1])
-    for k in range(1 if alike else 2):
-        check_camera(cameras[k], images[k].shape[:2], names[k], cropped)
+    """Check the intrinsics (3, 3) of both frames, once where they are the same.
 
-
-def check_camera(K: Float, size: Size, where: object, cropped: bool = False) -> None:
-    """Check intrinsics (3, 3) for an image of `size` (height, width).
-
-    `cropped` says that the image is a part of a larger one: its principal point is anywhere.
+    `cropped` says that the images are parts of larger ones: their principal points are anywhere.
 
     Raises:
-        DataError: the principal point is outside of the image.
+        DataError: a principal point is outside of the image.
 
     Warns:
-        DataWarning: the principal point is far from the middle, fx and fy differ much, or the
+        DataWarning: a principal point is far from the middle, fx and fy differ much, or the
             intrinsics are those of another resolution.
     """
-    problems = _problems(K, size, cropped)
-    if not problems:
-        return
-    cause, fits = _explanation(K, size)
-    hint = f"{cause}; {_text(fits)} would fit"
-    (x, y), (height, width) = K[:2, 2], size
-    if not cropped and not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
-        raise DataError(
-            "principal point is outside of the image",
-            where=where,
-            found=f"fx,fy,cx,cy {_text(K)} at {width} x {height}",
-            expected="a principal point near the middle",
-            hint=f"{hint}. If the images were cropped, --set input.cropped=true accepts it, in"
-            " Python solve_pair(pair, cropped=True)",
-        )
-    text = f"{where}, {width} x {height}: {' and '.join(problems)}. Likely cause: {hint}"
-    warnings.warn(text, DataWarning, stacklevel=3)
+    alike = images[0].shape == images[1].shape and np.array_equal(cameras[0], cameras[1])
+    for K, image, where in list(zip(cameras, images, names))[: 1 if alike else 2]:
+        height, width = size = image.shape[:2]
+        problems = _problems(K, size, cropped)
+        if not problems:
+            continue
+        cause, fits = _explanation(K, size)
+        hint, (x, y) = f"{cause}; {_text(fits)} would fit", K[:2, 2]
+        if not cropped and not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise DataError(
+                "principal point is outside of the image",
+                where=where,
+                found=f"fx,fy,cx,cy {_text(K)} at {width} x {height}",
+                expected="a principal point near the middle",
+                hint=f"{hint}. If the images were cropped, --set input.cropped=true accepts it, in"
+                " Python solve_pair(pair, cropped=True)",
+            )
+        text = f"{where}, {width} x {height}: {' and '.join(problems)}. Likely cause: {hint}"
+        warnings.warn(text, DataWarning, stacklevel=2)
 
 
 def _text(K: Float) -> str:
