@@ -126,23 +126,15 @@ def _comparison(folder: Path, rows: pd.DataFrame) -> list[str]:
     return [*lines, *_figure("comparison", "MRE by dataset")]
 
 
-def _plot_bars(path: Path, bars: pd.DataFrame, text: str, log: bool = False) -> None:
-    """Groups of horizontal bars: a group for each row, a colour for each column."""
+def _plot_bars(path: Path, bars: pd.DataFrame, text: str, base: float = 0.0) -> None:
+    """Groups of horizontal bars from `base`: a group for each row, a colour for each column."""
     picture = figure(8, 0.4 * len(bars) + 1.5)
     ax = picture.add_subplot()
-    height = 0.8 / max(1, bars.shape[1])
-    for k, column in enumerate(bars.columns):
-        y = np.arange(len(bars)) + (k - (bars.shape[1] - 1) / 2) * height
-        x = bars[column].to_numpy(float)
-        ax.barh(y, x - 1 if log else x, height, left=1 if log else 0, label=str(column))
-    if log:
-        ax.set_xscale("log")
-    ax.set_yticks(np.arange(len(bars)), [str(name) for name in bars.index], size=7)
-    ax.invert_yaxis()
-    ax.grid(alpha=0.3, axis="x")
-    if bars.shape[1]:
+    if len(bars):
+        style = {"width": 0.8, "fontsize": 7, "grid": True, "logx": base > 0}
+        (bars - base).plot.barh(ax=ax, left=base, title=text, **style)
+        ax.invert_yaxis()
         ax.legend(fontsize=7)
-    ax.set_title(text, fontsize=10)
     save(picture, path)
 
 
@@ -264,7 +256,7 @@ def _departures(folder: Path, rows: pd.DataFrame) -> list[str]:
         lines += [text, "", *markdown(values.rename_axis("departure")), ""]
     lines += [f"- {d.name}: {d.needs}." for d in DEPARTURES if d.needs]
     text = "MRE relative to all others as they are (geometric mean of the pairs)"
-    _plot_bars(folder / "departures.png", pd.DataFrame(bars), text, log=True)
+    _plot_bars(folder / "departures.png", pd.DataFrame(bars), text, base=1.0)
     return [*lines, "", *_figure("departures", text)]
 
 
@@ -280,27 +272,13 @@ def _missing(given: set[str]) -> list[str]:
 
 
 def _plot_lines(path: Path, tables: Mapping[str, pd.DataFrame], axis: str, text: str) -> None:
-    """Lines of tables over their columns: a panel for each table, the mean in black."""
-    picture = figure(4.5 * len(tables) + 1.5, 3.6)
-    axes = picture.subplots(1, len(tables), sharey=True, squeeze=False)[0]
-    for ax, (title, drawn) in zip(axes, tables.items(), strict=True):
-        for name, line in drawn.iterrows():
-            mean = str(name).startswith("mean of")
-            style = {"color": "black", "lw": 2.0} if mean else {"lw": 1.0}
-            ax.plot(range(len(line)), line.to_numpy(float), "o-", ms=3, label=name, **style)
-        names = [str(c) for c in drawn.columns]
-        slanted = {"rotation": 20, "ha": "right"} if len("".join(names)) > 36 else {}
-        ax.set_xticks(range(len(names)), names, size=8, **slanted)
-        ax.set(title=title, xlabel=axis)
-        ax.grid(alpha=0.3)
-    values = np.concatenate([t.to_numpy(float).ravel() for t in tables.values()])
-    values = values[np.isfinite(values)]
-    if values.size and values.min() > 0 and values.max() > 20 * values.min():
-        axes[0].set_yscale("log")
-    else:
-        axes[0].set_ylim(bottom=0)
-    axes[0].set_ylabel("MRE")
-    if values.size:
-        picture.legend(*axes[-1].get_legend_handles_labels(), loc="outside right upper", fontsize=6)
+    """Lines of tables over their columns, a panel for each table."""
+    picture = figure(4.5 * len(tables), 3.8)
+    for k, (title, table) in enumerate(tables.items()):
+        ax = picture.add_subplot(1, len(tables), k + 1)
+        style = {"marker": "o", "ms": 3, "lw": 1, "fontsize": 8, "grid": True, "rot": 20}
+        if len(table):
+            table.T.plot(ax=ax, title=title, xlabel=axis, ylabel="MRE", logy=True, **style)
+            ax.legend(fontsize=5)
     picture.suptitle(text, fontsize=10)
     save(picture, path)

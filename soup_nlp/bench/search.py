@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -57,44 +57,40 @@ Space = Mapping[str, "BaseDistribution"]
 
 
 def parse_space(texts: Sequence[str]) -> Space:
-    """Optuna's distributions of KEY=log|linear|int:LOW:HIGH and KEY=choice:A:B, by key.
+    """Optuna's distributions of KEY=log|linear|int:LOW:HIGH, by key.
 
     Raises:
-        ConfigError: a text has none of these forms, or Optuna is not installed.
+        ConfigError: a text does not have this form, or Optuna is not installed.
     """
     try:
-        from optuna import distributions as known
+        from optuna.distributions import FloatDistribution, IntDistribution
     except ImportError as error:
         hint = "pip install 'soup-nlp[bench]'"
         raise ConfigError("bench search needs optuna", hint=hint) from error
     makers = {
-        "log": lambda a, b: known.FloatDistribution(float(a), float(b), log=True),
-        "linear": lambda a, b: known.FloatDistribution(float(a), float(b)),
-        "int": lambda a, b: known.IntDistribution(int(a), int(b)),
-        "choice": lambda a, b, *more: known.CategoricalDistribution((a, b, *more)),
+        "log": lambda a, b: FloatDistribution(float(a), float(b), log=True),
+        "linear": lambda a, b: FloatDistribution(float(a), float(b)),
+        "int": lambda a, b: IntDistribution(int(a), int(b)),
     }
     out: dict[str, BaseDistribution] = {}
     for text in texts:
-        key, _, rest = text.partition("=")
-        kind, *values = rest.split(":")
         try:
-            out[key] = makers[kind](*values)
-            good = bool(key) and (kind == "choice" or float(values[0]) < float(values[1]))
-        except (KeyError, TypeError, ValueError):
-            good = False
-        if not good:
+            key, _, rest = text.partition("=")
+            kind, low, high = rest.split(":")
+            out[key] = makers[kind](low, high)
+            if not key or not float(low) < float(high):
+                raise ValueError(text)
+        except (KeyError, ValueError) as error:
+            expected = "energy.weights.cont=log:1e-5:1e-3, or KEY=linear|int:LOW:HIGH"
             raise ConfigError(
-                "not a parameter to search",
-                where="--param",
-                found=text,
-                expected="energy.weights.cont=log:1e-5:1e-3; KEY=linear|int:LOW:HIGH, choice:A:B",
-            )
+                "not a parameter to search", where="--param", found=text, expected=expected
+            ) from error
     return out
 
 
-def as_yaml(value: Any) -> str:
+def as_yaml(value: float) -> str:
     """A suggested value as YAML, floats with four digits."""
-    if not isinstance(value, float):
+    if isinstance(value, int):
         return str(value)
     text = f"{value:.4g}"
     return text if "." in text or "e" in text else f"{text}.0"
@@ -137,10 +133,7 @@ def search(
         ConfigError: a parameter is wrong.
     """
     for key, distribution in space.items():
-        for value in getattr(distribution, "choices", None) or (
-            distribution.low,
-            distribution.high,
-        ):
+        for value in (distribution.low, distribution.high):
             items[0].problem([f"{key}={as_yaml(value)}"])
     import optuna
 
@@ -189,15 +182,10 @@ def accepted(left_out: pd.DataFrame) -> bool:
 def search_page(frame: pd.DataFrame, space: Sequence[str], command: str) -> str:
     """Page of a search: trials, one family left out at a time, every pair."""
     groups = frame.groupby("variant")
-    trials = pd.DataFrame(
-        {
-            "score": groups["loss"].mean(),
-            "mean MRE": groups["mre"].mean(),
-            "failed": groups["ok"].agg(lambda ok: str(int(ok.ne(True).sum()))),
-            "settings": groups["settings"].first(),
-        }
-    )
+    trials = groups.agg(score=("loss", "mean"), mre=("mre", "mean"), settings=("settings", "first"))
+    trials.insert(2, "failed", groups["ok"].agg(lambda ok: str(int(ok.ne(True).sum()))))
     trials = trials.sort_values("score", kind="stable").rename_axis("trial")
+    trials = trials.rename(columns={"mre": "mean MRE"})
     best = str(trials.index[0])
     lines = ["# Search for defaults", ""]
     lines += [
@@ -217,10 +205,10 @@ def search_page(frame: pd.DataFrame, space: Sequence[str], command: str) -> str:
     lines += ["## Trials", "", *markdown(trials.head(TOP), ".3f"), ""]
     left_out = leave_one_family_out(frame)
     if len(left_out):
-        met = "met" if accepted(left_out) else "not met"
         about = (
             "MRE of the trial that the other families choose against the default. A change of"
-            f" defaults must gain together and lose at most {LOSS_ALLOWED:.0%} on any: {met}."
+            f" defaults must gain together and lose at most {LOSS_ALLOWED:.0%} on any:"
+            f" {'met' if accepted(left_out) else 'not met'}."
         )
         lines += ["## One family left out at a time", "", about, ""]
         lines += [*markdown(left_out, {"change": "+.1%"}), ""]

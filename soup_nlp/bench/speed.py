@@ -20,10 +20,8 @@ from soup_nlp.bench.study import (
     Cell,
     Item,
     failures,
-    figure,
     markdown,
     page_text,
-    save,
     titled,
 )
 from soup_nlp.bench.suites import MOTORCYCLE, Options, list_suite
@@ -135,9 +133,8 @@ def measure_speed(cell: Cell) -> Row:
 
     Returns:
         "wall" and "cpu" seconds by stage ("build", "functions" and "linear algebra" are parts of
-        the wall time of "nlp"), "sizes", "iterations" in all and by "stages", "status", "energy",
-        "error" (MRE by soup), "residuals", "peak_bytes" before the reference solver runs, and
-        "reference" with the energy, iterations and CPU seconds of that solver.
+        the wall time of "nlp"), MRE by soup in "errors", "peak_bytes" before the reference solver
+        runs, and that solver's "reference"; further numbers by the names of the solution.
 
     Raises:
         SoupError: the input cannot be used.
@@ -247,10 +244,9 @@ def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
 
 def growth(frame: pd.DataFrame) -> pd.DataFrame:
     """Exponent of every cost by pair and K, for pairs that ran at several sizes."""
-    groups = frame.groupby(["sequence", "k"])
     lines = {
         (pair, str(k)): {t: exponent(group["n"], group[column]) for column, t in COSTS.items()}
-        for (pair, k), group in groups
+        for (pair, k), group in frame.groupby(["sequence", "k"])
     }
     table = pd.DataFrame.from_dict(lines, orient="index", columns=list(COSTS.values()))
     return table.rename_axis(["pair", "K"] if lines else None).dropna(how="all")
@@ -271,12 +267,6 @@ def speed_page(frame: pd.DataFrame) -> str:
     return page_text([*lines, *failures(frame)])
 
 
-def write_speed(page: Path, frame: pd.DataFrame) -> None:
-    """Write the page of all rows, and the picture growth.png beside it."""
-    page.write_text(speed_page(frame), encoding="utf-8")
-    plot_growth(page.with_name("growth.png"), frame)
-
-
 def progress_line(row: Row) -> str:
     """The result of a run as text for the progress line."""
     reference = row["reference"]
@@ -291,39 +281,14 @@ def _conclusion(frame: pd.DataFrame) -> str:
     if frame.empty:
         return "No run ended with a result."
     large = frame[frame["n"] > 0.8 * frame["n"].max()]
-    costs, energies, times = (
-        f"{values.min():.{digits}f} to {values.max():.{digits}f}"
-        for values, digits in (
-            (large["cpu.nlp"], 1),
-            (frame["energy_to_reference"], 4),
-            (frame["time_to_reference"], 2),
-        )
-    )
+
+    def ends(values: pd.Series, form: str) -> str:
+        return f"{values.min():{form}} to {values.max():{form}}"
+
     return (
         f"{int(frame['converged'].sum())} of {len(frame)} runs converged to their tolerance."
-        f" With the most superpixels (about {large['n'].max()}) the NLP takes {costs} CPU s"
-        f" ({len(large)} runs). Its energy is {energies} times that of Levenberg-Marquardt on the"
-        f" same smoothing, its CPU time {times} times."
+        f" With the most superpixels (about {large['n'].max()}) the NLP takes"
+        f" {ends(large['cpu.nlp'], '.1f')} CPU s ({len(large)} runs). Its energy is"
+        f" {ends(frame['energy_to_reference'], '.4f')} times that of Levenberg-Marquardt on the"
+        f" same smoothing, its CPU time {ends(frame['time_to_reference'], '.2f')} times."
     )
-
-
-def plot_growth(path: Path, frame: pd.DataFrame) -> None:
-    """CPU seconds of NLP, reference solver and other stages, and peak memory, over N (log-log)."""
-    picture = figure(11, 4)
-    left, right = picture.subplots(1, 2)
-    good = with_costs(frame)
-    groups = good.sort_values("n").groupby(["sequence", "k"]) if len(good) else ()
-    for index, ((scene, k), group) in enumerate(groups):
-        style = {"color": f"C{index % 10}"}
-        slope = exponent(group["n"], group["cpu.nlp"])
-        label = f"{scene}, K {k}" + (f": N^{slope:.2f}" if np.isfinite(slope) else "")
-        left.loglog(group["n"], group["cpu.nlp"], "o-", label=label, **style)
-        left.loglog(group["n"], group["outside"], ".:", alpha=0.6, **style)
-        left.loglog(group["n"], group["reference.cpu_seconds"], "x", alpha=0.7, **style)
-        right.loglog(group["n"], group["GB"], "o-", **style)
-    left.set(xlabel="superpixels N", ylabel="CPU s")
-    left.set_title("NLP (o), reference solver (x), all stages outside (.)", fontsize=10)
-    right.set(xlabel="superpixels N", ylabel="GB", title="peak memory")
-    if len(good):
-        left.legend(fontsize=8)
-    save(picture, path)

@@ -101,10 +101,8 @@ def chain_page(frame: pd.DataFrame) -> str:
     good = frame[frame["ok"].eq(True)]
     if len(good):
         lines += titled(good.set_axis(pd.Index(good["pair"], name="sequence")), COLUMNS)
-        lines += [
-            "",
-            f"Mean cost of one scale: {good['cost'].astype(float).mean():+.2%} of the MRE.",
-        ]
+        mean = good["cost"].astype(float).mean()
+        lines += ["", f"Mean cost of one scale: {mean:+.2%} of the MRE."]
     return page_text([*lines, *failures(frame)])
 
 

@@ -161,7 +161,7 @@ def search(
     out: Out = Path("out/bench/accuracy"),
     params: Annotated[
         list[str] | None,
-        typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH or KEY=choice:A:B instead."),
+        typer.Option("--param", help="KEY=log|linear|int:LOW:HIGH instead; may be repeated."),
     ] = None,
     trials: Annotated[int, typer.Option(help="Configurations beside the default.", min=1)] = 24,
     seeds: Seeds = "0,1",
@@ -254,9 +254,8 @@ def speed(
     k = numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS)
     cells = timing.speed_cells(items, n, k, overrides or [])
     measured = partial(measure_cells, cells, timing.measure_speed, own_process=True)
-    page, files = out / "table.md", ["growth.png"]
-    write, line = timing.write_speed, timing.progress_line
-    raise typer.Exit(_study(page, measured, write, quiet, overwrite, files, line))
+    page, write, line = out / "table.md", _text(timing.speed_page), timing.progress_line
+    raise typer.Exit(_study(page, measured, write, quiet, overwrite, result_of=line))
 
 
 def cost(

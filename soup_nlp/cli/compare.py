@@ -20,7 +20,7 @@ from soup_nlp.bench.solvers.page import (
     page,
     summary,
 )
-from soup_nlp.bench.solvers.profiles import draw_curves, draw_profiles
+from soup_nlp.bench.solvers.profiles import draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import family_tasks, is_family, make_tasks
@@ -44,7 +44,7 @@ from soup_nlp.storage.folders import claim, default_folder, scratch, staged
 from soup_nlp.storage.rows import Row
 from soup_nlp.storage.store import write_json
 
-FILES = ("README.md", "profile.png", "curves.png")
+FILES = ("README.md", "profile.png")
 """Files that are made from all rows."""
 OF_FAMILY = ("profiles.png", "results.json", "reached.json")
 """Further files for rows of the family."""
@@ -62,8 +62,6 @@ def compare(
     superpixels: Superpixels = None,
     seconds: Annotated[float, typer.Option(help="CPU time limit of a run.")] = 60.0,
     iterations: Annotated[int, typer.Option(help="Iteration limit of a run.")] = 300,
-    tol: Annotated[float, typer.Option(help="Dual infeasibility; constraints get 1/100.")] = 1e-4,
-    memory: Annotated[float, typer.Option(help="Memory limit of a run, GiB.")] = 4.0,
     presolve: Annotated[
         bool,
         typer.Option(help="Begin at the presolve's answer (a confirmation) or the initialisation."),
@@ -75,11 +73,11 @@ def compare(
     overwrite: Overwrite = False,
 ) -> None:
     """Run real solvers on problems, verify their claims, write table and profiles."""
-    if not (seconds > 0 and iterations > 0 and tol > 0 and memory > 0):
+    if not (seconds > 0 and iterations > 0):
         raise ConfigError(
             "limits must be positive",
             where="compare",
-            found=f"{seconds:g} s, {iterations} iterations, tol {tol:g}, {memory:g} GiB",
+            found=f"{seconds:g} s, {iterations} iterations",
         )
     names = [*available()] if solvers == "all" else listed(solvers)
     if not names:
@@ -87,7 +85,7 @@ def compare(
     for name in names:
         find_solver(name)
     forms = parse_formulations(formulation, coordinates)
-    limits = Limits(seconds, iterations, tol, int(memory * 2**30))
+    limits = Limits(seconds, iterations)
     sizes = [[f"segmentation.superpixels={n}"] for n in superpixels or ()] or [[]]
     # load all problems first: a wrong file must not stop after hours of runs
     sets = [path for path in problems if is_family(path)]
@@ -139,7 +137,6 @@ def _write(folder: Path, frame: pd.DataFrame, limits: Limits, subject: str) -> N
     with staged(folder, subject=subject) as new:
         write_text(new / "README.md", page(frame))
         draw_profiles(new / "profile.png", {"": frame}, ("seconds", "energy"))
-        draw_curves(new / "curves.png", frame)
         if len(family):
             measures = "cpu_seconds", "objective"
             draw_profiles(new / "profiles.png", by_start(family), measures)

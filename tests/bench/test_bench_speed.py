@@ -14,7 +14,6 @@ from soup_nlp.bench.speed import (
     exponent,
     growth,
     measure_speed,
-    plot_growth,
     schedule,
     speed_cells,
     speed_page,
@@ -106,7 +105,7 @@ def test_growth_is_the_exponent_of_a_cost_by_scene_and_neighbours():
     assert frame["outside"].iloc[0] == 3.0
 
 
-def test_page_and_picture(tmp_path):
+def test_the_page_of_runs():
     rows = [made(scene, n) for scene in ("street", "room") for n in (250, 500)]
     rows += [made("room", 500, 20, converged=False, errors={}), failed("no answer")]
     text = speed_page(frame_of(rows))
@@ -114,9 +113,6 @@ def test_page_and_picture(tmp_path):
     assert "1.0200 to 1.0200 times" in text
     assert "1.50 to 1.50 times" in text
     assert "N 250, K 10: no answer" in text
-    for name, shown in (("all", rows), ("none", rows[-1:])):
-        plot_growth(tmp_path / name, frame_of(shown))
-        assert (tmp_path / name).stat().st_size > 5000
     assert "No run" in speed_page(frame_of(rows[-1:]))
 
 
@@ -172,4 +168,3 @@ def test_a_real_run_and_its_table(tmp_path):
     assert parts == pytest.approx(row["wall"]["nlp"], rel=1e-6)
     assert {"load", "flow", "segmentation", "start", "output"} <= set(row["cpu"])
     assert "| street |" in (out / "table.md").read_text()
-    assert (out / "growth.png").is_file()

@@ -16,7 +16,7 @@ from helpers_model import PAPER, Tiny
 
 from soup_nlp.bench.processes import isolated
 from soup_nlp.bench.solvers import runner
-from soup_nlp.bench.solvers.plugins import PLUGINS, Answer, Task, Trace
+from soup_nlp.bench.solvers.plugins import PLUGINS, Answer, Task
 from soup_nlp.bench.solvers.registry import available, executable, find_solver, reference
 from soup_nlp.bench.solvers.runner import compare
 from soup_nlp.errors import SolverError
@@ -122,32 +122,6 @@ def test_time_and_memory_are_limited(tmp_path, monkeypatch):
     assert isolated(lambda: np.ones(10**9), tmp_path, 20, MANY).how == "killed: memory"
 
 
-def test_a_trace_survives_a_kill(tmp_path):
-    trace = Trace(tmp_path / "trace", 2)
-    assert trace.read()[1].shape == (0, 2)
-
-    def work() -> None:
-        trace.add(np.array([1.0, 2.0]))
-        trace.add(np.array([3.0, 4.0]))
-        with trace.path.open("ab") as file:
-            file.write(b"half")
-        die()
-
-    isolated(work, tmp_path, 20, MANY)
-    seconds, points = trace.read()
-    assert points.tolist() == [[1, 2], [3, 4]]
-    assert (np.diff(seconds) >= 0).all()
-
-
-def test_a_curve_has_the_first_and_the_last_iterate(monkeypatch):
-    monkeypatch.setattr(runner, "_energy", lambda _, x: float(x[0]))
-    for count in (0, 1, 2, 500):
-        at = np.arange(float(count))
-        curve = runner._curve(None, at, at[:, None])
-        assert len(curve) == min(count, runner.CURVE_POINTS)
-        assert count == 0 or (curve[0], curve[-1]) == ([0, 0], [count - 1, count - 1])
-
-
 # --- solvers -------------------------------------------------------------------------------------
 
 
@@ -160,7 +134,6 @@ def test_solvers_reach_a_verified_point(name, task, tmp_path):
     assert row["verified"], row
     assert row["status"] != "Time_Limit"
     assert row["energy"] < row["energy_start"]
-    assert row["curve"][-1][1] == pytest.approx(row["energy"])
 
 
 def test_a_claim_with_the_gauss_newton_hessian_is_true(task, tmp_path):

@@ -15,7 +15,6 @@ from soup_nlp.bench.solvers.page import page as page_of
 from soup_nlp.bench.solvers.profiles import (
     _draw_profile,
     cost_table,
-    draw_curves,
     draw_profiles,
     profile,
 )
@@ -42,7 +41,7 @@ def row(
     return {
         "problem": problem, "superpixels": 10, "formulation": "f", "solver": solver,
         "seconds": seconds, "energy": energy, "verified": verified, "claimed": True,
-        "energy_start": 9.0, "curve": [[0.1, 5.0], [seconds, energy]], "iterations": 3,
+        "energy_start": 9.0, "iterations": 3,
         "cpu_seconds": 1.0, "wall_seconds": 9.0, "peak_bytes": 1 << 20, "status": "a | b",
         "machine": "m", "versions": {"casadi": "3"}, "code": "1", "problem_hash": "0",
         "start": "presolve", "primal": 0.0, "limits": asdict(Limits()), **more,
@@ -82,14 +81,13 @@ def test_a_profile_names_the_solvers_that_solve_nothing():
     assert told == ["one", "two", "none by three"]
 
 
-@pytest.mark.parametrize("rows", [ROWS, [ROWS[2] | {"curve": []}]], ids=["some", "none"])
+@pytest.mark.parametrize("rows", [ROWS, ROWS[2:3]], ids=["some", "none"])
 def test_pictures_of_runs(rows, tmp_path):
     frame = frame_of_runs(rows)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         draw_profiles(tmp_path / "p.png", {"": frame}, ("seconds", "energy"))
-        draw_curves(tmp_path / "c.png", frame)
-    assert all((tmp_path / name).stat().st_size > 5000 for name in ("p.png", "c.png"))
+    assert (tmp_path / "p.png").stat().st_size > 5000
 
 
 def test_a_page_has_problems_solvers_and_runs():
@@ -109,8 +107,8 @@ def test_a_page_has_problems_solvers_and_runs():
     assert np.isfinite(cost).sum(axis=1).tolist() == [2, 2, 1]
     assert "Verified problems by solver: none." in page(ROWS[2:3])
     # a solver without an answer
-    nothing = {k: v for k, v in ROWS[0].items() if k not in ("energy", "primal", "curve")}
-    text = page([nothing | {"verified": False, "claimed": False, "curve": []}])
+    nothing = {k: v for k, v in ROWS[0].items() if k not in ("energy", "primal")}
+    text = page([nothing | {"verified": False, "claimed": False}])
     assert "| a | 10 | f | one | no | - | 9 | - |" in text
 
 
@@ -118,14 +116,6 @@ def test_runs_that_begin_at_a_solution_are_headed_confirmation():
     text = page([row(start, "one", 1.0, 4.0) | {"start": start} for start in ("hard", "easy")])
     first, second = text.index("## By run"), text.index("## Confirmation")
     assert first < text.index("| hard |", first) < second < text.index("| easy |", second)
-
-
-def test_curves_of_equal_times_are_drawn(tmp_path):
-    """Two times that differ by rounding only leave no room for automatic limits."""
-    for times in ([0.1, np.nextafter(0.1, 1)], [0.0, 0.0], [2.0]):
-        runs = [row("a", "mine", times[-1], 1.0, False, curve=[[t, 1.5] for t in times])]
-        draw_curves(tmp_path / "curves.png", frame_of_runs(runs))
-        assert (tmp_path / "curves.png").stat().st_size
 
 
 # --- runs on the SOUP family ---------------------------------------------------------------------
@@ -184,9 +174,9 @@ def test_command(tmp_path, capsys):
     rows = [json.loads(x) for x in (tmp_path / "runs.jsonl").read_text().splitlines()]
     assert rows[0]["verified"]
     assert "1 verified" in capsys.readouterr().out
-    for name in ("README.md", "profile.png", "curves.png"):
+    for name in ("README.md", "profile.png"):
         assert (tmp_path / name).stat().st_size > 0
-    assert main([*words, "--tol", "-1"]) == 2
+    assert main([*words, "--seconds", "-1"]) == 2
     assert main(["compare", str(PROBLEMS / "orbit.yaml"), "--solvers", "nothing"]) == 2
 
 

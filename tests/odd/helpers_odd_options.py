@@ -81,7 +81,7 @@ def number_cases() -> Iterator[Case]:
         numbers = ("nan", "inf", "1e300", "1e-300", "-1", "0")
         make = lambda w, o, x: depth_png(o) and x  # noqa: E731
         yield from every("2 numbers", f"evaluate {option}={{}}", line, numbers, (0, 2), make=make)
-    for option in ("--seconds", "--iterations", "--tol", "--memory"):
+    for option in ("--seconds", "--iterations"):
         line = f"compare {{p}} --solvers no_such_solver {option}={{x}} -o {{out}}"
         numbers = ("nan", "inf", "1e300", "0", "-1", "x")
         yield from every("2 numbers", f"compare {option}={{}}", line, numbers)

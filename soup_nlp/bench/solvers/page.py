@@ -80,7 +80,7 @@ def page(frame: pd.DataFrame) -> str:
     begun = frame["start"].isin(CONFIRMATIONS)
     facts = [*sorted(frame["machine"].unique()), ", ".join(sorted(packages)), f"code {code}"]
     lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(frame), ""]
-    lines += ["![performance profiles](profile.png)", "", "![energy against time](curves.png)"]
+    lines += ["![performance profiles](profile.png)"]
     sections = {
         "By start and size": _by_start(of_family(frame)),
         "By problem": _by_problem(frame),

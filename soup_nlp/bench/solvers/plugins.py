@@ -1,10 +1,10 @@
-"""Task and answer of a solver, the trace of its iterates, and CasADi's plug-ins as solvers."""
+"""Task and answer of a solver, and CasADi's plug-ins as solvers."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,7 +70,6 @@ class Answer:
         claimed: Whether the solver claims an optimum.
         iterations: Outer iterations, -1 if unknown.
         seconds: CPU time of set-up and solve.
-        curve: (k, 2) seconds and exact energy, from solvers that record it themselves.
     """
 
     x: Float | None
@@ -79,7 +78,6 @@ class Answer:
     claimed: bool
     iterations: int
     seconds: float
-    curve: Float | None = None
 
 
 def clock() -> float:
@@ -94,33 +92,6 @@ WALL_PER_CPU = 8.0
 """Limit of the wall time relative to that of the CPU time: other work may slow a run down, and a
 program that waits uses no CPU time."""
 Solver = Callable[[Task], Answer]
-
-
-@dataclass
-class Trace:
-    """File of the iterates of a solver, written at once so that it survives a killed solver.
-
-    Args:
-        path: File of float64 records (seconds, x).
-        nx: Number of variables.
-    """
-
-    path: Path
-    nx: int
-    begin: float = field(default_factory=clock)
-
-    def add(self, x: Float) -> None:
-        """Append an iterate with the time since the trace began."""
-        record = np.concatenate([[clock() - self.begin], np.asarray(x, float).ravel()])
-        with self.path.open("ab") as file:
-            file.write(record.tobytes())
-
-    def read(self) -> tuple[Float, Float]:
-        """(k,) seconds and (k, nx) iterates, without an incomplete last record."""
-        flat = np.fromfile(self.path) if self.path.is_file() else np.zeros(0)
-        width = self.nx + 1
-        records = flat[: len(flat) // width * width].reshape(-1, width)
-        return records[:, 0], records[:, 1:]
 
 
 # --- CasADi's plug-ins ---------------------------------------------------------------------------
@@ -216,15 +187,14 @@ FIRST = ("nlp_grad_f", "nlp_jac")
 
 
 class _Watch(IterationCallback):
-    """Writes the iterates of a plug-in into the trace and stops it at the time limit."""
+    """Stops a plug-in at a time of `clock`."""
 
-    def __init__(self, trace: Trace, seconds: float) -> None:
+    def __init__(self, end: float) -> None:
         super().__init__()
-        self.trace, self.seconds, self.late = trace, seconds, False
+        self.end, self.late = end, False
 
     def eval(self, arg: list[ca.DM]) -> list[int]:
-        self.trace.add(np.asarray(arg[0]))
-        self.late = clock() - self.trace.begin > self.seconds
+        self.late = clock() > self.end
         return [int(self.late)]
 
 
@@ -233,8 +203,8 @@ def plugin(name: str, task: Task) -> Answer:
     chosen = PLUGINS[name]
     library = chosen.library
     nlp = task.gauss_newton if chosen.hessian == "gauss-newton" else task.nlp
-    trace = Trace(task.folder / "trace", nlp.nx)
-    watch = _Watch(trace, task.limits.seconds)
+    begin = clock()
+    watch = _Watch(begin + task.limits.seconds)
     # parameters are replaced by numbers, since bonmin has no parameters
     x, functions = ca.MX.sym("x", nlp.nx), Functions(nlp)
     # these differentiate f and g when they are made, in spite of cached derivatives
@@ -256,15 +226,13 @@ def plugin(name: str, task: Task) -> Answer:
     stats = solver.stats()
     status = str(stats.get("return_status", stats.get("unified_return_status", "?")))
     claimed = bool(stats.get("success")) or status in CLAIMS
-    point = np.asarray(out["x"]).ravel()
-    trace.add(point)
     return Answer(
-        point,
+        np.asarray(out["x"]).ravel(),
         np.asarray(out["lam_g"]).ravel(),
         "Time_Limit" if watch.late else status,
         claimed and not watch.late,
         int(stats.get("iter_count", -1)),
-        clock() - trace.begin,
+        clock() - begin,
     )
 
 

@@ -1,18 +1,17 @@
-"""Performance profiles (Dolan and More, 2002) and curves of the runs."""
+"""Performance profiles of the runs (Dolan and More, 2002)."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
 from soup_nlp.arrays import Float
-from soup_nlp.bench.study import figure, panels, save
+from soup_nlp.bench.study import figure, save
 
 PROBLEM = ["problem", "superpixels", "formulation", "problem_hash"]
 """Columns that identify a problem."""
@@ -78,7 +77,7 @@ def _draw_profile(ax: Axes, measure: str, count: int, share: pd.DataFrame) -> No
     for j, solver in enumerate(share):
         if str(solver) not in none:
             y = share[solver].to_numpy()
-            ax.step([*x, last], [*y, y[-1]], where="post", label=str(solver), **_style(j))
+            ax.step([*x, last], [*y, y[-1]], where="post", label=str(solver), color=f"C{j % 10}")
     if none:
         ax.plot([], [], " ", label=textwrap.fill("none by " + ", ".join(none), 30))
     if timed:
@@ -87,45 +86,5 @@ def _draw_profile(ax: Axes, measure: str, count: int, share: pd.DataFrame) -> No
         ax.set_xscale("symlog", linthresh=1e-6)
         ax.set_xlim(-3e-8, 1.1 * last)
     ax.set(xlabel=LABELS[measure], ylabel=f"share of {count} problems", ylim=(-0.02, 1.05))
-    _finish(ax, 7)
-
-
-def _style(number: int) -> dict[str, Any]:
-    """Line style of a solver, the same in every panel: ten colours, repeated with dashes."""
-    return {"color": f"C{number % 10}", "ls": ("-", "--", ":", "-.")[number // 10 % 4]}
-
-
-def _finish(ax: Axes, size: int) -> None:
-    """Add a grid, and a legend if a line has a label."""
     ax.grid(alpha=0.3)
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=size)
-
-
-def draw_curves(path: Path, frame: pd.DataFrame) -> None:
-    """Write a picture of exact energy over time, a panel for each problem; dots mark the ends."""
-    solvers = sorted(frame["solver"].unique())
-    problems = frame.groupby(PROBLEM)
-    picture, axes = panels(problems.ngroups, 2, 5.2, 3.4)
-    for ax, (key, group) in zip(axes, problems, strict=True):
-        start, times = group["energy_start"].min(), []
-        for row in group.sort_values("solver").to_dict("records"):
-            # a run without stored iterates has its end only
-            end = [[row["seconds"], row["energy"]]] if pd.notna(row.get("energy")) else []
-            curve = np.array(row["curve"] or end, float).reshape(-1, 2)
-            # iterates that violate the constraints may have very large energies
-            curve = curve[curve[:, 1] < 3 * start]
-            if len(curve):
-                style = _style(solvers.index(row["solver"]))
-                filled = "full" if row["verified"] else "none"
-                ax.plot(*curve.T, lw=1, label=row["solver"], **style)
-                ax.plot(*curve[-1], "o", color=style["color"], fillstyle=filled, ms=5)
-                times += [t for t in curve[:, 0] if t > 0]
-        ax.axhline(start, color="0.6", lw=0.8, ls=":")
-        # automatic limits fail where all times are equal up to rounding
-        ax.set_xlim(min(times, default=1e-3) / 1.5, max(times, default=1.0) * 1.5)
-        ax.set_xscale("log")
-        ax.set_title("{}, N = {}, {}".format(*key[:3]), fontsize=8)
-        ax.set(xlabel="seconds", ylabel="exact energy")
-        _finish(ax, 6)
-    save(picture, path)
+    ax.legend(fontsize=7)

@@ -21,7 +21,6 @@ from soup_nlp.bench.solvers.plugins import (
     Answer,
     Solver,
     Task,
-    Trace,
     clock,
     plugin,
 )
@@ -57,7 +56,6 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
         raise SolverError("solver wrote no .sol", where=Path(command).name, found=f"exit {code}")
     sol = read_sol(path, file.variables, file.rows)
     seconds = clock() - begin
-    Trace(task.folder / "trace", task.nlp.nx, begin).add(sol.x)
     status = sol.message.splitlines()[-1] if sol.message else sol.status
     return Answer(sol.x, sol.lam_g, status, sol.solved, -1, seconds)
 
@@ -87,13 +85,9 @@ def reference(task: Task) -> Answer:
     eps = [*(e for e in EPS if e > last), last]
     energy = task.soup, task.data, task.weights, task.form
     begin = clock()
-    record = levenberg_marquardt(*energy, eps=eps, seconds=0.8 * WALL_PER_CPU * task.limits.seconds)
+    y = levenberg_marquardt(*energy, eps=eps, seconds=0.8 * WALL_PER_CPU * task.limits.seconds)
     seconds = clock() - begin
-    # its history has wall times: convert them to CPU times
-    own_seconds = max(float(record.history[-1, 0]), seconds)
-    curve = record.history * [seconds / own_seconds, 1.0]
-    x = task.point(record.soup)
-    return Answer(x, None, record.status, False, record.iterations, seconds, curve)
+    return Answer(task.point(y.soup), None, y.status, False, y.iterations, seconds)
 
 
 def package(task: Task) -> Answer:

@@ -15,7 +15,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float
 from soup_nlp.bench.processes import isolated, processor
-from soup_nlp.bench.solvers.plugins import WALL_PER_CPU, Answer, Task, Trace
+from soup_nlp.bench.solvers.plugins import WALL_PER_CPU, Answer, Task
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.study import show
 from soup_nlp.errors import DataError
@@ -38,8 +38,6 @@ Maker = Callable[[Path], Task]
 Program = tuple[NLP, MatrixLayout | TangentLayout, Formulation]
 Build = Callable[[Hessian], Program]
 
-CURVE_POINTS = 40
-"""Iterates of a trace for which the exact energy is computed."""
 KEY = ("problem", "problem_hash", "superpixels", "formulation", "start")
 """Entries of a label that identify a task."""
 
@@ -90,8 +88,7 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
     `label` has the entries that identify the task, and "energy_limit".
     """
     work = find_solver(solver)
-    trace, limits = Trace(task.folder / "trace", task.nlp.nx), task.limits
-    trace.path.unlink(missing_ok=True)
+    limits = task.limits
     ended = isolated(
         lambda: work(task),
         task.folder,
@@ -115,13 +112,9 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
         "energy_start": oracle.energy(task.soup, task.data, task.weights)["total"],
         "versions": versions(),
         "machine": f"{platform.system()} {platform.machine()}, {processor()}",
-        "curve": _curve(task, *trace.read()),
     }
     if isinstance(ended.value, Answer):
         row |= _verified(task, ended.value, float(label["energy_limit"]))
-    elif row["curve"]:
-        # the solver was killed, but its iterates are stored
-        row["energy"] = row["curve"][-1][1]
     return row
 
 
@@ -134,15 +127,6 @@ def _energy(task: Task, x: Float) -> float:
         except np.linalg.LinAlgError:
             return float("inf")
     return float(value) if np.isfinite([value, *x]).all() else float("inf")
-
-
-def _curve(task: Task, seconds: Float, points: Float) -> list[list[float]]:
-    """(seconds, exact energy) of some iterates, including the first and the last."""
-    if not len(seconds):
-        return []
-    chosen = np.unique(np.linspace(0, len(seconds) - 1, CURVE_POINTS).round().astype(int))
-    pairs = [[float(seconds[k]), _energy(task, points[k])] for k in chosen]
-    return [p for p in pairs if np.isfinite(p[1])]
 
 
 def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
@@ -158,8 +142,6 @@ def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
         "iterations": answer.iterations,
         "seconds": answer.seconds,
     }
-    if answer.curve is not None:
-        row["curve"] = answer.curve
     if answer.x is None:
         return row
     row["energy"] = _energy(task, answer.x)
