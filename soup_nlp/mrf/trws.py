@@ -47,9 +47,6 @@ class TRWSResult:
         status: ``"gap"``, ``"stagnation"``, ``"iterations"`` or ``"interrupted"``.
         ties: Nodes whose label was a tie, to rounding, when ``labels`` were decoded; 0 if they
             are ``init_labels``.
-        min_marginals: (N, L) costs plus messages of the last backward pass, the least of a node 0:
-            every labelling with this label has at least the bound before that pass plus this much
-            energy. Those of the costs alone before the first pass.
     """
 
     labels: np.ndarray
@@ -61,7 +58,6 @@ class TRWSResult:
     iterations: int
     status: str
     ties: int
-    min_marginals: np.ndarray
 
 
 def solve_trws(
@@ -75,7 +71,6 @@ def solve_trws(
     patience: int = 10,
     dtype: type | np.dtype = np.float64,
     init_labels: np.ndarray | None = None,
-    polish: bool = False,
     callback: Callback | None = None,
 ) -> TRWSResult:
     """Minimise a pairwise energy by TRW-S; see the module for the equations.
@@ -92,7 +87,6 @@ def solve_trws(
         patience: See ``stagnation``.
         dtype: float64, or float32 for half the memory; the bound is then exact to that rounding.
         init_labels: (N,) labels that the result is never worse than; they do not steer the method.
-        polish: Whether to end with iterated conditional modes, which can only lower the energy.
         callback: Called after every iteration as ``callback(iteration, bound, energy, best
             energy)``; a true answer or a KeyboardInterrupt, there or anywhere in the iterations,
             ends them with status ``"interrupted"``.
@@ -124,8 +118,6 @@ def solve_trws(
                 status = "stagnation" if rise <= stagnation * max(1.0, abs(bound)) else status
             if status != "iterations":
                 break
-        if polish and status != "interrupted":
-            best = (best[0], solver.icm(best[1]), best[2])
     except KeyboardInterrupt:
         status = "interrupted"
     _, labels, ties = best
@@ -135,7 +127,7 @@ def solve_trws(
     bounds, energies, bests = np.array(rows).reshape(-1, 3).T.copy()
     bound = min(float(bounds.max(initial=-math.inf)), energy)
     history = bounds, energies, bests, len(rows)
-    return TRWSResult(labels, energy, bound, *history, status, ties, solver.min_marginals)
+    return TRWSResult(labels, energy, bound, *history, status, ties)
 
 
 def mrf_energy(
@@ -167,7 +159,6 @@ class _Passes:
         dtype = tables.table.dtype
         with np.errstate(over="ignore", invalid="ignore"):
             self.costs = costs.astype(dtype)
-            self.min_marginals = self.costs - self.costs.min(axis=1, keepdims=True)
         self.absent, self.plan, self.tables = np.isinf(costs), plan, tables
         self.messages = np.zeros((len(tables.table), costs.shape[1]), dtype)
 
@@ -181,7 +172,6 @@ class _Passes:
                 belief = self._beliefs(level)
                 least = belief.min(axis=1, keepdims=True)
                 belief -= least
-                self.min_marginals[level.nodes] = belief
                 bound += float(least.sum(dtype=np.float64)) + self._send(level.down, level, belief)
         if not math.isfinite(bound):
             raise ModelError(
@@ -236,21 +226,3 @@ class _Passes:
             near = near + rounding * np.maximum(1, np.abs(near))
             ties += int(((total <= near).sum(axis=1) > 1).sum())
         return energy, labels, ties
-
-    def icm(self, labels: np.ndarray) -> np.ndarray:
-        """(N,) labels after sweeps of single-node moves, each of which lowers the energy."""
-        labels = labels.copy()
-        for _ in range(100):
-            moved = False
-            for level in self.plan:
-                total = self.costs[level.nodes]
-                level.up.add(total, self.tables.lines(level.up, labels))
-                level.down.add(total, self.tables.lines(level.down, labels))
-                row, now = np.arange(len(total)), labels[level.nodes]
-                new = total.argmin(axis=1)
-                new = np.where(total[row, new] < total[row, now], new, now)
-                moved = moved or not np.array_equal(new, now)
-                labels[level.nodes] = new
-            if not moved:
-                break
-        return labels

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from soup_nlp.arrays import AnyFloat, Float, Int, Mask
 from soup_nlp.model.energy_data import HINGE, EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.refine.anchored import Particles, anchor_depth
+from soup_nlp.refine.particles import Particles, anchor_depth
 
 BLOCK_BYTES = 1 << 18  # one of the half dozen buffers of a block of edges
 UNARY_BYTES = 1 << 23  # one of the arrays of a block of superpixels

@@ -16,42 +16,35 @@ TRW-S starts every round with messages of zero, because nearly all of its labels
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Int
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.mrf.trws import solve_trws
-from soup_nlp.refine.anchored import Particles, neighbours
 from soup_nlp.refine.costs import PairCosts, feasible, unary_costs
-from soup_nlp.refine.particles import Proposals, Proposer
-from soup_nlp.refine.photometric import Photometric, swept
-from soup_nlp.refine.population import (
-    COMMON,
+from soup_nlp.refine.particles import (
     KINDS,
-    SHARES,
+    NEIGHBOURS,
     WALKS,
-    conditional_costs,
+    Particles,
+    Proposer,
     counts,
-    diverse,
-    relearn,
-    spread_of,
+    neighbours,
     within_reach,
 )
+from soup_nlp.refine.photometric import Photometric, swept
 from soup_nlp.refine.records import Refined, RefineOptions, Round
 from soup_nlp.storage.progress import Progress, Watch
 
-CURRENT, KEPT = KINDS.index("current"), KINDS.index("kept")
-KEPT_SHARE = 0.25
-"""Share of the particles that stays for the next round."""
 TRWS_ITERATIONS, TRWS_GAP = 15, 1e-4
 """Most iterations of TRW-S in a round, and the relative gap at which it stops earlier."""
 DEPTH_REACH = 2.0
@@ -98,27 +91,21 @@ def refine_soup(
     Returns:
         The best soup, normalised to sum(lam) = 1, and what happened.
     """
-    o = options or RefineOptions()
     begin = time.perf_counter()
     rays = data.visibility_ray(depth_ratio)
-    best = (
-        tilt_to_camera(soup, data.anchor_ray, rays, min_facing).normalised(data.share).retracted()
-    )
+    best = tilt_to_camera(soup, data.anchor_ray, rays, min_facing)
+    best = best.normalised(data.share).retracted()
     energy = objective(best, data, weights, photo)
     before = energy if start is None else objective(start, data, weights, photo)
-    pair_costs = PairCosts(data, weights)
-    proposer = Proposer(data, neighbours(pair_costs.edges, data.anchor_ray), seed)
-    costs = _Costs(data, weights, photo, o, rays, min_facing, pair_costs, proposer.near)
-    rounds = _Rounds(costs, proposer, watch or Watch(), best, energy, begin + o.max_seconds)
-    if photo is not None and not rounds.agreed:
-        rounds.kept = swept(best, *proposer.commonest(best, 2), data, photo, SWEPT)
-    status, done = rounds.run(), tuple(rounds.done)
+    o = options or RefineOptions()
+    rounds = Rounds(best, energy, data, weights, o, photo, (rays, min_facing), seed)
+    status = rounds.run(watch or Watch(), begin + o.max_seconds)
     return Refined(
         rounds.best,
         before,
         energy,
         rounds.energy,
-        done,
+        tuple(rounds.done),
         status,
         time.perf_counter() - begin,
         0 if photo is None else int(photo.contradicted.sum()),
@@ -146,54 +133,6 @@ def objective(
     return {**own, "proj": proj, "total": own["total"] - own["proj"] + proj + seen, "photo": seen}
 
 
-@dataclass(frozen=True)
-class _Costs:
-    """The exact energy over particles, as costs of a pairwise MRF.
-
-    Attributes:
-        data: Numbers of the energy.
-        weights: Its constants.
-        photo: Photometric term; None for the flow alone.
-        options: Kinds of proposals: walks may reach any depth.
-        rays: Where visibility is imposed, see `EnergyData.visibility_ray`.
-        min_facing: Least facing there.
-        pairs: Costs of pairs of particles.
-        near: (N, K) neighbours of every superpixel.
-    """
-
-    data: EnergyData
-    weights: Weights
-    photo: Photometric | None
-    options: RefineOptions
-    rays: Float
-    min_facing: float
-    pairs: PairCosts
-    near: Int
-
-    def of(self, best: Soup, p: Particles) -> tuple[Float, NDArray[np.floating]]:
-        """Unary and pairwise costs of particles; what is not feasible costs infinitely much."""
-        data = self.data
-        flow = self.photo.costs_of_flow if self.photo else unary_costs
-        unary, ahead = flow(p, data, self.weights)
-        unit = float(np.sum(data.share * best.distance))
-        if not data.local_units:
-            slope = length_slope(best, data, self.weights)
-            unary -= slope * data.share[:, None] * (p.D - best.distance[:, None]) / unit
-        if self.photo is not None:
-            unary += self.photo.costs(p, self.photo.unit(best))
-        allowed = ahead & feasible(p, self.rays, self.min_facing)
-        if self.options.proposals != "walks":
-            allowed &= within_reach(p, best, self.near, data.anchor_ray, DEPTH_REACH)
-        unary[~allowed] = np.inf
-        # the current belief is allowed even where it violates a constraint
-        lost = ~np.isfinite(unary[:, 0])
-        if lost.any():
-            exact = self.weights.proj * oracle.reprojection(best, data, self.weights)
-            unary[lost, 0] = np.minimum(exact, 1e9)[lost]
-        # single precision suffices: a choice is taken only where the exact energy falls
-        return unary, self.pairs.tables(p, unit, np.float32)
-
-
 def length_slope(soup: Soup, data: EnergyData, weights: Weights) -> float:
     """`-dE / d log u`: by how much E rises when the scene's length unit shrinks, all else fixed."""
     h = 1e-4
@@ -206,46 +145,68 @@ def length_slope(soup: Soup, data: EnergyData, weights: Weights) -> float:
     return (down - up) / (2 * h)
 
 
-class _Rounds:
+class Rounds:
     """The rounds of a refinement.
 
     Attributes:
         best: Soup of the lowest energy so far.
         energy: Its energy by term, see `objective`.
-        kept: Particles that the next round uses besides its proposals.
         done: Rounds that have ended.
-        agreed: Whether images and flow agree, so that one round is enough.
+
+    Args:
+        best: The soup to begin with.
+        energy: Its energy.
+        data: Numbers of the energy.
+        weights: Its constants.
+        options: Rounds, particles, limits.
+        photo: Photometric term; None for the flow alone.
+        visibility: (N, V, 3) rays where visibility is imposed, and the least facing there.
+        seed: Of every draw.
     """
 
     def __init__(
         self,
-        costs: _Costs,
-        proposer: Proposer,
-        watch: Watch,
         best: Soup,
         energy: Mapping[str, float],
-        deadline: float,
+        data: EnergyData,
+        weights: Weights,
+        options: RefineOptions,
+        photo: Photometric | None,
+        visibility: tuple[Float, float],
+        seed: int,
     ) -> None:
-        """Draw nothing yet; `deadline` is a time of `time.perf_counter`."""
-        self.costs, self.proposer, self.watch = costs, proposer, watch
-        self.best, self.energy, self.deadline = best, energy, deadline
-        walks_only = costs.options.proposals == "walks"
-        self.shares = {k: v for k, v in SHARES.items() if not walks_only or k in WALKS}
-        self.kept: Particles | None = None
+        self.best, self.energy = best, energy
+        self.data, self.weights, self.options, self.photo = data, weights, options, photo
+        self.visibility = visibility
+        self.pairs = PairCosts(data, weights)
+        near = neighbours(self.pairs.edges, data.anchor_ray)
+        self.proposer = Proposer(data, near, seed)
         self.done: list[Round] = []
-        photo = costs.photo
-        self.agreed = photo is not None and photo.contradicted.mean() < CONTRADICTED
 
-    def run(self) -> str:
-        """Run all rounds; returns the status of `Refined`."""
-        o, slow, interrupted = self.costs.options, False, False
-        most = min(1, o.rounds) if self.agreed else o.rounds
-        while len(self.done) < most and not (slow or interrupted or self._over()):
+    def run(self, watch: Watch, deadline: float) -> str:
+        """Run all rounds until a time of `time.perf_counter`; returns the status of `Refined`."""
+        o, photo, slow, interrupted = self.options, self.photo, False, False
+        agreed = photo is not None and photo.contradicted.mean() < CONTRADICTED
+        most = min(1, o.rounds) if agreed else o.rounds
+
+        def over() -> bool:
+            return watch.stop.is_set() or time.perf_counter() > deadline
+
+        def follow(mark: float, k: int, bound: float, energy: float, least: float) -> bool:
+            """Report an iteration of TRW-S; returns whether to stop after it."""
+            if watch.listener:
+                stage, seconds = f"refine {len(self.done) + 1}", time.perf_counter() - mark
+                watch.listener(Progress(stage, k - 1, least, 0.0, seconds))
+            return over()
+
+        while len(self.done) < most and not (slow or interrupted or over()):
             before = self.energy["total"]
-            interrupted = self._round()
-            self.watch.say(f"refine {len(self.done)}: {self.done[-1]}")
+            self.done.append(self._round(sweep=not (agreed or self.done), follow=follow))
+            # TRW-S answers Ctrl-C too with the best labels so far
+            interrupted = self.done[-1].status == "interrupted" and time.perf_counter() <= deadline
+            watch.say(f"refine {len(self.done)}: {self.done[-1]}")
             slow = before - self.energy["total"] < o.stagnation * abs(before)
-        if interrupted or self.watch.stop.is_set():
+        if interrupted or watch.stop.is_set():
             return "interrupted"
         if slow:
             return "stagnated"
@@ -253,55 +214,73 @@ class _Rounds:
             return "time limit"
         return "agreed" if most < o.rounds else "rounds"
 
-    def _over(self) -> bool:
-        """Whether the stop event is set or the time limit has passed."""
-        return self.watch.stop.is_set() or time.perf_counter() > self.deadline
+    def costs(self, p: Particles) -> tuple[Float, NDArray[np.floating]]:
+        """The exact energy over particles as a pairwise MRF: unary and pairwise costs.
 
-    def _draw(self) -> Proposals:
-        """The current belief, the kept particles and new proposals, `particles` in all."""
-        current, near = Particles.of(self.best), self.proposer.near
-        fixed = current if self.kept is None else current.joined(self.kept)
-        have = fixed.shape[1]
-        count = counts(self.shares, max(0, self.costs.options.particles - have), near.shape[1])
-        kind, step = np.full(have, KEPT), np.full((len(near), have), np.nan)
-        kind[0] = CURRENT
-        if not sum(count.values()):
-            return Proposals(fixed, kind, step)
-        new = self.proposer.propose(self.best, count)
-        kinds, steps = np.concatenate([kind, new.kind]), np.hstack([step, new.step])
-        return Proposals(fixed.joined(new.particles), kinds, steps)
+        What is not feasible costs infinitely much.
+        """
+        data, best, photo = self.data, self.best, self.photo
+        flow = photo.costs_of_flow if photo else unary_costs
+        unary, allowed = flow(p, data, self.weights)
+        unit = float(np.sum(data.share * best.distance))
+        if not data.local_units:
+            slope = length_slope(best, data, self.weights)
+            unary -= slope * data.share[:, None] * (p.D - best.distance[:, None]) / unit
+        if photo is not None:
+            unary += photo.costs(p, photo.unit(best))
+        allowed &= feasible(p, *self.visibility)
+        if self.options.proposals != "walks":
+            allowed &= within_reach(p, best, self.proposer.near, data.anchor_ray, DEPTH_REACH)
+        unary[~allowed] = np.inf
+        # the current belief is allowed even where it violates a constraint
+        lost = ~np.isfinite(unary[:, 0])
+        if lost.any():
+            exact = self.weights.proj * oracle.reprojection(best, data, self.weights)
+            unary[lost, 0] = np.minimum(exact, 1e9)[lost]
+        # single precision suffices: a choice is taken only where the exact energy falls
+        return unary, self.pairs.tables(p, unit, np.float32)
 
-    def _round(self) -> bool:
-        """Run one round; returns whether TRW-S was interrupted, which ends the refinement."""
-        mark, costs, o = time.perf_counter(), self.costs, self.costs.options
-        drawn = self._draw()
-        p, edges, none = drawn.particles, costs.pairs.edges, np.zeros(len(self.best), np.int64)
-        unary, pairwise = costs.of(self.best, p)
+    def _draw(self, sweep: bool) -> tuple[Particles, list[str]]:
+        """The current belief, swept planes and proposals, and the kind of each."""
+        parts, kinds = [Particles.of(self.best)], ["current"]
+
+        def add(p: Particles, kind: str) -> None:
+            parts.append(p)
+            kinds.extend([kind] * p.shape[1])
+
+        if sweep and self.photo is not None:
+            rng = self.proposer.rng
+            add(swept(self.best, self.data, self.photo, SWEPT, rng), "swept")
+        shares = WALKS if self.options.proposals == "walks" else {**WALKS, **NEIGHBOURS}
+        left = max(0, self.options.particles - len(kinds))
+        for kind, count in counts(shares, left).items():
+            if count:
+                add(self.proposer.propose(self.best, kind, count), kind)
+        return parts[0].joined(*parts[1:]), kinds
+
+    def _round(self, sweep: bool, follow: Callable[..., bool]) -> Round:
+        """Draw particles, choose among them, and go on from the choice if its energy is lower."""
+        mark, data = time.perf_counter(), self.data
+        p, kinds = self._draw(sweep)
+        unary, pairwise = self.costs(p)
         result = solve_trws(
             unary,
-            edges,
+            self.pairs.edges,
             pairwise,
             max_iter=TRWS_ITERATIONS,
             gap=TRWS_GAP,
             dtype=pairwise.dtype,
-            init_labels=none,
-            polish=True,
-            callback=partial(self._follow, mark),
+            init_labels=np.zeros(len(unary), np.int64),
+            callback=partial(follow, mark),
         )
-        # TRW-S answers Ctrl-C too with the best labels so far
-        interrupted = result.status == "interrupted" and time.perf_counter() <= self.deadline
-        new = p.soup(result.labels, costs.data.share).retracted()
-        energy = objective(new, costs.data, costs.weights, costs.photo)
+        new = p.soup(result.labels, data.share).retracted()
+        energy = objective(new, data, self.weights, self.photo)
         taken = energy["total"] < self.energy["total"]
-        labels = result.labels if taken else none
+        labels = result.labels if taken else np.zeros_like(result.labels)
         if taken:
             self.best, self.energy = new, energy
-        cost = conditional_costs(labels, unary, edges, pairwise)
-        self.kept = p.take(diverse(p, labels, cost, round(KEPT_SHARE * o.particles), costs.data))
-        proposed = _by_kind(drawn.kind, np.isfinite(unary).sum(axis=0))
-        kind, step = drawn.kind[labels], drawn.step[np.arange(len(labels)), labels]
-        accepted = _by_kind(kind, np.ones(len(labels), np.int64))
-        done = Round(
+        number = np.array([KINDS.index(k) for k in kinds])
+        return Round(
             energy=dict(self.energy),
             mrf_energy=result.energy,
             bound=result.lower_bound,
@@ -310,26 +289,13 @@ class _Rounds:
             ties=result.ties,
             taken=taken,
             moved=int((labels > 0).sum()),
-            proposed=proposed,
-            accepted=accepted,
+            proposed=_by_kind(number, np.isfinite(unary).sum(axis=0)),
+            accepted=_by_kind(number, np.bincount(labels, minlength=len(number))),
             seconds=time.perf_counter() - mark,
-            spread=spread_of(p, result.min_marginals, costs.data.anchor_ray),
         )
-        self.done.append(done)
-        for name in (*WALKS, *COMMON):
-            self.proposer.spread.learn(name, step[kind == KINDS.index(name)])
-        relearn(self.shares, proposed, accepted)
-        return interrupted
-
-    def _follow(self, mark: float, k: int, bound: float, energy: float, least: float) -> bool:
-        """Report an iteration of TRW-S; returns whether to stop after it."""
-        if self.watch.listener:
-            stage, seconds = f"refine {len(self.done) + 1}", time.perf_counter() - mark
-            self.watch.listener(Progress(stage, k - 1, least, 0.0, seconds))
-        return self._over()
 
 
-def _by_kind(kind: Int, count: Int) -> dict[str, int]:
-    """Sums of counts by kind."""
-    total = np.bincount(kind, count, len(KINDS))
-    return {k: int(total[c]) for c, k in enumerate(KINDS)}
+def _by_kind(kind: NDArray[np.integer], count: NDArray[np.integer]) -> dict[str, int]:
+    """Sums of counts (L,) by kind (L,)."""
+    total = np.bincount(kind, count, len(KINDS)).astype(int)
+    return dict(zip(KINDS, total.tolist(), strict=True))

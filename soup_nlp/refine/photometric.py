@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
 
 from soup_nlp.arrays import Float, FloatMap, Mask
 from soup_nlp.data.census import census, census_at
@@ -28,8 +27,8 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.refine.anchored import Particles
 from soup_nlp.refine.costs import unary_costs
+from soup_nlp.refine.particles import Particles
 from soup_nlp.refine.records import RefineOptions
 
 TAU = 0.35
@@ -180,23 +179,23 @@ def photometric_term(
 # --- plane sweep ----------------------------------------------------------------------------------
 #
 # Proposals that do not depend on the flow: every superpixel is tried at evenly spaced steps along
-# its epipolar line, under each of a few motions and orientations, and scored by the images alone.
-# Costs are averaged with neighbours of similar colour, because a small patch is ambiguous.
+# its epipolar line, under each of the commonest motions and in two orientations, and scored by the
+# images alone.
 
 LEVELS = 64
 """Depths that are tried."""
-NORMALS = 3
-"""Orientations common to all superpixels: parallel to the image, and clusters of the soup's."""
+MOTIONS, TRIED = 2, 64
+"""Motions under which planes are swept, and the sample of present motions they are chosen from."""
 NEAREST = 1.5
 """The nearest depth tried is that of the 2 % nearest superpixels over this."""
-VOTE = 0.6
-"""Weight of a neighbour whose boundary and colour bind it well, beside the superpixel's own 1."""
 STEEP = 0.08
 """`-n . ray` below which an orientation is replaced by one parallel to the image."""
+CLIP_PX = 3.0
+"""Limit of the distance between two motions of a point, pixels."""
 
 
 def swept(
-    soup: Soup, R: Float, T: Float, data: EnergyData, photo: Photometric, keep: int
+    soup: Soup, data: EnergyData, photo: Photometric, keep: int, rng: np.random.Generator
 ) -> Particles:
     """(N, keep) particles of lowest photometric cost among the local minima over depth.
 
@@ -205,25 +204,23 @@ def swept(
     steps in pixels, and nearly the same depths for all superpixels.
 
     Args:
-        soup: Current belief; gives orientations and the range of depths.
-        R: (M, 3, 3) rotations of the motions tried.
-        T: (M, 3) translations.
-        data: Anchors and neighbours.
+        soup: Current belief; gives motions, orientations and the range of depths.
+        data: Anchors.
         photo: Photometric term.
         keep: Particles wanted.
+        rng: Draws the sample of motions.
     """
     n, ray = len(soup), data.anchor_ray
     most = NEAREST / np.quantile(soup.depth_at(ray), 0.02)
-    frontal = np.array([0.0, 0.0, -1.0])
-    normals = [np.broadcast_to(c, (n, 3)) for c in common_normals(soup.n, NORMALS)] + [soup.n]
+    frontal = np.broadcast_to([0.0, 0.0, -1.0], (n, 3))
     tried, cost, unit = [], [], photo.unit(soup)
-    for turn, shift in zip(R, T, strict=True):
+    for turn, shift in zip(*common_motions(soup, data, MOTIONS, rng), strict=True):
         # the nearest depth may lie behind a camera that moves forward: the line has no end then
         last = most / max(1 + most * shift[2], 0.2)
         s = (np.arange(LEVELS) + 0.5) / LEVELS * last
         mu = s * (ray @ turn.T)[:, 2:] / np.maximum(1 - s * shift[2], 1e-6)
         Z = 1 / np.maximum(mu, 1e-9)
-        for normal in normals:
+        for normal in (frontal, soup.n):
             facing = -np.sum(normal * ray, axis=1)
             slanted = np.where((facing < STEEP)[:, None], frontal, normal)
             p = Particles(
@@ -234,7 +231,7 @@ def swept(
             )
             tried.append(p)
             cost.append(photo.costs(p, unit))
-    value = _voted(np.stack(cost, axis=1), data)
+    value = np.stack(cost, axis=1)
     sides = np.pad(value, ((0, 0), (0, 0), (1, 1)), constant_values=np.inf)
     low = (value <= sides[..., :-2]) & (value <= sides[..., 2:])
     value = np.where(low, value, np.inf).reshape(n, -1)
@@ -242,33 +239,25 @@ def swept(
     return tried[0].joined(*tried[1:]).take(which)
 
 
-def _voted(cost: Float, data: EnergyData) -> Float:
-    """Costs (N, ...) as weighted means with those of the neighbours."""
-    if not len(data.pairs):
-        return cost
-    n = len(cost)
-    i, k = data.pairs.T
-    bound = np.quantile(data.pair_weight, 0.8)
-    w = VOTE * np.minimum(data.pair_weight / max(bound, 1e-12), 1.0)
-    link = coo_matrix((np.tile(w, 2), (np.r_[i, k], np.r_[k, i])), shape=(n, n)).tocsr()
-    flat = cost.reshape(n, -1)
-    total = 1.0 + np.asarray(link.sum(axis=1)).reshape(n, 1)
-    return np.asarray((flat + link @ flat) / total).reshape(cost.shape)
+def common_motions(
+    soup: Soup, data: EnergyData, count: int, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """At most `count` present motions under which most anchors move as under their own.
 
+    Each is chosen by how much it lowers the sum of the limited distances, after those before.
 
-def common_normals(n: Float, count: int) -> Float:
-    """(count, 3) a plane parallel to the image and medians of clusters of unit normals (N, 3).
-
-    Each cluster starts at a normal that is farther from those before than nine in ten are.
+    Returns:
+        (C, 3, 3) rotations and (C, 3) translations.
     """
-    centre = np.array([[0.0, 0.0, -1.0]])
-    for _ in range(count - 1):
-        gap = 1 - (n @ centre.T).max(axis=1)
-        centre = np.vstack([centre, n[np.argsort(gap, kind="stable")[int(0.9 * len(n))]]])
-    for _ in range(10):
-        nearest = (n @ centre.T).argmax(axis=1)
-        for c in range(1, count):
-            if (nearest == c).any():
-                middle = np.median(n[nearest == c], axis=0)
-                centre[c] = middle / max(np.linalg.norm(middle), 1e-12)
-    return centre
+    pick = rng.choice(len(soup), min(TRIED, len(soup)), replace=False)
+    X = soup.points(data.anchor_ray)
+    moved = np.einsum("mij,nj->nmi", soup.R[pick], X) + soup.translation[pick]
+    # rays of the next camera
+    there, own = (y[..., :2] / np.maximum(y[..., 2:], 1e-9) for y in (moved, soup.moved(X)))
+    gap = np.linalg.norm(there - own[:, None], axis=-1)
+    error = np.minimum(float(data.K_next[0, 0]) * gap, CLIP_PX)
+    best, kept = np.full((len(soup), 1), CLIP_PX), []
+    for _ in range(min(count, len(pick))):
+        kept.append(int(np.minimum(best, error).sum(axis=0).argmin()))
+        best = np.minimum(best, error[:, kept[-1:]])
+    return soup.R[pick[kept]], soup.translation[pick[kept]]

@@ -6,18 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import Field
 
-from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.schema.limits import MAX_PARTICLES
-from soup_nlp.schema.section import (
-    Count,
-    NonNegative,
-    Section,
-    Tolerance,
-)
+from soup_nlp.schema.section import Count, NonNegative, Section, Tolerance
 
 
 class RefineOptions(Section):
@@ -58,8 +51,6 @@ class Round:
         proposed: Feasible particles by kind.
         accepted: Chosen particles by kind.
         seconds: Wall time.
-        spread: (N,) standard deviation of the particles' log depth at the anchors, each weighted
-            by exp(-its min-marginal).
     """
 
     energy: Mapping[str, float]
@@ -73,7 +64,6 @@ class Round:
     proposed: Mapping[str, int] = field(repr=False)
     accepted: Mapping[str, int] = field(repr=False)
     seconds: float
-    spread: Float = field(repr=False, default_factory=lambda: np.zeros(0))
 
     def __str__(self) -> str:
         return (

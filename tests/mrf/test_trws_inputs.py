@@ -113,18 +113,6 @@ def test_as_long_as_the_best_energy_falls_nothing_stagnates():
     assert late
 
 
-def test_polish_ends_where_no_single_node_helps():
-    rng = np.random.default_rng(13)
-    unary, edges, tables = dense(rng, 10, 40, 4)
-    rough = solve_trws(unary, edges, tables, max_iter=1, **FOREVER)
-    result = solve_trws(unary, edges, tables, max_iter=1, polish=True, **FOREVER)
-    assert result.energy <= rough.energy
-    for v, x in itertools.product(range(10), range(4)):
-        moved = result.labels.copy()
-        moved[v] = x
-        assert mrf_energy(moved, unary, edges, tables) >= result.energy - 1e-9
-
-
 def test_stops():
     rng = np.random.default_rng(14)
     unary, edges, tables = dense(rng, 12, 50, 4)

@@ -10,7 +10,7 @@ import pytest
 
 from soup_nlp.data.census import census, census_at
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.geometry import camera
+from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
@@ -18,15 +18,15 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
-from soup_nlp.refine.anchored import Particles
 from soup_nlp.refine.mppbp import objective, refine_soup
+from soup_nlp.refine.particles import Particles
 from soup_nlp.refine.photometric import (
     BEHIND,
     SAMPLES,
     TAU,
     UNSEEN,
     Photometric,
-    common_normals,
+    common_motions,
     photometric_term,
     swept,
 )
@@ -174,18 +174,21 @@ def test_weight_zero_leaves_the_images_out(two):
 def test_sweep_finds_depths_that_the_start_does_not_have(two):
     rng = np.random.default_rng(0)
     start = two.soup(np.exp(rng.uniform(np.log(0.8), np.log(3.0), two.count)))
-    t = start.translation[:1]
-    found = swept(start, np.eye(3)[None], t, two.data(two.flow), two.look(start), 6)
+    found = swept(start, two.data(two.flow), two.look(start), 6, rng)
     assert found.shape == (two.count, 6)
     gap = np.abs(np.log(found.D / -found.n[..., 2] / two.truth.distance[:, None])).min(axis=1)
     u = two.seg.anchors[:, 0]
     assert np.median(gap[u < 85]) < 0.05
 
 
-def test_normals_start_with_the_image_plane():
-    n = np.tile([0.0, -0.6, -0.8], (10, 1))
-    centre = common_normals(n, 2)
-    np.testing.assert_allclose(centre, [[0, 0, -1], [0, -0.6, -0.8]])
+def test_common_motions_are_those_of_the_components(two):
+    turn = rotation.exp(np.array([0.0, 0.05, 0.02]))
+    R = np.where(two.near[:, None, None], turn, np.eye(3))
+    soup = replace(two.truth, R=R)
+    found, shift = common_motions(soup, two.data(two.flow), 2, np.random.default_rng(0))
+    assert shift.shape == (2, 3)
+    order = np.argsort(found[:, 0, 2])
+    np.testing.assert_array_equal(found[order], [np.eye(3), turn])
 
 
 def test_images_repair_what_the_flow_says_wrongly(two):

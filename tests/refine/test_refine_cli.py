@@ -17,7 +17,7 @@ from soup_nlp.config.problem import load_problem, make_problem
 from soup_nlp.errors import ConfigError
 from soup_nlp.model.energy_data import PAPER_TERMS
 from soup_nlp.pipeline.run import run
-from soup_nlp.refine.population import KINDS
+from soup_nlp.refine.particles import KINDS
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.check import check_folder
 

@@ -11,10 +11,9 @@ from helpers_model import Tiny, random_soup, weights_for, with_graph
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
-from soup_nlp.refine.anchored import Particles, anchor_depth
 from soup_nlp.refine.costs import PairCosts, feasible, unary_costs
 from soup_nlp.refine.mppbp import length_slope
-from soup_nlp.refine.population import conditional_costs, diverse, within_reach
+from soup_nlp.refine.particles import Particles, anchor_depth, within_reach
 
 
 def cloud(tiny: Tiny, labels: int, seed: int = 3, spread: float = 1.0) -> Particles:
@@ -162,37 +161,6 @@ def test_the_length_slope_is_the_derivative_of_the_energy():
     )
 
 
-def test_conditional_costs_are_differences_of_the_energy():
-    tiny = Tiny("pixels")
-    weights = weights_for("pixels")
-    costs = PairCosts(tiny.data, weights)
-    p = cloud(tiny, 4)
-    unary, _ = unary_costs(p, tiny.data, weights)
-    labels = np.random.default_rng(0).integers(0, 4, len(tiny.soup))
-    found = conditional_costs(labels, unary, costs.edges, costs.tables(p))
-    base = oracle.energy(chosen(p, labels), tiny.data, weights)["total"]
-    for i in (0, 5, 11):
-        for x in range(4):
-            other = labels.copy()
-            other[i] = x
-            gain = oracle.energy(chosen(p, other), tiny.data, weights)["total"] - base
-            assert found[i, x] - found[i, labels[i]] == pytest.approx(gain, abs=1e-10)
-
-
-def test_kept_particles_are_cheap_feasible_and_different():
-    tiny = Tiny("pixels")
-    p = cloud(tiny, 6)
-    n = len(tiny.soup)
-    p = p.joined(p.take(np.full((n, 1), 2)))  # number 6 repeats number 2
-    cost = np.tile(np.array([0.0, 1.0, 2.0, 3.0, np.inf, 5.0, 2.1]), (n, 1))
-    labels = np.zeros(n, int)
-    kept = diverse(p, labels, cost, 4, tiny.data)
-    assert np.array_equal(kept, np.tile([1, 2, 3, 5], (n, 1)))
-    # with nothing else left: the repeated one, then the infeasible one
-    every = diverse(p, labels, cost, 20, tiny.data)
-    assert np.array_equal(every[:, 4:], np.tile([6, 4], (n, 1)))
-
-
 def test_no_particle_runs_away_but_the_current_one_may_stay():
     tiny = Tiny()
     n = len(tiny.soup)
@@ -210,18 +178,3 @@ def test_no_particle_runs_away_but_the_current_one_may_stay():
     # back to its neighbours is open to the one that ran away
     assert found[3, 3]
     assert anchor_depth(p, tiny.data.anchor_ray)[3, 3] < 2.0
-
-
-def test_turns_between_neighbours_count_in_both_directions():
-    problem = Tiny("pixels", samples=None)
-    names = ("arap", "proj", "cont", "prior", "depth", "order")
-    weights = weights_for("pixels", False).replace(**dict.fromkeys(names, 0.0), orient=1.0)
-    costs = PairCosts(problem.data, weights)
-    found = costs.tables(Particles.of(problem.soup))[:, 0, 0].sum()
-    i, k = problem.data.pairs.T
-    n = problem.soup.n
-    turn = np.minimum(1 - np.sum(n[i] * n[k], axis=1), weights.sigma_orient)
-    assert turn.sum() > 0.01
-    assert found == pytest.approx(float(2 * turn.sum()), rel=1e-12)
-    exact = oracle.energy(problem.soup, problem.data, weights)["orient"]
-    assert found == pytest.approx(exact, rel=1e-12)
