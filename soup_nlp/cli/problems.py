@@ -158,7 +158,6 @@ QUICK = "100,250"
 
 TABLES = (
     "index.json",
-    "index.csv",
     "instancedata.csv",
     "run.py",
     "README.md",

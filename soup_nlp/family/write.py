@@ -81,10 +81,7 @@ def write_family(
             write_text(folder / f"{starts[0].problem}.casadi", as_casadi(programs))
     index = {"set": "SOUP", "version": VERSION, "generator": f"soup_nlp {__version__}"}
     write_json(folder / "index.json", {**index, "instances": entries})
-    write_text(
-        folder / "index.csv", as_csv([{k: v for k, v in e.items() if k != "runs"} for e in entries])
-    )
-    write_text(folder / "instancedata.csv", as_csv([instance_data(e) for e in entries], ";"))
+    write_text(folder / "instancedata.csv", as_csv([instance_data(e) for e in entries]))
     write_text(folder / "run.py", Path(run_solver.__file__).read_text(encoding="utf-8"))
     write_text(folder / "README.md", readme(entries))
     write_text(folder / "LICENSE.txt", _file("LICENSE.txt"))
@@ -216,25 +213,13 @@ def instance_data(entry: Mapping[str, Any]) -> Entry:
     }
 
 
-def as_csv(entries: Sequence[Entry], delimiter: str = ",") -> str:
-    """The entries as a CSV table; columns of nested entries have names with dots."""
-    rows = [_flat(e) for e in entries]
-    head = list(dict.fromkeys(k for row in rows for k in row))
+def as_csv(rows: Sequence[Entry]) -> str:
+    """Rows as a table in the form of MINLPLib, separated by semicolons."""
     out = io.StringIO()
-    writer = csv.DictWriter(out, head, restval="", lineterminator="\n", delimiter=delimiter)
+    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n", delimiter=";")
     writer.writeheader()
     writer.writerows(rows)
     return out.getvalue()
-
-
-def _flat(entry: Mapping[str, Any], before: str = "") -> Entry:
-    out: Entry = {}
-    for key, value in entry.items():
-        if isinstance(value, Mapping):
-            out |= _flat(value, f"{before}{key}.")
-        else:
-            out[before + key] = " ".join(value) if isinstance(value, list) else value
-    return out
 
 
 # --- README of the folder -------------------------------------------------------------------------

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image, Mask
@@ -229,12 +228,9 @@ def load(folder: str | Path) -> Result:
     require_layout(tree)
     try:
         metrics = {name: _metrics(row) for name, row in summary["metrics"].items()}
-    except (KeyError, TypeError, AttributeError) as error:
-        raise DataError("summary.json cannot be read", where=place, found=error) from error
-    try:
         found = _result(tree, attrs)
-    except (KeyError, IndexError, ValueError, TypeError, yaml.YAMLError) as error:
-        raise DataError("result does not hold together", where=path, found=error) from error
+    except (LookupError, ValueError, TypeError, AttributeError) as error:
+        raise DataError("result does not hold together", where=place, found=error) from error
     picture = place / "overview.png"
     return replace(
         found,

@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import lru_cache
+from glob import glob
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -97,21 +98,17 @@ def find_images(source: Path) -> list[Path]:
         DataError: there are fewer than two.
     """
     source = as_path(source, "frames")
-    root = source
-    if source.is_dir():
-        found = [p for p in source.glob(LAYOUT) if p.suffix.lower() in IMAGES]
-        found = found or [p for p in source.iterdir() if p.suffix.lower() in IMAGES]
+    root = next(folder for folder in (source, *source.parents) if folder.is_dir())
+    # glob leaves out hidden files and folders
+    if root == source:
+        every = [root / name for name in glob("*", root_dir=root)]
+        images = [p for p in every if p.suffix.lower() in IMAGES]
+        found = [p for p in images if p.match(LAYOUT)] or images
     else:
-        root = next(folder for folder in source.parents if folder.is_dir())
-        found = []
-        with suppress(ValueError):  # of a pattern such as a**
-            found = [p for p in root.glob(str(source.relative_to(root))) if p.is_file()]
-    # hidden by its own name, or by that of a folder that the pattern matched
-    found = [
-        p for p in found if not any(part.startswith(".") for part in p.parts[len(root.parts) :])
-    ]
+        matches = glob(str(source.relative_to(root)), root_dir=root, recursive=True)
+        found = [p for p in (root / name for name in matches) if p.is_file()]
     names = {*found}
-    found = [p for p in found if not any(q in names for q in _shorter(p))]
+    found = [p for p in found if names.isdisjoint(_shorter(p))]
     if len(found) < 2:
         raise DataError(
             "a sequence needs two images at least",

@@ -14,13 +14,6 @@ from soup_nlp.evaluate.metrics import depth_metrics, true_pixels
 from soup_nlp.sequence.chain import Chain
 
 
-def true_depth(chain: Chain, frame: int) -> Float | None:
-    """(H, W) true z of a frame, None where unknown."""
-    if frame == len(chain.pairs):
-        return chain.pairs[-1].truth.get("depth_next")
-    return chain.pairs[frame].truth.get("depth_ref")
-
-
 def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any] | None:
     """Errors of depth and path; None without a truth.
 
@@ -32,8 +25,10 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     """
     if truths is not None and len(truths) != len(chain):
         raise DataError("truth and chain differ in length", found=len(truths), expected=len(chain))
-    found = [(k, true_depth(chain, k) if truths is None else truths[k]) for k in range(len(chain))]
-    known = {k: z for k, z in found if z is not None and true_pixels(z, None).any()}
+    own = [*(pair.truth.get("depth_ref") for pair in chain.pairs)]
+    own.append(chain.pairs[-1].truth.get("depth_next"))
+    given = enumerate(own if truths is None else truths)
+    known = {k: z for k, z in given if z is not None and true_pixels(z, None).any()}
     if not known:
         return None
     depths = {k: chain.depth(k) for k in known}

@@ -97,11 +97,14 @@ def test_casadi_and_hdf5_agree_with_the_nlp(exported):
         close(oracle(x0, p)[1], file["at_start/g"][:])
         stored = file["at_start/hess_lag/value"][:]
         assert file["x_names"].asstr()[0] == "lam[0]"
+        for name in ("p", "x0", "lbx", "ubx", "lbg", "ubg"):
+            assert np.array_equal(file[name][:], getattr(nlp, name))
         row, column, value, shape = (
             file[f"at_start/information/{name}"][:] for name in ("row", "column", "value", "shape")
         )
     close(np.array(hess(x0, p, 1, np.ones(nlp.ng)).nonzeros()), stored)
-    assert np.array_equal(x0, nlp.x0)
+    listed = json.loads((exported / "manifest.json").read_text())["files"]
+    assert all((exported / name).is_file() for name in listed)
     found = sparse.coo_matrix((value, (row, column)), shape).toarray()
     form = case.formulation(hessian="exact", compiled=False)
     expected = information(case.soup, case.data, case.weights, form).matrix.toarray()

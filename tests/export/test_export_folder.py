@@ -6,8 +6,6 @@ import json
 import shutil
 from pathlib import Path
 
-import casadi as ca
-import h5py
 import numpy as np
 import pytest
 from helpers_nl import ReadBack, close
@@ -26,20 +24,6 @@ from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.folders import MARK
 
 pytestmark = pytest.mark.slow
-
-
-def test_the_casadi_format_includes_the_start(tmp_path):
-    assert write(tmp_path, "--superpixels", "9", "--format", "casadi") == 0
-    listed = json.loads((tmp_path / "manifest.json").read_text())["files"]
-    assert all((tmp_path / name).is_file() for name in listed)
-    _, nlp, _, (v, _), _ = problem_of(tmp_path)
-    with h5py.File(tmp_path / "soup.h5") as file:
-        given = {k: file[k][:] for k in ("p", "x0", "lbx", "ubx", "lbg", "ubg")}
-    for name, values in given.items():
-        assert np.array_equal(values, getattr(nlp, name))
-    oracle = ca.Function.load(str(tmp_path / "oracle.casadi"))
-    back = ReadBack(tmp_path / "soup.nl")
-    close(oracle(given["x0"], given["p"])[0], back.values(given["x0"][v])[0])
 
 
 def test_a_second_export_removes_the_files_of_the_first(tmp_path):

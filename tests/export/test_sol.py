@@ -11,13 +11,12 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from helpers_formulation import form, tiny
 from helpers_model import PAPER, Tiny
 from scipy import sparse
 
 from soup_nlp.errors import ExportError
 from soup_nlp.export import verify
-from soup_nlp.export.nl import readable_names, write_nl
+from soup_nlp.export.nl import write_nl
 from soup_nlp.export.program import make_program
 from soup_nlp.export.sol import Sol, read_sol, write_sol
 from soup_nlp.export.verify import bound_multipliers, kind, least_squares_multipliers
@@ -60,40 +59,40 @@ basic
 
 
 def test_a_file_is_read_into_the_order_of_the_problem(tmp_path):
-    (tmp_path / "a.sol").write_text(TEXT)
-    sol = read_sol(tmp_path / "a.sol", ORDER, ROWS)
+    path = tmp_path / "a.sol"
+    path.write_text(TEXT)
+    sol = read_sol(path, ORDER, ROWS)
     assert sol.message == "solver 1.0: optimal"
     assert (sol.code, sol.solved, sol.status) == (0, True, "solved")
     # file: variable 2 is 10, variable 0 is 20, variable 1 is 30
     assert sol.x.tolist() == [20, 30, 10]
     assert sol.lam_g.tolist() == [-0.25, 1.5]
-
-
-def test_a_file_with_a_tolerance_and_without_duals(tmp_path):
-    head = "Options\n5\n1\n1\n3\n2\n0\n3\n3\n1e-6\n1\n2\n3\nobjno 0 400\n"
-    (tmp_path / "a.sol").write_text(head)
-    sol = read_sol(tmp_path / "a.sol", ORDER, ROWS)
+    # with a tolerance and without duals
+    path.write_text("Options\n5\n1\n1\n3\n2\n0\n3\n3\n1e-6\n1\n2\n3\nobjno 0 400\n")
+    sol = read_sol(path, ORDER, ROWS)
     assert sol.x.tolist() == [2, 3, 1]
-    assert sol.lam_g is None
-    assert (sol.status, sol.solved) == ("limit", False)
+    assert (sol.lam_g, sol.status, sol.solved) == (None, "limit", False)
 
 
-def test_written_files_read_back(tmp_path):
-    rng = np.random.default_rng(0)
-    x, lam = rng.normal(size=3), rng.normal(size=2)
-    write_sol(tmp_path / "a.sol", x, lam, ORDER, ROWS, "two\n\nlines", 402)
+@pytest.mark.parametrize(
+    ("message", "read"),
+    [("two\n\nlines", "two\nlines"), ("one\n Options\ntwo", 'one\n"Options"\ntwo')],
+)
+@pytest.mark.parametrize("lam", [None, np.array([0.1, -1 / 3])])
+def test_written_files_read_back(message, read, lam, tmp_path):
+    x = np.random.default_rng(0).normal(size=3)
+    write_sol(tmp_path / "a.sol", x, lam, ORDER, ROWS, message, 402)
     sol = read_sol(tmp_path / "a.sol", ORDER, ROWS)
     assert np.array_equal(sol.x, x)
     assert np.array_equal(sol.lam_g, lam)
-    assert (sol.message, sol.code) == ("two\nlines", 402)
-    write_sol(tmp_path / "a.sol", x, None, ORDER, ROWS)
-    assert read_sol(tmp_path / "a.sol", ORDER, ROWS).lam_g is None
+    assert (sol.message, sol.code) == (read, 402)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
         ("Options", "Optionen", "ends early"),
+        (TEXT[TEXT.index("20") :], "", "ends early"),
         ("objno 0 0", "objno", "objno, objective, code"),
         ("\n30\n", "\nthirty\n", "line 17"),
         ("\n2\n2\n3\n3\n", "\n2\n2\n4\n4\n", "another problem"),
@@ -110,14 +109,8 @@ def test_wrong_files_are_refused(tmp_path, old, new, said):
     (tmp_path / "a.sol").write_text(TEXT.replace(old, new))
     with pytest.raises(ExportError, match=said):
         read_sol(tmp_path / "a.sol", ORDER, ROWS)
-
-
-def test_missing_and_truncated_files_are_refused(tmp_path):
     with pytest.raises(ExportError, match="is missing"):
         read_sol(tmp_path / "none.sol", ORDER, ROWS)
-    (tmp_path / "a.sol").write_text(TEXT[: TEXT.index("20")])
-    with pytest.raises(ExportError, match="ends early"):
-        read_sol(tmp_path / "a.sol", ORDER, ROWS)
 
 
 @pytest.mark.slow
@@ -144,11 +137,6 @@ def test_multipliers_of_a_foreign_optimum(tmp_path):
     away = sol.x + 0.01
     lam = least_squares_multipliers(nlp, away)
     assert max(optimality(nlp, away, bound_multipliers(nlp, away, lam), lam).values()) > 1e-2
-
-
-def test_a_message_with_the_word_options_is_read_back(tmp_path):
-    write_sol(tmp_path / "a.sol", np.ones(3), None, ORDER, ROWS, "one\n Options\ntwo", 0)
-    assert read_sol(tmp_path / "a.sol", ORDER, ROWS).message == 'one\n"Options"\ntwo'
 
 
 # --- multipliers and residuals of answers, names of an export -------------------------------------
@@ -217,12 +205,6 @@ def test_groups_without_elements_are_passed_over():
     program = make_program(groups, 2, 0, np.zeros(0))
     assert program.in_objective.tolist() == [True, True]
     assert len(program.stamped) == 2
-
-
-def test_rows_of_one_superpixel_are_named_by_it_alone():
-    nlp, layout = tiny().nlp(PAPER, form(gauge="unit-translation"))
-    _, names = readable_names(nlp, layout)
-    assert {"so3[0,1]", "so3[11,6]", "normal[3]", "visible[5,1]", "translation[4]"} <= set(names)
 
 
 def test_a_row_of_residuals_says_whether_it_holds():

@@ -203,13 +203,11 @@ def test_the_index_says_what_problem_sets_say(folder):
     starts = [entries[f"SOUP-room-unit-offset-smooth-N100-{s}"] for s in ("hard", "cold")]
     assert starts[1]["objective_at_start"] > 2 * starts[0]["objective_at_start"]
     assert starts[0]["best_known"] == easy["best_known"]
-    rows = list(csv.DictReader((folder / "index.csv").read_text().splitlines()))
-    assert [r["name"] for r in rows] == list(entries)
-    assert float(rows[0]["best_known.objective"]) == easy["best_known"]["objective"]
     assert "CC BY 4.0" in (folder / "LICENSE.txt").read_text()
     assert easy["sha256"][:16] in (folder / "README.md").read_text()
     text = (folder / "instancedata.csv").read_text().splitlines()
     data = {r["name"]: r for r in csv.DictReader(text, delimiter=";")}
+    assert [row["file"] for row in data.values()] == [e["file"] for e in entries.values()]
     own = data[easy["short"]]
     assert own["file"] == easy["file"]
     assert int(own["nvars"]), int(own["ncons"]) == (16 * n, 16 * n + 1)

@@ -110,12 +110,6 @@ def test_planes_and_motions_rebuild_both_frames(text, small_run):
         np.testing.assert_allclose(moved / far, want / far, atol=1e-4)
 
 
-def test_the_next_camera_is_where_the_background_says(text, small_run):
-    pose = np.array(data_of(text)["scene"]["camera"])
-    centre = small_run.metrics["solution"].scale * small_run.camera.centre
-    np.testing.assert_allclose(pose[:3, 3], centre, rtol=1e-9)
-
-
 def test_curtains_are_cut(shown, small_run):
     """Cells within one superpixel are kept; cells across components are removed."""
     labels, found = small_run.segmentation.labels, small_run.components

@@ -214,23 +214,6 @@ def test_unknown_formats_are_refused(tmp_path, result):
     assert set(FORMATS) >= {"ply", "glb", "colmap", "npy", "pfm", "png", "rrd"}
 
 
-def test_bytes_of_one_point(tmp_path):
-    write_ply(tmp_path / "a.ply", [[1.0, 2.0, 3.0]], np.array([[10, 20, 30]], np.uint8))
-    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
-    assert header.decode().splitlines() == [
-        "ply",
-        "format binary_little_endian 1.0",
-        "element vertex 1",
-        "property float x",
-        "property float y",
-        "property float z",
-        "property uchar red",
-        "property uchar green",
-        "property uchar blue",
-    ]
-    assert body == np.array([1, 2, 3], "<f4").tobytes() + bytes([10, 20, 30])
-
-
 def test_unknown_points_of_a_map_are_dropped(tmp_path):
     xyz = np.ones((2, 3, 3))
     xyz[0, 1, 2] = np.nan
