@@ -9,16 +9,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, FloatMap, Image
+from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.camera_files import check_intrinsics, read_intrinsics
 from soup_nlp.data.formats.images import read_image
-from soup_nlp.data.formats.map_files import (
-    UNKNOWN_FLOW,
-    flow_layout,
-    known_depth,
-    read_depth,
-    read_flow,
-)
+from soup_nlp.data.formats.map_files import known_depth, read_depth
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import check_image_size
@@ -99,33 +93,6 @@ def prior_of(given: object) -> Float:
         return read_depth(Path(str(given)), 1.0)
     values = array_of(given, "depth prior", "prior", "numbers (H, W), or a path")
     return known_depth(values, "prior")
-
-
-def flow_of(given: FlowLike, confidence: object, source: str) -> tuple[NDArray[Any], FloatMap, str]:
-    """Displacements (H, W, 2), confidence (H, W) and source of a flow.
-
-    Args:
-        given: Array, see `flow_layout`, or file.
-        confidence: (H, W) in [0, 1]; None for 1 where the flow is finite and 0 elsewhere, with the
-            displacement set to 0.
-        source: Name of the flow; "unknown" for the name of the file.
-
-    Raises:
-        DataError: it is not a flow.
-    """
-    if is_path(given):
-        source = str(given) if source == "unknown" else source
-        given = read_flow(Path(given))
-    expected = "numbers (H, W, 2) or (2, H, W) in pixels, or a path"
-    uv = flow_layout(array_of(given, "flow", source, expected), source)
-    if not (uv.dtype.kind == "f" and uv.dtype.itemsize >= 4):
-        uv = uv.astype(np.float32)
-    if confidence is None:
-        known = (np.abs(uv) < UNKNOWN_FLOW).all(axis=2)
-        return np.where(known[..., None], uv, 0), known.astype(np.float32), source
-    expected = "numbers (H, W) from 0 to 1"
-    sure = array_of(confidence, "flow confidence", source, expected, kinds="fiub", axes="(H, W)")
-    return uv, sure if sure.dtype.kind == "f" else sure.astype(np.float32), source
 
 
 def array_of(

@@ -18,12 +18,12 @@ from soup_nlp.data.accept import (
     ImageLike,
     array_of,
     camera_of,
-    flow_of,
     image_of,
     is_path,
     prior_of,
 )
 from soup_nlp.data.formats.cameras import estimated_cameras
+from soup_nlp.data.formats.map_files import UNKNOWN_FLOW, flow_layout, read_flow
 from soup_nlp.errors import DataError, expect, repr_of
 
 SHORTEST = 0.05
@@ -81,11 +81,22 @@ class Flow:
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        for name, value in zip(
-            ("uv", "confidence", "source"), flow_of(self.uv, self.confidence, self.source)
-        ):
-            object.__setattr__(self, name, value)
-        check_size("flow confidence and flow", self.confidence.shape, self.uv.shape, self.source)
+        put = partial(object.__setattr__, self)
+        given: FlowLike = self.uv
+        if is_path(given):
+            put("source", str(given) if self.source == "unknown" else self.source)
+            given = read_flow(given)
+        expected = "numbers (H, W, 2) or (2, H, W) in pixels, or a path"
+        uv = flow_layout(array_of(given, "flow", self.source, expected), self.source)
+        put("uv", uv if uv.dtype.kind == "f" and uv.dtype.itemsize >= 4 else uv.astype(np.float32))
+        if self.confidence is None:
+            known = (np.abs(self.uv) < UNKNOWN_FLOW).all(axis=2)
+            put("uv", np.where(known[..., None], self.uv, 0))
+            put("confidence", known.astype(np.float32))
+        what, expected = "flow confidence", "numbers (H, W) from 0 to 1"
+        sure = array_of(self.confidence, what, self.source, expected, "fiub", "(H, W)")
+        put("confidence", sure if sure.dtype.kind == "f" else sure.astype(np.float32))
+        check_size("flow confidence and flow", sure.shape, self.uv.shape, self.source)
         # False for NaN
         fits = (self.confidence >= 0) & (self.confidence <= 1)
         if not fits.all():

@@ -309,17 +309,6 @@ def test_a_first_flow_that_is_half_wrong_is_completed():
     assert confidence_of(gap)[outside & ~known].max(initial=0.0) < 0.5
 
 
-@pytest.mark.parametrize("planes", [0, 4])
-def test_flow_with_and_without_homographies(planes, monkeypatch):
-    monkeypatch.setattr(dis, "PLANES", planes)
-    first, second = images(ROAD)
-    flow = dis.dis_flow(first, second)
-    assert np.isfinite(flow.uv).all()
-    sure = flow.confidence > 0.5
-    assert sure.mean() > 0.3
-    assert np.median(np.linalg.norm(flow.uv - truth(ROAD), axis=-1)[sure]) < 0.3
-
-
 @pytest.mark.parametrize(("error", "taken"), [(0.2, False), (0.8, True)])
 def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
     """Images without contrast: only the round trip counts, and that of the new flow is exact."""

@@ -8,13 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import pieh, put, raises, write_dpt, write_flo, write_kitti_flow, write_pfm
+from helpers_files import put, raises, write_dpt, write_flo, write_kitti_flow, write_pfm
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from soup_nlp.data.formats import map_files as fmt
-from soup_nlp.data.formats.camera_files import read_kitti_projections
 
 many = settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -34,13 +33,6 @@ def flows(low: float, high: float) -> st.SearchStrategy[np.ndarray]:
 
 
 # --- .flo ---------------------------------------------------------------------------------------
-
-
-def test_flo_golden_bytes(tmp_path: Path) -> None:
-    golden = struct.pack("<fii4f", 202021.25, 2, 1, 1.5, -2.0, 1e10, 0.0)
-    assert golden[:4] == b"PIEH"
-    flow = fmt.read_flo(put(tmp_path / "a.flo", golden))
-    np.testing.assert_array_equal(flow, [[[1.5, -2.0], [np.nan, np.nan]]])
 
 
 @many
@@ -245,21 +237,3 @@ def test_kitti_disparity_and_vkitti_depth(tmp_path: Path) -> None:
     np.testing.assert_array_equal(disparity, [[np.nan, 1.0, 1.5, 65535 / 256]])
     depth = fmt.read_vkitti_depth(tmp_path / "a.png")
     np.testing.assert_array_equal(depth, [[np.nan, 2.56, 3.84, np.nan]])
-
-
-# --- real files ---------------------------------------------------------------------------------
-
-
-@pytest.mark.shared
-def test_real_files(shared_data: Path, tmp_path: Path) -> None:
-    kitti = shared_data / "kitti2012" / "training"
-    flow = fmt.read_kitti_flow(kitti / "flow_occ" / "000027_10.png")
-    write_kitti_flow(tmp_path / "a.png", flow)
-    np.testing.assert_array_equal(fmt.read_kitti_flow(tmp_path / "a.png"), flow)
-    sintel = shared_data / "sintel" / "training"
-    path = sintel / "flow" / "alley_1" / "frame_0002.flo"
-    assert pieh(fmt.read_flo(path).astype("<f4")) == path.read_bytes()
-    depth = fmt.read_dpt(sintel / "depth" / "alley_1" / "frame_0020.dpt")
-    assert depth.shape == (436, 1024)
-    (projection,) = read_kitti_projections(kitti / "calib" / "000027.txt", ["P1"])
-    assert projection[0, 3] == -386.1448

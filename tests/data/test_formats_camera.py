@@ -116,12 +116,6 @@ def test_image_kinds(tmp_path: Path) -> None:
     assert out.flags.c_contiguous
 
 
-def test_image_16_bit_white(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, 4095, 2048, 65535]], np.uint16))
-    assert read_image(tmp_path / "a.png", white=65535)[0, :, 0].tolist() == [0, 16, 8, 255]
-    assert read_image(tmp_path / "a.png", white=4095)[0, :, 0].tolist() == [0, 255, 128, 255]
-
-
 def test_image_errors(tmp_path: Path) -> None:
     with raises("image is missing"):
         read_image(tmp_path / "none.png")

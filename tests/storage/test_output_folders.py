@@ -305,6 +305,23 @@ def test_a_move_that_was_killed_is_finished(moves, tmp_path):
     assert content(target) == {"a": "3"}
 
 
+def test_a_move_that_fails_is_finished_later(tmp_path, monkeypatch):
+    target, replace = tmp_path / "out", os.replace
+    write(target, a="1", b="1")
+
+    def failing(source, place):
+        if Path(place) == target / "c":
+            raise OSError(5, "Input/output error")
+        replace(source, place)
+
+    with monkeypatch.context() as m:
+        m.setattr(os, "replace", failing)
+        with pytest.raises(DataError, match="cannot be written"):
+            write(target, a="2", c="2")
+    recover(target)
+    assert content(target) == {"a": "2", "c": "2"}
+
+
 def test_scratch_folders_are_removed(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     ended = subprocess.Popen([sys.executable, "-c", ""])

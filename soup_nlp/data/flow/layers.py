@@ -8,6 +8,9 @@ along the epipolar lines of the rigid motion of the remaining flow.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import product
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -81,67 +84,6 @@ def _integrated(along: FloatMap, down: FloatMap, mean: float) -> Image:
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-class EpipolarSearch:
-    """Costs of flows between two images, and the flow of least cost along epipolar lines.
-
-    Args:
-        ref: (H, W) grey reference image.
-        nxt: (H', W') grey next image.
-        stride: Distance of the examined pixels of the reference image.
-    """
-
-    def __init__(self, ref: Image, nxt: Image, stride: int) -> None:
-        self.stride = stride
-        self.own = np.ascontiguousarray(census(ref)[:, ::stride, ::stride])
-        self.there = census(nxt)
-        height, width = ref.shape
-        self.v, self.u = np.mgrid[0:height:stride, 0:width:stride].astype(np.float32)
-
-    def cost(self, x: FloatMap, y: FloatMap) -> FloatMap:
-        """Census difference of the grid and the pixels (x, y) of the next image, averaged over a
-        window; `TAU` outside the image."""
-        height, width = self.there.shape[1:3]
-        inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-        c = np.abs(census_at(self.there, x, y) - self.own).sum(axis=(0, 3)) / 16
-        c = np.where(inside, np.minimum(c, TAU), TAU).astype(np.float32)
-        side = max(1, WINDOW // self.stride)
-        return np.asarray(cv2.blur(c, (side, side)), np.float32)
-
-    def of_flow(self, uv: FloatMap) -> FloatMap:
-        """Cost of a flow (H, W, 2) on the grid."""
-        own = uv[:: self.stride, :: self.stride]
-        return self.cost(self.u + own[..., 0], self.v + own[..., 1])
-
-    def along(self, R: Float, t: Float, K_ref: Float, K_next: Float) -> tuple[FloatMap, FloatMap]:
-        """Flow of least cost among planes swept over depth under a rigid motion, and its cost.
-
-        The planes are parallel to the image, or horizontal like the ground in an upright image.
-
-        Args:
-            R: (3, 3) rotation.
-            t: (3,) unit translation.
-            K_ref: (3, 3) intrinsics of the reference frame.
-            K_next: (3, 3) intrinsics of the next frame.
-        """
-        ray = rays(K_ref, np.stack([self.u, self.v], axis=-1).astype(float))
-        turned = (ray @ R.T).astype(np.float32)
-        best = np.full(self.u.shape, np.inf, np.float32)
-        flow = np.zeros((*self.u.shape, 2), np.float32)
-        most = REACH * self.there.shape[2] / K_next[0, 0]
-        level = np.maximum(ray[..., 1], 0.0) / max(float(ray[..., 1].max()), 1e-6)
-        for shape in (np.ones_like(level), level):
-            for share in (np.arange(LEVELS) + 0.5) / LEVELS:
-                point = turned + (most * share * shape[..., None] * t).astype(np.float32)
-                ahead = np.maximum(point[..., 2], 0.05)
-                x = (point[..., 0] / ahead * K_next[0, 0] + K_next[0, 2]).astype(np.float32)
-                y = (point[..., 1] / ahead * K_next[1, 1] + K_next[1, 2]).astype(np.float32)
-                c = self.cost(x, y)
-                better = c < best
-                best[better] = c[better]
-                flow[better] = np.stack([x - self.u, y - self.v], axis=-1)[better]
-        return flow, best
-
-
 def still(flow: Flow) -> NDArray[np.bool_]:
     """(H, W) static pixels with a confident flow."""
     near: NDArray[np.bool_] = np.linalg.norm(flow.uv, axis=2) < STILL_PX
@@ -166,10 +108,22 @@ def corrected(
         The corrected flow, whose confidence there decreases with the distance in pixels from the
         epipolar line. None if too few static pixels are contradicted.
     """
-    search = EpipolarSearch(ref, nxt, STRIDE)
-    found, cost = search.along(R, t, K_ref, K_next)
-    gain = search.of_flow(flow.uv) - cost
-    moved = np.linalg.norm(found - flow.uv[::STRIDE, ::STRIDE], axis=2)
+    height, width = nxt.shape
+    own = np.ascontiguousarray(census(ref)[:, ::STRIDE, ::STRIDE])
+    there, side = census(nxt), max(1, WINDOW // STRIDE)
+    v, u = np.mgrid[0 : ref.shape[0] : STRIDE, 0 : ref.shape[1] : STRIDE].astype(np.float32)
+
+    def cost_at(x: FloatMap, y: FloatMap) -> FloatMap:
+        """Mean census difference over a window to pixels (x, y) of the next image, or `TAU`."""
+        inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+        c = np.abs(census_at(there, x, y) - own).sum(axis=(0, 3)) / 16
+        c = np.where(inside, np.minimum(c, TAU), TAU).astype(np.float32)
+        return np.asarray(cv2.blur(c, (side, side)), np.float32)
+
+    found, cost = _swept(cost_at, u, v, R, t, K_ref, K_next, REACH * width / K_next[0, 0])
+    now = flow.uv[::STRIDE, ::STRIDE]
+    gain = cost_at(u + now[..., 0], v + now[..., 1]) - cost
+    moved = np.linalg.norm(found - now, axis=2)
     contradicted = still(flow)[::STRIDE, ::STRIDE] & (gain > MIN_GAIN_STATIC) & (moved > MOVED_PX)
     if contradicted.mean() < MIN_CONTRADICTED:
         return None
@@ -190,6 +144,37 @@ def corrected(
     confidence = np.where(wrong, np.exp(-(off**2)) * sure, flow.confidence)
     uv = np.where(wrong[..., None], uv, flow.uv)
     return Flow(uv, confidence.astype(np.float32), flow.source)
+
+
+def _swept(
+    cost_at: Callable[[FloatMap, FloatMap], FloatMap],
+    u: FloatMap,
+    v: FloatMap,
+    R: Float,
+    t: Float,
+    K_ref: Float,
+    K_next: Float,
+    most: float,
+) -> tuple[FloatMap, FloatMap]:
+    """Flow of least cost of pixels (u, v) along their epipolar lines, and its cost.
+
+    It is that of planes swept over depth, up to a shift of `most` over depth: they are parallel to
+    the image, or horizontal like the ground in an upright image.
+    """
+    ray = rays(K_ref, np.stack([u, v], axis=-1).astype(float))
+    turned = (ray @ R.T).astype(np.float32)
+    cost, flow = np.full(u.shape, np.inf, np.float32), np.zeros((*u.shape, 2), np.float32)
+    level = np.maximum(ray[..., 1], 0.0) / max(float(ray[..., 1].max()), 1e-6)
+    for plane, share in product((np.ones_like(level), level), (np.arange(LEVELS) + 0.5) / LEVELS):
+        point = turned + (most * share * plane[..., None] * t).astype(np.float32)
+        ahead = np.maximum(point[..., 2], 0.05)
+        x = (point[..., 0] / ahead * K_next[0, 0] + K_next[0, 2]).astype(np.float32)
+        y = (point[..., 1] / ahead * K_next[1, 1] + K_next[1, 2]).astype(np.float32)
+        c = cost_at(x, y)
+        better = c < cost
+        cost[better] = c[better]
+        flow[better] = np.stack([x - u, y - v], axis=-1)[better]
+    return flow, cost
 
 
 def _nearby(ref: Image, nxt: Image, guess: FloatMap) -> FloatMap:
