@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import AfterValidator, Field, ValidationError
-from pydantic.fields import FieldInfo
 
 from soup_nlp.config.presets import with_preset
 from soup_nlp.config.yaml_text import Dumper, parse
@@ -273,11 +272,6 @@ def dump_problem(problem: Problem, every: bool = True) -> str:
     return "\n".join(_write(problem, "", "", every)) + "\n"
 
 
-def _differs(field: FieldInfo, value: Any) -> bool:
-    """Whether a value is not the default of its field."""
-    return field.is_required() or value != field.get_default(call_default_factory=True)
-
-
 def _write(model: Section, pad: str, place: str, every: bool) -> Iterator[str]:
     docs = model.help()
     for key, field in type(model).model_fields.items():
@@ -286,7 +280,10 @@ def _write(model: Section, pad: str, place: str, every: bool) -> Iterator[str]:
         if isinstance(value, Section):
             lines = list(_write(value, pad + "  ", f"{place}{key}.", every))
             yield from [f"{pad}{key}:{comment}", *lines] if lines else []
-        elif every or f"{place}{key}" in USUAL or _differs(field, value):
+            continue
+        # a required field differs from any default
+        default = ... if field.is_required() else field.get_default(call_default_factory=True)
+        if every or f"{place}{key}" in USUAL or value != default:
             flow = None if isinstance(value, list | tuple | dict) else False
             text = yaml.dump({key: value}, Dumper=Dumper, default_flow_style=flow, width=10**6)
             yield f"{pad}{text.rstrip()}{comment}"

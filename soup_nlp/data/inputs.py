@@ -99,8 +99,8 @@ class FilesInput(FramesInput):
     """Horizontal field of view of the reference frame as shown, degrees, where `intrinsics` is
     null; the next frame has the same lens unless EXIF names another."""
     focal_sigma: NonNegative = 0.0
-    """Standard deviation of the logarithm of the focal length of `fov`, which counts in sigma. From
-    0.4, that of a guess, the flow also corrects the focal length."""
+    """Standard deviation of the logarithm of the focal length of `fov`; sigma includes its effect.
+    From 0.4, that of a guess, the flow also corrects the focal length."""
     intrinsics_next: Camera | str | None = None
     """Camera of the next frame, in the same forms; null for that of the reference frame."""
     depth: str | None = None
@@ -129,8 +129,11 @@ class FilesInput(FramesInput):
                 " belong to the images before",
             )
         truth = Truth(depth(self.depth), depth(self.depth_next), unit=self.unit)
-        following = self.intrinsics_next or self.intrinsics
-        lenses = [self._lens(given, path) for given in (self.intrinsics, following)]
+        read = read_camera if self.undistort else lambda file: (read_intrinsics(file), np.zeros(0))
+        lenses: list[tuple[Float | None, Float]] = []
+        for given in (self.intrinsics, self.intrinsics_next or self.intrinsics):
+            four = intrinsics(*given) if isinstance(given, list) else None
+            lenses.append(read(path(given)) if isinstance(given, str) else (four, np.zeros(0)))
         return make_pair(
             [path(self.ref), path(self.next)],
             [K for K, _ in lenses],
@@ -142,13 +145,6 @@ class FilesInput(FramesInput):
             cropped=self.cropped,
             distortion=[d for _, d in lenses] if self.undistort else (),
         )
-
-    def _lens(self, given: list[float] | str | None, path: Resolve) -> tuple[Float | None, Float]:
-        """Intrinsics (3, 3) or None, and distortion (n,)."""
-        if isinstance(given, str):
-            where = path(given)
-            return read_camera(where) if self.undistort else (read_intrinsics(where), np.zeros(0))
-        return intrinsics(*given) if given else None, np.zeros(0)
 
     def files(self) -> list[str]:
         """See `PairInput`."""

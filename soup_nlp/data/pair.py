@@ -179,7 +179,7 @@ class Truth:
             hint = "soup_nlp.Truth(depth_ref=array); files are read by a problem's input"
             made = array_of(value, what, where, expected, kinds, axes, hint)
             if made.dtype.kind == "f":
-                # float32 cannot be compared with what overflows
+                # float32 cannot be compared with a limit beyond its range
                 made = made.astype(np.float64)
             if made.dtype.kind == "f" and (abs(made[np.isfinite(made)]) > LARGEST).any():
                 raise DataError(
@@ -221,8 +221,8 @@ class Pair:
         name: Name for titles and folders.
         depth_prior: (H, W) depth of the reference frame from elsewhere, or an inverse depth or an
             order (`data.inputs.PriorOptions`); NaN where unknown. An array or the name of a file.
-        focal_sigma: Standard deviation of the log focal length; 0 where it is given. One as large
-            as that of a mere guess (0.4) lets the flow correct the focal length.
+        focal_sigma: Standard deviation of the log focal length; 0 for a known focal length. From
+            0.4, that of a guess, the flow corrects the focal length.
 
     Raises:
         DataError: an image has a wrong shape or type, a camera is invalid, or sizes differ.

@@ -39,7 +39,7 @@ def working_size(pair: Pair, megapixels: float | None) -> Pair:
 
 
 def _at_sizes(pair: Pair, factors: Float) -> Pair:
-    """The pair with images reduced by factors (2, 2) or (2, 1) (height, width), and no more."""
+    """The images and cameras of a pair, reduced by factors (2, 2) or (2, 1) (height, width)."""
     images = pair.image_ref, pair.image_next
     shapes = np.array([image.shape[:2] for image in images])
     sizes = np.maximum(1, np.rint(shapes * factors)).astype(int)

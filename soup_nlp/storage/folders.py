@@ -190,7 +190,7 @@ def staged(
         folder: The output folder.
         whole: The new files are a complete result: files of an earlier result are removed.
         overwrite: Overwrite files that the program did not make.
-        subject: What the files are the result of; nothing leaves what the folder says.
+        subject: What the files are the result of; empty for that of the earlier result.
 
     Raises:
         DataError: a file cannot be written, or a file of the user has the name of a new one.
@@ -260,7 +260,7 @@ def _temporary(parent: Path, prefix: str) -> Iterator[Path]:
 
 
 def _sweep(parent: Path, prefix: str) -> None:
-    """Remove temporary folders whose process has ended; another one may have had our number."""
+    """Remove temporary folders of processes that have ended, also of one with our own number."""
     for path in parent.glob(f"{prefix}*"):
         number = re.match(r"(\d{1,9})-", path.name.removeprefix(prefix))
         if number is None or path in _open:

@@ -66,7 +66,7 @@ class interruptible:  # noqa: N801
     `aborted` records it.
 
     Args:
-        say: Told what a Ctrl-C does; it is called in a signal handler.
+        say: Called in a signal handler, with the effect of this Ctrl-C.
         numbers: The signals.
     """
 

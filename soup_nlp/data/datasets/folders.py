@@ -6,6 +6,7 @@ Each needs the two images and the camera. The truth is None without its file, an
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +18,6 @@ from soup_nlp.data.datasets.layout import (
     FramesInput,
     PairInput,
     Resolve,
-    is_result,
     make_pair,
     need,
     need_folder,
@@ -31,7 +31,7 @@ from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Positive, Whole
-from soup_nlp.storage.files import is_file, read_text
+from soup_nlp.storage.files import is_file, read_json, read_text
 from soup_nlp.storage.folders import MARK
 
 LAYOUT = (
@@ -95,8 +95,10 @@ class FolderInput(FramesInput):
 def _plain_folder(folder: Path, own: FolderInput, usual: float = MILLIMETRES) -> Pair:
     """The pair of a plain folder; `usual` are the values per unit of a depth without a scale."""
     folder = need_folder(folder, LAYOUT)
-    if is_result(folder):
-        marked = is_file(folder / MARK)
+    marked, summary = is_file(folder / MARK), None
+    with suppress(DataError):
+        summary = read_json(folder / "summary.json", "summary.json")
+    if marked or (isinstance(summary, dict) and "problem_hash" in summary):
         raise DataError(
             "input folder holds a result, whose depth and flow would pass for truth",
             where=folder,
@@ -187,15 +189,16 @@ class TumInput(PairInput):
                 )
         beside = _find(folder, ("K", "camera"), (".txt",))
         K = _tum_camera(folder) if beside is None else read_intrinsics(beside)
-        (time_ref, ref), (time_next, following) = (images[k] for k in numbers)
-        maps = (
-            read_if(read_depth, _tum_depth(depths, time), self.depth_scale, TUM_SCALE)
-            for time in (time_ref, time_next)
-        )
-        truth = Truth(depth_ref=next(maps), depth_next=next(maps))
+        maps = []
+        for time, _ in (images[k] for k in numbers):
+            stamp, file = min(
+                depths, key=lambda entry: abs(entry[0] - time), default=(np.inf, None)
+            )
+            near = abs(stamp - time) <= _TUM_SLACK
+            maps.append(read_if(read_depth, file if near else None, self.depth_scale, TUM_SCALE))
         name = f"{folder.resolve().name}_{self.frame}"
-        files = [need(path, TUM_LAYOUT) for path in (ref, following)]
-        return make_pair(files, [K, K], truth, name)
+        files = [need(images[k][1], TUM_LAYOUT) for k in numbers]
+        return make_pair(files, [K, K], Truth(maps[0], maps[1]), name)
 
 
 def _tum_camera(folder: Path) -> Float:
@@ -228,14 +231,6 @@ def _tum_list(path: Path) -> list[tuple[float, Path]]:
                 expected="'timestamp file'",
             ) from None
     return out
-
-
-def _tum_depth(depths: list[tuple[float, Path]], time: float) -> Path | None:
-    """The depth image nearest in time; None if it is more than 20 ms away."""
-    if not depths:
-        return None
-    stamp, path = min(depths, key=lambda entry: abs(entry[0] - time))
-    return path if abs(stamp - time) <= _TUM_SLACK else None
 
 
 class MotorcycleInput(PairInput):

@@ -16,8 +16,7 @@ from soup_nlp.data.formats.images import read_images
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.schema.section import Positive, Section
-from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder, read_json
-from soup_nlp.storage.folders import MARK
+from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder
 
 T = TypeVar("T")
 Resolve = Callable[[str], Path]
@@ -149,14 +148,3 @@ def make_pair(
     known = truth if truth.known() else None
     images_and_cameras = pictures[0], pictures[1], own[0], own[1]
     return Pair(*images_and_cameras, truth=known, name=name, focal_sigma=focal_sigma)
-
-
-def is_result(folder: Path) -> bool:
-    """Whether a folder holds a result: it has the mark, or a summary.json of a solve."""
-    if is_file(folder / MARK):
-        return True
-    try:
-        summary = read_json(folder / "summary.json", "summary.json")
-    except DataError:
-        return False
-    return isinstance(summary, dict) and "problem_hash" in summary
