@@ -269,7 +269,7 @@ def follows_edges(values: Float, image: Image) -> bool:
         move = np.array([[sign, 0.0, first + right], [0.0, 1.0, down]])
         one, step = (
             cv2.warpAffine(
-                m, move, (columns, rows), flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REFLECT
+                m, move, (columns, rows), flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REFLECT_101
             )
             for m in (small, steps)
         )
@@ -282,7 +282,7 @@ def follows_edges(values: Float, image: Image) -> bool:
         down, right = np.trunc(FARTHEST * rng.uniform(-1, 1, 2) * (rows, columns))
         mirrored = len(trials) % 2
         if mirrored or abs(down) + abs(right) >= NEAREST * columns:
-            trials.append(scores(mirrored, right, down))
+            trials.append(scores(mirrored, -right, -down))
     chance = np.array(trials)
     found = np.array(scores(0, 0.0, 0.0))
     better = (found - chance.mean(axis=0)) / np.maximum(chance.std(axis=0), 1e-12)
