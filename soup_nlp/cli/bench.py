@@ -31,7 +31,6 @@ from soup_nlp.cli.options import (
     Workers,
     listed,
     numbers,
-    words,
 )
 from soup_nlp.errors import ConfigError
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SIDE, MAX_SUPERPIXELS
@@ -248,7 +247,11 @@ def speed(
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
-    chosen = words(scenes, "--scenes", [*RENDERED, MOTORCYCLE.name])
+    chosen, known = listed(scenes), [*RENDERED, MOTORCYCLE.name]
+    if not chosen or set(chosen) - set(known):
+        raise ConfigError(
+            "unknown scene", where="--scenes", found=scenes, expected=", ".join(known)
+        )
     items = timing.timed_pairs(chosen, numbers(seeds, "--seeds"), width, listed(pairs), data)
     n = numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS)
     k = numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS)

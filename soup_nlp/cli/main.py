@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 
 from soup_nlp.errors import ConfigError, DataError, SoupError, StoppedError, printable
 from soup_nlp.storage.system import handling
@@ -30,6 +30,8 @@ from soup_nlp.storage.versions import __version__, versions
 
 BUG = 70
 """Exit code of a bug of the program (EX_SOFTWARE of sysexits.h)."""
+ABORTED = 130
+"""Exit code of a command that Ctrl-C ended without a result, as in shells."""
 BROKEN_PIPE = 141
 """Exit code after a broken pipe, as in shells."""
 
@@ -120,9 +122,6 @@ def prepare_streams() -> None:
                 stream.reconfigure(errors="backslashreplace")
 
 
-ABORTED = 130
-"""Exit code of a command that Ctrl-C ended without a result, as in shells."""
-
 COMMANDS: Mapping[str, str] = {
     "solve": "solve:solve",
     "demo": "solve:demo",
@@ -156,68 +155,47 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv is None:
         # pictures go to files, so that the backend of the user does not matter
         os.environ["MPLBACKEND"] = "agg"
+    words = list(sys.argv[1:] if argv is None else argv)
     try:
-        with handling(signal.default_int_handler, [signal.SIGTERM]):
-            code = _run(argv)
+        as_ctrl_c = handling(signal.default_int_handler, [signal.SIGTERM])
+        with as_ctrl_c, warnings.catch_warnings():
+            refuse_odd(words)
+            warnings.showwarning = print_warning
+            code = int(_root()(args=words, standalone_mode=False) or 0)
+            # the command line library turns a KeyboardInterrupt into this code
+            if code == ABORTED:
+                raise KeyboardInterrupt
         sys.stdout.flush()
     except BrokenPipeError:
         # the rest of the output has no reader
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
-    return code
-
-
-def _run(argv: Sequence[str] | None) -> int:
-    """Run the command line; the exit code."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    try:
-        refuse_odd(words)
-        with warnings.catch_warnings():
-            warnings.showwarning = print_warning
-            code = _root()(args=words, standalone_mode=False)
-        # the command line library turns a KeyboardInterrupt into this code
-        return _aborted() if code == ABORTED else int(code or 0)
     except typer.Exit as done:
         return int(done.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        return _aborted()
-    except BrokenPipeError:
-        raise
+        print("interrupted: no result is written", file=sys.stderr)
+        return ABORTED
     except Exception as error:
-        said: object = error if isinstance(error, SoupError) else refusal(error)
-        if said is None and hasattr(error, "format_message"):
-            # a usage error; it says nothing for a bare command, whose help is printed
-            said = printable(error.format_message())
-        if said is None:
-            return report_bug(error)
-        if said:
-            print(said if isinstance(said, StoppedError) else f"error: {said}", file=sys.stderr)
-        return ABORTED if isinstance(said, StoppedError) else 2
+        return _explained(error)
+    return code
 
 
-def _aborted() -> int:
-    print("interrupted: no result is written", file=sys.stderr)
-    return ABORTED
+def _explained(error: Exception) -> int:
+    """Print what an exception says to the user; the exit code."""
+    said: object = error if isinstance(error, SoupError) else refusal(error)
+    if said is None and hasattr(error, "format_message"):
+        # a usage error; it says nothing for a bare command, whose help is printed
+        said = printable(error.format_message())
+    if said is None:
+        return report_bug(error)
+    stopped = isinstance(said, StoppedError)
+    if said:
+        print(said if stopped else f"error: {said}", file=sys.stderr)
+    return ABORTED if stopped else 2
 
 
-class _Flags:
-    """A command whose flags show no type in its help."""
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        """Options and arguments, `--help` included."""
-        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
-        for param in params:
-            if getattr(param, "is_flag", False):
-                param.metavar = ""
-        return params
-
-
-class Command(_Flags, TyperCommand):
-    """A command of the program."""
-
-
-class LazyGroup(_Flags, TyperGroup):
+class LazyGroup(TyperGroup):
     """A group that imports a command only when it is called, which makes `--help` fast."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
@@ -241,7 +219,7 @@ def _load(name: str, home: str) -> Any:
     module, _, function = home.partition(":")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     function_of = getattr(import_module(f"soup_nlp.cli.{module}"), function)
-    alone.command(name=name, cls=Command)(function_of)
+    alone.command(name=name)(function_of)
     return typer.main.get_command(alone)
 
 
@@ -270,12 +248,9 @@ def _group(text: str, commands: Mapping[str, str], **options: Any) -> typer.Type
         **options,
     )
     for name, home in commands.items():
-        group.command(name=name, help=first_line(home))(_placeholder)
+        # the command itself is imported when it is called
+        group.command(name=name, help=first_line(home))(lambda: None)
     return group
-
-
-def _placeholder() -> None:
-    """Stands for a command until it is called."""
 
 
 def _version(asked: bool) -> None:

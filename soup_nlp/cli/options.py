@@ -137,21 +137,6 @@ def listed(text: str) -> list[str]:
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
-def words(text: str, option: str, known: list[str]) -> list[str]:
-    """Different names of a comma-separated list.
-
-    Raises:
-        ConfigError: the list is empty, or a name is unknown.
-    """
-    names = listed(text)
-    wrong = [name for name in names if name not in known]
-    if wrong or not names:
-        raise ConfigError(
-            "unknown name", where=option, found=", ".join(wrong) or text, expected=", ".join(known)
-        )
-    return names
-
-
 def camera(text: str | None, option: str) -> list[float] | str | None:
     """Value of the key `intrinsics`: four numbers, or the name of a file; None without a text.
 
