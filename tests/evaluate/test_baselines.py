@@ -35,17 +35,6 @@ def made(
     return Pair(image, image, K, K_next, flow), z, R, t
 
 
-def test_recovers_a_rigid_scene(orbit):
-    m = depth_metrics(rigid_depth(orbit), orbit.truth.depth_ref)
-    assert m.mre < 1e-4
-    assert m.coverage == 1.0
-
-
-def test_same_seed_same_answer(orbit):
-    a, b = (rigid_depth(orbit, seed=3) for _ in range(2))
-    np.testing.assert_array_equal(a, b)
-
-
 @pytest.mark.parametrize(("dtype", "rtol"), [(np.float32, 5e-3), (np.float64, 1e-6)])
 @pytest.mark.parametrize(
     ("fx", "fy", "skew", "cx", "cy"),
@@ -124,13 +113,6 @@ def test_dynamic_scene_is_not_rigid():
     m = depth_metrics(found, pair.truth.depth_ref)
     static = depth_metrics(found, pair.truth.depth_ref, mask=pair.truth.components == 0)
     assert static.mre < m.mre < 0.05
-
-
-def test_unknown_pixels_take_the_nearest_depth():
-    z = np.array([[1.0, np.nan, np.nan, 4.0]])
-    np.testing.assert_array_equal(fill_nearest(z), [[1, 1, 4, 4]])
-    full = np.ones((2, 2))
-    assert fill_nearest(full) is not full
 
 
 def test_without_flow_or_motion_there_is_no_baseline(orbit, monkeypatch):

@@ -9,7 +9,7 @@ import pytest
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.data.working_size import scaled_camera, working_size
+from soup_nlp.data.working_size import working_size
 from soup_nlp.geometry.camera import intrinsics, pixel_grid, project, rays
 from soup_nlp.geometry.full_size import grown_labels, plane_depth
 from soup_nlp.pipeline.case import prepare
@@ -60,13 +60,6 @@ def test_what_is_small_enough_is_not_touched():
     pair = plane_pair()
     assert working_size(pair, None) is pair
     assert working_size(pair, 60 * 96 / 1e6) is pair
-
-
-def test_corners_of_a_resized_image_keep_their_rays():
-    other = scaled_camera(K, (60, 96), (20, 48))
-    corner, same = rays(K, [-0.5, -0.5]), rays(other, [-0.5, -0.5])
-    np.testing.assert_allclose(corner, same, rtol=1e-12)
-    np.testing.assert_allclose(rays(K, [95.5, 59.5]), rays(other, [47.5, 19.5]), rtol=1e-12)
 
 
 def test_labels_grow_to_the_edges_of_the_image():

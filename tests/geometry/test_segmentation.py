@@ -216,19 +216,6 @@ def test_boundary_samples_are_spread_over_the_shared_boundary(samples):
     np.testing.assert_allclose(np.sort(seg.boundary[0, :, 1]), rows)
 
 
-def test_all_boundary_pixels_and_samples_are_on_the_boundary(seg, image):
-    for samples in (None, 1, 3, 8):
-        other = build_segmentation(seg.labels, image, neighbours=3, boundary_samples=samples)
-        b = samples or int(other.boundary_length.max())
-        assert other.boundary.shape == (len(other.pairs), b, 2)
-        u, v = other.boundary[..., 0], other.boundary[..., 1]
-        # a midpoint lies between two pixels that carry the pair's two labels
-        one = other.labels[np.floor(v).astype(int), np.floor(u).astype(int)]
-        two = other.labels[np.ceil(v).astype(int), np.ceil(u).astype(int)]
-        ends = np.sort(np.stack([one, two], -1), axis=-1)
-        assert (ends == other.pairs[:, None]).all()
-
-
 def test_rim_points_are_extreme_pixels_of_their_superpixel(seg):
     height, width = seg.labels.shape
     v, u = np.mgrid[0:height, 0:width]
@@ -261,20 +248,3 @@ def test_one_superpixel_has_no_edges_and_no_pairs():
     assert seg.knn.shape == (1, 0)
     np.testing.assert_allclose(seg.anchors, [[4.0, 3.5]])
     assert "1 superpixels" in str(seg)
-
-
-def test_relabelling_renames_edges_and_pairs_only():
-    image = noise(48, 64)
-    labels = segment(image, 12, "grid")
-    other = np.random.default_rng(0).permutation(12).astype(np.int32)
-    a = build_segmentation(labels, image, neighbours=4)
-    b = build_segmentation(other[labels], image, neighbours=4)
-
-    def table(pairs, weight, rename):
-        return {frozenset(rename[p].tolist()): w for p, w in zip(pairs, weight)}
-
-    one = table(a.pairs, a.pair_weight, other)
-    two = table(b.pairs, b.pair_weight, np.arange(12))
-    assert one.keys() == two.keys()
-    assert all(one[k] == pytest.approx(two[k], rel=1e-12) for k in one)
-    np.testing.assert_allclose(a.anchors, b.anchors[other])

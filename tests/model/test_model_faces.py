@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from functools import cache
 
-import casadi as ca
 import numpy as np
 import pytest
 from helpers_model import (
@@ -26,7 +25,6 @@ from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.superpixel import tangent_view
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
 pytestmark = pytest.mark.slow
@@ -149,30 +147,6 @@ def test_derivatives_equal_finite_differences(coordinates, norm, units, at_ancho
     assert_derivatives(nlp, wiggle(nlp, layout.size, 3, 0.05), 4)
 
 
-@pytest.mark.parametrize("gauge", GAUGES)
-def test_every_entry_of_jacobian_and_hessian(gauge):
-    """Column by column, with the name of the entry that disagrees."""
-    nlp, layout = program(gauge, "smooth", "pixels", True)
-    x = wiggle(nlp, layout.size, 7, 0.03)
-    lam_g = np.random.default_rng(8).normal(size=nlp.ng)
-    J, H = nlp.jacobian(x).toarray(), nlp.hessian(x, lam_g).toarray()
-    names, rows = nlp.x_names(), nlp.g_names()
-    scale = 1 + np.abs(H).max()
-
-    def both(y: np.ndarray) -> np.ndarray:
-        """Constraints, then the gradient of the Lagrangian."""
-        return np.append(nlp.constraints(y), lagrangian_gradient(nlp, y, 1.0, lam_g))
-
-    for j in range(0, nlp.nx, 3):
-        v = np.zeros(nlp.nx)
-        v[j] = 1.0
-        column, slope = np.split(directional(both, x, v), [nlp.ng])
-        wrong = np.flatnonzero(np.abs(column - J[:, j]) > 1e-8)
-        assert not len(wrong), f"d {rows[wrong[0]]} / d {names[j]}"
-        wrong = np.flatnonzero(np.abs(slope - H[:, j]) > 1e-8 * scale)
-        assert not len(wrong), f"d2 / d {names[wrong[0]]} d {names[j]}"
-
-
 # --- kinds of Hessian ----------------------------------------------------------------------------
 
 
@@ -264,26 +238,3 @@ def test_machine_code_equals_numpy(coordinates, norm, kind):
 
 
 # --- views ---------------------------------------------------------------------------------------
-
-
-def test_what_two_views_differ_by_is_the_difference_of_both():
-    # of the base of a tangent view: anchor, radius, depth, R0, t0
-    cuts = [0, 3, 4, 5, 14, 17]
-    x, base = ca.SX.sym("x", 18), ca.SX.sym("base", 34)
-    a, b = (
-        tangent_view(x[9 * k : 9 * k + 9], *ca.vertsplit(base[17 * k : 17 * k + 17], cuts))
-        for k in range(2)
-    )
-    points = a.point(ca.SX([0.1, 0.2, 1])), b.point(ca.SX([0.3, -0.1, 1]))
-    pairs = [
-        (a.turn_from(b), a.R - b.R),
-        (a.drift_from(b), a.lam * a.t - b.lam * b.t),
-        (a.next_gap(points[0], b, points[1]), a.move(points[0]) - b.move(points[1])),
-    ]
-    rng = np.random.default_rng(8)
-    turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0].ravel() for _ in range(2)]
-    bases = [np.concatenate([[0.1, -0.2, 1, 0.05, 2.0], R, rng.normal(size=3)]) for R in turns]
-    values = np.tile([1.1, 0.2, -0.1] + [0.3] * 6, 2), np.concatenate(bases)
-    for one, other in pairs:
-        p, q = ca.Function("f", [x, base], [one, other])(*values)
-        np.testing.assert_allclose(np.asarray(p), np.asarray(q), atol=1e-13)

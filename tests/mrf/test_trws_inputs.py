@@ -161,12 +161,6 @@ def test_interruption_in_the_first_pass(monkeypatch):
     assert result.labels.tolist() == unary.argmin(1).tolist()
 
 
-def test_result_is_frozen():
-    result = solve_trws(np.eye(2), NO_EDGES, np.zeros((0, 2, 2)))
-    with pytest.raises(AttributeError):
-        result.energy = 0.0
-
-
 # --- energy -----------------------------------------------------------------------------------
 
 
