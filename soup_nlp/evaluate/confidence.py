@@ -243,20 +243,6 @@ def scale_by_contact(
     return np.hypot(np.hypot(scale, mean), own_place)
 
 
-def _spread(
-    rec: Reconstruction,
-    data: EnergyData,
-    weights: Weights,
-    form: FormulationOptions,
-    component: Int,
-    K_ref: Float,
-) -> tuple[Marginals, Float]:
-    """Marginals, and (H, W) standard deviation of log depth by them."""
-    info = information(rec.soup, data, weights, form)
-    own = marginals(info, np.bincount(rec.labels.ravel()), component)
-    return own, spread_in_image(info, own.plane, rec.labels, K_ref)
-
-
 def confidence(
     rec: Reconstruction,
     pair: Pair,
@@ -278,11 +264,15 @@ def confidence(
         given: A depth prior, a measurement with an error of its own.
     """
     assert pair.flow is not None
+    sizes = np.bincount(rec.labels.ravel())
     weak = weights.replace(prior=PRIOR_SHARE * weights.prior, depth=0.0, order=0.0)
     blind = weak.replace(proj=FLOW_SHARE * weights.proj)
     try:
-        (own, seen), (without, guessed) = (
-            _spread(rec, data, w, form, start.component, pair.K_ref) for w in (weak, blind)
+        infos = [information(rec.soup, data, w, form) for w in (weak, blind)]
+        own, without = (marginals(info, sizes, start.component) for info in infos)
+        seen, guessed = (
+            spread_in_image(info, m.plane, rec.labels, pair.K_ref)
+            for info, m in zip(infos, (own, without), strict=True)
         )
         spread = np.sqrt(learned(seen**2, guessed**2))
         own = replace(own, component=learned(own.component, without.component))
@@ -299,7 +289,7 @@ def confidence(
     noise, misfit = start.noise, flow_misfit(rec, pair.flow, most)
     found = evidence(rec.soup, data, start.component, noise, pair.focal_sigma)
     far = displacement(rec.soup, data.anchor_ray, start.component)
-    scale = scale_by_contact(own, start, np.bincount(rec.labels.ravel()), far, given)
+    scale = scale_by_contact(own, start, sizes, far, given)
     rigid = np.hypot(scale, found.sigma)
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
     guess = found.guess[start.component] | start.at_rest | (start.tie == FIXED)

@@ -52,7 +52,6 @@ def information(
     data: EnergyData,
     weights: Weights,
     form: FormulationOptions,
-    smoothing: float = SMOOTHING,
 ) -> Information:
     """The information of the energy at a soup.
 
@@ -61,11 +60,10 @@ def information(
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
         form: Visibility and whether kernels are compiled; constraints carry no information.
-        smoothing: Width of all norms, pixels.
     """
     whole = majorant(Formulation.make(dict(form)))
     nlp, layout = build_tangent_nlp(soup, data, weights, whole, "inverse-depth")
-    x, theta = nlp.x0, nlp.thetas(eps=smoothing, eps_pixel=smoothing)
+    x, theta = nlp.x0, nlp.thetas(eps=SMOOTHING, eps_pixel=SMOOTHING)
     matrix = nlp.hessian(x, np.zeros(nlp.ng), theta=theta).tocsr()
     plane, growth = x.reshape(-1, 9)[:, :3], np.zeros((len(data), 9))
     growth[:, :3] = -plane

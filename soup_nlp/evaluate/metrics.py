@@ -107,8 +107,7 @@ def depth_metrics(
         DataError: shapes differ, the rule is unknown, the cap is not positive, or no pixel has a
             truth to compare with.
     """
-    if scale not in get_args(Scale):
-        raise DataError("unknown scale rule", found=repr(scale), expected=list(get_args(Scale)))
+    check_rule(scale)
     z, gt, coverage = _compared(estimate, truth, cap, mask)
     s = _scale(z, gt, scale) if z.size else float("nan")
     z = s * z if clamp is None else np.clip(s * z, *clamp)
@@ -144,6 +143,18 @@ def true_pixels(truth: Float, cap: float | None) -> Mask:
     """Where a true depth is known, positive and within the cap."""
     check_cap(cap)
     return np.isfinite(truth) & (truth > 0) & (truth <= (np.inf if cap is None else cap))
+
+
+def check_rule(scale: object) -> None:
+    """Check that there is a scale rule of this name.
+
+    Raises:
+        DataError: there is none.
+    """
+    if not (isinstance(scale, str) and scale in get_args(Scale)):
+        raise DataError(
+            "unknown scale rule", found=repr_of(scale), expected=", ".join(get_args(Scale))
+        )
 
 
 def check_cap(cap: float | None) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -81,7 +79,7 @@ class Preset:
         )
 
 
-_PRESETS = (
+_ALL = (
     Preset("paper", text="the paper's MRE: every true pixel, one global scale"),
     Preset("best", "mre", text="the scale that minimises the MRE itself, no cap"),
     Preset(
@@ -101,7 +99,7 @@ _PRESETS = (
         " is the median of z_gt / z, not median z_gt over median z",
     ),
 )
-PRESETS: Mapping[str, Preset] = MappingProxyType({p.name: p for p in _PRESETS})
+PRESETS = {p.name: p for p in _ALL}
 """Conventions by name."""
 
 

@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +18,7 @@ from soup_nlp.evaluate.metrics import (
     DepthMetrics,
     Scale,
     check_cap,
+    check_rule,
     depth_metrics,
     sample_at_points,
     true_pixels,
@@ -119,10 +119,7 @@ def evaluate(
             pixel.
     """
     check_cap(cap)
-    if not (isinstance(scale, str) and scale in get_args(Scale)):
-        raise DataError(
-            "unknown scale rule", found=repr_of(scale), expected=", ".join(get_args(Scale))
-        )
+    check_rule(scale)
     depths = _depths(result)
     where = depth if isinstance(depth, str | Path) else "truth"
     gt = _map(depth, "truth") if where == "truth" else read_depth(where, depth_scale)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int, Mask
@@ -88,15 +89,13 @@ def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Int:
         step: Pixels of a side of a cell.
     """
     height, width = keep.shape
+    if min(height, width) <= step:
+        return np.zeros((0, 3), np.int64)
 
     def full(mask: Mask, tall: int, wide: int) -> Mask:
         """(h, w) whether a mask is True in the whole tall x wide window of every cell."""
-        total = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), np.int64)
-        total[1:, 1:] = (~mask).cumsum(0).cumsum(1)
-        v = np.arange(0, height - step, step)[:, None]
-        u = np.arange(0, width - step, step)
-        missing = total[v + tall, u + wide] - total[v, u + wide] - total[v + tall, u] + total[v, u]
-        return missing == 0
+        cells = sliding_window_view(mask, (tall, wide))[::step, ::step]
+        return np.asarray(cells.all(axis=(2, 3)))
 
     whole = full(keep, step + 1, step + 1)
     whole &= full(right, step + 1, step) & full(below, step, step + 1)

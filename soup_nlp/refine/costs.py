@@ -50,8 +50,8 @@ def unary_costs(
         b = slice(a, a + step)
         ray, confidence = data.pixel_ray[every[b]], data.pixel_weight[every[b]]
         target = data.pixel_target[every[b], None]
-        H = p.R[b] - p.T[b][..., :, None] * (p.n[b] / p.D[b][..., None])[..., None, :]
-        y = np.matmul(data.K_next @ H, np.swapaxes(ray, 1, 2)[:, None])
+        H = data.K_next @ p.of_some(b).homographies
+        y = np.matmul(H, np.swapaxes(ray, 1, 2)[:, None])
         used = confidence[:, None] > 0
         ahead[b] = (y[:, :, 2] > 1e-9).all(axis=2, where=used)
         with np.errstate(divide="ignore", invalid="ignore"):

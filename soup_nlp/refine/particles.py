@@ -52,6 +52,12 @@ class Particles:
         """(N, L)."""
         return self.D.shape[0], self.D.shape[1]
 
+    @property
+    def homographies(self) -> Float:
+        """(N, L, 3, 3) `R - T n^T / D`, from rays of the reference frame to those of the next."""
+        scaled = self.n / self.D[..., None]
+        return np.asarray(self.R - self.T[..., :, None] * scaled[..., None, :])
+
     @classmethod
     def of(cls, soup: Soup) -> Particles:
         """A soup as one particle per superpixel."""
@@ -70,8 +76,8 @@ class Particles:
         rows = np.arange(len(self.D))[:, None]
         return Particles(*(a[rows, which] for a in (self.n, self.D, self.R, self.T)))
 
-    def of_some(self, who: Int) -> Particles:
-        """The particles of some superpixels (M,)."""
+    def of_some(self, who: Int | slice) -> Particles:
+        """The particles of some superpixels."""
         return Particles(self.n[who], self.D[who], self.R[who], self.T[who])
 
     def soup(self, labels: Int, share: Float) -> Soup:

@@ -123,8 +123,7 @@ class Photometric:
         """Pixels (u, v) of the next frame, and whether it shows them: (n, L, S) each."""
         n, labels = p.D[b].shape
         ray = self.ray[b].transpose(0, 2, 1)
-        H = p.R[b] - p.T[b][..., :, None] * (p.n[b] / p.D[b][..., None])[..., None, :]
-        H = (self.K_next @ H).reshape(n, labels * 3, 3).astype(np.float32)
+        H = (self.K_next @ p.of_some(b).homographies).reshape(n, labels * 3, 3).astype(np.float32)
         x, y, z = np.moveaxis(np.matmul(H, ray).reshape(n, labels, 3, -1), 2, 0)
         seen = z > 1e-6
         ahead = np.where(seen, z, 1.0)

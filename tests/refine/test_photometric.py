@@ -131,26 +131,6 @@ def test_costs_are_those_of_a_loop(two):
             assert found[i, c] == pytest.approx(7.0 * total / SAMPLES, abs=1e-3)
 
 
-def test_the_truth_agrees_and_the_unseen_costs_what_it_must(two):
-    cost = two.look(two.truth, photo=1.0).costs(Particles.of(two.truth), 1.0)[:, 0]
-    u = two.seg.anchors[:, 0]
-    inside = (u < 38) | ((u > 58) & (u < 76))
-    assert cost[inside].max() < 0.03
-    # eight columns leave the view
-    at_border = np.zeros((HEIGHT, WIDTH))
-    at_border[:, WIDTH - 8 :] = UNSEEN
-    for i in np.unique(two.labels[:, -1]):
-        assert cost[i] == pytest.approx(at_border[two.labels == i].mean(), abs=0.06)
-
-
-def test_what_is_hidden_is_not_held_against_it(two):
-    # the far plane on the right would come to lie behind the near one
-    hidden = two.soup(np.full(two.count, FAR))
-    cost = two.look(two.truth, photo=1.0).costs(Particles.of(hidden), 1.0)[:, 0]
-    u = two.seg.anchors[:, 0]
-    np.testing.assert_allclose(cost[(u > 62) & (u < 85)], UNSEEN, atol=1e-6)
-
-
 def test_energy_does_not_depend_on_scale(two):
     photo = two.look(two.truth)
     t = two.truth

@@ -14,11 +14,9 @@ import yaml
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem, make_problem
-from soup_nlp.errors import ConfigError
 from soup_nlp.model.energy_data import PAPER_TERMS
 from soup_nlp.pipeline.run import run
 from soup_nlp.refine.particles import KINDS
-from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.check import check_folder
 
 pytestmark = pytest.mark.slow
@@ -162,17 +160,3 @@ def test_an_interrupted_refinement_keeps_its_best_and_exits_with_1(tmp_path):
     assert len(done.refined.rounds) == 1
     assert not done.good
     assert done.refined.energy["total"] < done.refined.energy_begin["total"]
-
-
-def test_the_section_mirrors_its_record_and_is_strict():
-    problem = make_problem({"input": {"kind": "motorcycle"}})
-    assert problem.refine == RefineOptions()
-    assert problem.refine.particles == 50
-    for wrong in (
-        "refine.particles=1",
-        "refine.proposals=neighbours",
-        "refine.round=3",
-        "refine.rounds=-1",
-    ):
-        with pytest.raises(ConfigError):
-            make_problem({"input": {"kind": "motorcycle"}}, [wrong])

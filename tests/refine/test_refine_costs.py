@@ -91,30 +91,6 @@ def test_every_entry_is_the_energy_of_its_pair():
                 assert table[e, a, b] == pytest.approx(exact, rel=1e-9, abs=1e-12 * table.max())
 
 
-def test_alike_motions_and_planes_cost_exactly_nothing():
-    tiny = Tiny("pixels")
-    one = Particles.of(tiny.soup)
-    n = len(tiny.soup)
-    same = Particles(*(np.repeat(v[:1], n, axis=0) for v in (one.n, one.D, one.R, one.T)))
-    # their anchors differ in depth, and none is in front
-    weights = weights_for("pixels").replace(prior=0.0, depth=0.0, order=0.0)
-    table = PairCosts(tiny.data, weights).tables(same.joined(one))
-    # rotation, translation, gaps and turn vanish; the distances are kept up to rounding
-    assert np.abs(table[:, 0, 0]).max() < 1e-12 * table.max()
-
-
-def test_edges_are_the_union_of_both_graphs_once_each():
-    tiny = Tiny(neighbours=2)
-    costs = PairCosts(tiny.data, weights_for("paper"))
-    found = {tuple(e) for e in costs.edges}
-    assert len(found) == len(costs.edges)
-    assert found == {tuple(e) for e in (*tiny.data.edges, *tiny.data.pairs)}
-    assert (costs.edges[:, 0] < costs.edges[:, 1]).all()
-    for rows, graph in ((costs.arap_row, tiny.data.edges), (costs.cont_row, tiny.data.pairs)):
-        assert np.array_equal(costs.edges[rows >= 0], graph[rows[rows >= 0]])
-        assert (rows >= 0).sum() == len(graph)
-
-
 def test_blocks_and_single_precision_change_no_digit_that_matters(monkeypatch):
     tiny = Tiny("pixels")
     costs = PairCosts(tiny.data, weights_for("pixels"))
