@@ -251,18 +251,14 @@ def placed(
     free[a[behind != 0]] = False
     while (use := ~done[a] & done[b] & (behind != 0)).any():
         c = int(np.argmax(np.bincount(a[use], np.abs(behind[use]), minlength=count)))
-        # by how much c recedes: behind what covers it, and (negative) in front of what it covers
-        lacks = []
+        # c recedes behind what covers it, and comes in front of what it covers
         for sign in (1.0, -1.0):
             some = use & (a == c) & (sign * behind > 0)
-            now = sign * (step - shift[b])[some]
-            gap = quantile(now, length[some], 0.5) if some.any() else IN_FRONT
+            now = sign * (step - shift[b])
+            gap = quantile(now[some], length[some], 0.5) if some.any() else IN_FRONT
             if sign < 0 and (high := some & upper).any():
-                stands = quantile((shift[b] - step)[high], length[high], 0.5) >= STANDING
-                gap = IN_FRONT if stands else gap
-            lacks.append(sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0)
-        # no scale agrees with both
-        shift[c] = sum(lacks) if min(map(abs, lacks)) == 0 else 0.0
+                gap = IN_FRONT if quantile(now[high], length[high], 0.5) >= STANDING else gap
+            shift[c] += sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0
         done[c] = True
     follows = free & ~done & (touch.max(axis=1) > 0)
     shift[follows] = shift[np.argmax(touch, axis=1)[follows]]
