@@ -61,8 +61,6 @@ def image_of(given: ImageLike, where: str) -> Image:
             expected="uint8 (H, W, 3)",
             hint="image / 255, if its values are 0 to 255" if floats else None,
         )
-    if image.size == 0:
-        raise DataError("image has no pixels", where=where, found=image.shape)
     check_image_size(image.shape[1], image.shape[0], "image", where)
     image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[:, :, :3]
     return np.ascontiguousarray(image)

@@ -12,7 +12,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import SCENES, render_scene
 from soup_nlp.data.scenes.everyday import LAYOUTS
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
-from soup_nlp.data.scenes.shapes import Box, Plane, Sheet, Sphere
+from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Plane, Sheet
 from soup_nlp.data.scenes.texture import Texture, fractal_noise, pulse_coverage, value_noise
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera, rotation
@@ -204,12 +204,12 @@ def test_rays_to_points_of_a_sheet_hit_it_there(curvature):
 
 def test_hits_by_hand():
     ahead = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0]])
-    eye = np.array([0.0, 0.0, -5.0])
+    eye, ball = np.array([0.0, 0.0, -5.0]), Ellipsoid((2.0, 2.0, 2.0))
     np.testing.assert_allclose(Plane().intersect(eye, ahead, 0), [5, 5])
     np.testing.assert_allclose(Box((1.0, 1.0, 2.0)).intersect(eye, ahead, 0), [3, np.inf])
-    np.testing.assert_allclose(Sphere(2.0).intersect(eye, ahead, 0), [3, np.inf])
+    np.testing.assert_allclose(ball.intersect(eye, ahead, 0), [3, np.inf])
     np.testing.assert_allclose(Box((1.0, 1.0, 2.0)).intersect(0 * eye, ahead, 0), [2, 2])
-    assert np.isinf(Sphere(2.0).intersect(-eye, ahead, 0)).all()
+    assert np.isinf(ball.intersect(-eye, ahead, 0)).all()
 
 
 def test_a_pose_and_its_inverse():

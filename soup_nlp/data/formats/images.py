@@ -196,22 +196,13 @@ def _colours(path: PathLike, turn: bool) -> NDArray[Any]:
             hint="save it upright (Pillow: ImageOps.exif_transpose), or leave the intrinsics out:"
             " soup-nlp then turns it",
         )
-    if image.ndim == 2:
-        image = image[:, :, None]
+    image = image if image.ndim == 3 else image[:, :, None]
     channels = image.shape[2]
-    if channels not in (1, 3, 4):
+    if channels not in (1, 3, 4) or image.dtype not in (np.uint8, np.uint16):
         raise DataError(
-            "image has an unusual number of channels",
+            "image is neither 8-bit nor 16-bit grey, RGB or RGBA",
             where=path,
-            found=channels,
-            expected="1 (grey), 3 (RGB) or 4 (RGBA)",
-        )
-    if image.dtype not in (np.uint8, np.uint16):
-        raise DataError(
-            "image is neither 8-bit nor 16-bit",
-            where=path,
-            found=image.dtype,
-            expected="uint8 or uint16",
+            found=f"{image.dtype} with {channels} channel(s)",
             hint="convert it to an 8-bit PNG first",
         )
     # OpenCV turns TIFF files itself

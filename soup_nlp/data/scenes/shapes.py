@@ -127,41 +127,16 @@ class Box(Centred):
         return np.stack([across, down], axis=1)
 
 
-@dataclass(frozen=True)
-class Sphere(Shape):
-    """A sphere around the origin.
-
-    Attributes:
-        radius: Unit of length.
-    """
-
-    radius: float
-
-    def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
-        """See `Shape`."""
-        a = np.einsum("ni,ni->n", rays, rays)
-        b = rays @ origin
-        c = origin @ origin - self.radius**2
-        with np.errstate(invalid="ignore"):
-            root = np.sqrt(b * b - a * c)
-        return _first_hit((-b - root) / a, (-b + root) / a)
-
-    def normals(self, points: Float, frame: int) -> Float:
-        """See `Shape`."""
-        return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-    def corners(self) -> Float:
-        """See `Shape`."""
-        return _corner_points((self.radius,) * 3)
-
-
 class Ellipsoid(Centred):
     """An ellipsoid, whose half axes are the half sizes."""
 
     def intersect(self, origin: Float, rays: Float, frame: int) -> Float:
-        """See `Shape`: a sphere in coordinates divided by the half axes."""
-        half = np.asarray(self.half)
-        return Sphere(1.0).intersect(origin / half, rays / half, frame)
+        """See `Shape`: a unit sphere in coordinates divided by the half axes."""
+        o, d = origin / np.asarray(self.half), rays / np.asarray(self.half)
+        a, b, c = np.einsum("ni,ni->n", d, d), d @ o, o @ o - 1
+        with np.errstate(invalid="ignore"):
+            root = np.sqrt(b * b - a * c)
+        return _first_hit((-b - root) / a, (-b + root) / a)
 
     def normals(self, points: Float, frame: int) -> Float:
         """See `Shape`."""

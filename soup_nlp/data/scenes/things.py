@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from soup_nlp.data.scenes.raycast import Body, Part, inverse
-from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Float, Plane, Shape, Sphere
+from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Float, Plane, Shape
 from soup_nlp.data.scenes.texture import Colour, Panels, Texture
 from soup_nlp.geometry import rotation
 
@@ -181,7 +181,7 @@ class SceneBuilder:
             shape: Shape
             if k % 2:
                 up = size * self.uniform(0.85, 1.05)
-                shape, yaw = Sphere(up), self.uniform(0, 360)
+                shape, yaw = Ellipsoid((up, up, up)), self.uniform(0, 360)
             else:
                 half = size * self.uniform([0.75, 0.75, 0.75], [1.0, 1.4, 1.0])
                 shape, up, yaw = Box(half), half[1], self.uniform(20, 70)
