@@ -57,7 +57,9 @@ DATASETS = {
     "folder": "path: {}",
     "tum": "path: {}",
     "sintel": "root: {}, scene: alley_1, frame: 1",
+    "kitti2012": 'root: {}, index: "000001"',
     "kitti2015": 'root: {}, index: "000001"',
+    "vkitti1": 'root: {}, scene: "0001", frame: 0',
     "vkitti2": "root: {}, scene: Scene01, frame: 0",
 }
 SMALL_SPEED = "bench speed --scenes street --sizes 12 --neighbours 4 --seeds 0 --width 64"
