@@ -9,8 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_formulation import NORMS
-from helpers_model import GAUGES, PAPER, TRUNCATED, Tiny, value, wiggle
+from helpers_model import GAUGES, NORMS, PAPER, TRUNCATED, Tiny, value, wiggle
 from helpers_nl import ReadBack, close
 
 from soup_nlp.config.problem import make_problem

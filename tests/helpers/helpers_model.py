@@ -1,9 +1,10 @@
-"""Tiny problems, finite differences and rendered planes that the tests of the model share."""
+"""Tiny problems, finite differences and rendered planes of known energy, for tests of the model."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -309,3 +310,43 @@ def with_graph(data: EnergyData, edges: list[int], pairs: list[int]) -> EnergyDa
     """The data with some rows of the K-NN graph and of the neighbour graph."""
     rows = {**dict.fromkeys(EDGE_FIELDS, edges), **dict.fromkeys(PAIR_FIELDS, pairs)}
     return replace(data, **{k: getattr(data, k)[np.array(v, int)] for k, v in rows.items()})
+
+
+# --- the tiny problem and rendered planes in their units -----------------------------------------
+
+UNITS = ("paper", "pixels")
+NORMS = ("smooth", "epigraph")
+
+
+@cache
+def tiny(units: str = "paper", at_anchors: bool = False) -> Tiny:
+    return Tiny(units, at_anchors)
+
+
+def form(**options) -> Formulation:
+    return Formulation(**{"compiled": False, **options})
+
+
+def assert_same_soup(a: Soup, b: Soup, tolerance: float = 1e-12) -> None:
+    np.testing.assert_allclose(a.lam.sum(), 1.0, rtol=tolerance)
+    for name in ("n", "R", "distance", "translation"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=0, atol=tolerance)
+
+
+WORLDS = {
+    "fronto-parallel, sideways": (plane_pose(2.0), motion((0, 0, 0), (0.1, 0.03, 0))),
+    "fronto-parallel, turning": (plane_pose(3.0), motion((0.5, -1, 2), (0.1, 0.03, 0.2))),
+    "slanted": (plane_pose(2.5, yaw=25, pitch=-30), motion((1, 0.5, -1), (0.02, 0.1, -0.1))),
+    "at rest": (plane_pose(2.0, yaw=10), motion((0, 0, 0), (0, 0, 0))),
+}
+
+
+def world(name: str, units: str, at_anchors: bool) -> tuple[Soup, EnergyData]:
+    pose, move = WORLDS[name]
+    pair = plane_world(pose, move, WIDTH, HEIGHT)
+    seg = build_segmentation(segment(pair.image_ref, 12, "grid"), pair.image_ref, neighbours=5)
+    data = build_energy_data(
+        seg, pair.flow, pair.K_ref, pair.K_next, 8, 0, arap_at_anchors=at_anchors
+    )
+    soup = plane_soup(pose, move, len(seg))
+    return soup, in_pixels(data, soup, seg) if units == "pixels" else data

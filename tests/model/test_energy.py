@@ -6,16 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_formulation import UNITS, WORLDS, form, tiny, world
 from helpers_model import (
     GAUGES,
     K_NEXT,
     K_REF,
     PAPER,
+    UNITS,
+    WORLDS,
     Tiny,
+    form,
     random_soup,
+    tiny,
     value,
     weights_for,
+    world,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st

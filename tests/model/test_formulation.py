@@ -7,8 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_formulation import NORMS, UNITS, assert_same_soup, form, tiny
-from helpers_model import GAUGES, PAPER, random_soup, value, weights_for
+from helpers_model import (
+    GAUGES,
+    NORMS,
+    PAPER,
+    UNITS,
+    assert_same_soup,
+    form,
+    random_soup,
+    tiny,
+    value,
+    weights_for,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

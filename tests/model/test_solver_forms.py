@@ -5,8 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from helpers_formulation import NORMS, UNITS, WORLDS, form, tiny, world
-from helpers_model import GAUGES, PAPER, value, weights_for
+from helpers_model import GAUGES, NORMS, PAPER, UNITS, WORLDS, form, tiny, value, weights_for, world
 
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import TERMS
