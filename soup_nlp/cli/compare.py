@@ -14,13 +14,13 @@ from soup_nlp.bench.processes import machine
 from soup_nlp.bench.solvers.page import (
     by_start,
     conclusion,
+    draw_profiles,
     frame_of_runs,
     neutral,
     of_family,
     page,
     summary,
 )
-from soup_nlp.bench.solvers.profiles import draw_profiles
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import family_tasks, is_family, make_tasks

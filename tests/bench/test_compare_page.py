@@ -10,14 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from soup_nlp.bench.solvers.page import by_start, frame_of_runs, neutral, reached, summary
-from soup_nlp.bench.solvers.page import page as page_of
-from soup_nlp.bench.solvers.profiles import (
+from soup_nlp.bench.solvers.page import (
     _draw_profile,
+    by_start,
     cost_table,
     draw_profiles,
+    frame_of_runs,
+    neutral,
     profile,
+    reached,
+    summary,
 )
+from soup_nlp.bench.solvers.page import page as page_of
 from soup_nlp.bench.study import figure
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
-import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,9 +15,7 @@ from helpers_files import read_ply, write_flo
 
 from soup_nlp.cli.main import main
 from soup_nlp.cli.solve import exit_code
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.pipeline.run import run, solve_pair
 from soup_nlp.report.check import check_folder
 
 pytestmark = pytest.mark.slow
@@ -144,31 +139,6 @@ def test_a_solve_that_stops_early_is_a_result(tmp_path):
     assert check_folder(tmp_path).ok
 
 
-def test_an_interruption_keeps_the_best_iterate():
-    stop = threading.Event()
-    problem = make_problem(
-        {
-            "input": {
-                "kind": "scene", "scene": "orbit", "width": 128, "height": 96
-            },
-            "segmentation": {"superpixels": 30, "neighbours": 5},
-            "flow": {"source": "truth"},
-        }
-    )  # fmt: skip
-    seen = []
-
-    def listener(progress):
-        seen.append(progress)
-        if len(seen) == 3:
-            stop.set()
-
-    result = run(problem, listener=listener, stop=stop)
-    assert result.solution.status == "Interrupted"
-    start = result.solution.energy_start["total"]
-    # the start itself may be kept, known to rounding
-    assert result.solution.energy["total"] <= start * (1 + 1e-9)
-
-
 @pytest.fixture(scope="module")
 def images(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("images")
@@ -229,12 +199,6 @@ def test_bad_input_leaves_no_folder(images, tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_an_unwritable_output_is_refused(images, tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert solve_files(images, tmp_path / "file" / "out") == 2
-    assert "cannot be written" in capsys.readouterr().err
-
-
 def test_zero_flow_gives_a_constant_depth_and_says_so(images, tmp_path):
     assert solve_files(images, tmp_path, flow="zero.flo") in (0, 1)
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -292,25 +256,6 @@ def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
     found = exit_code(fake, 0.2)
     assert found[0] == code
     assert part in found[1]
-
-
-def test_python_functions_do_the_same():
-    pair = render_scene("orbit", 0, 128, 96)
-    result = solve_pair(
-        pair, segmentation={"superpixels": 30, "neighbours": 5}, flow={"source": "truth"}
-    )
-    assert result.metrics["solution"].mre < 0.05
-    assert len(result.soup) == len(result.segmentation)
-    again = make_problem({"input": {"kind": "motorcycle"}}).load_pair()
-    assert again.K_next[0, 2] > again.K_ref[0, 2]
-
-
-def test_the_package_is_a_command():
-    words = [sys.executable, "-m", "soup_nlp", "show", "nothing.yaml"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: ")
-    assert "nothing.yaml" in done.stderr
 
 
 def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch, capsys):

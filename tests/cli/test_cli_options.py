@@ -15,9 +15,8 @@ import pytest
 from helpers_files import write_flo
 
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import make_problem
-from soup_nlp.data.datasets.layout import MARK
 from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.storage.folders import MARK
 
 pytestmark = pytest.mark.slow
 
@@ -155,23 +154,12 @@ def test_a_picture_of_12_bits_names_its_key(white, tmp_path, capsys):
     assert ("warning: " in log) == (white is None)
 
 
-def test_white_reaches_files_too(tmp_path):
-    cv2.imwrite(str(tmp_path / "a.png"), np.full((64, 64, 3), 4095, np.uint16))
-    source = {
-        "kind": "files",
-        "ref": "a.png",
-        "next": "a.png",
-        "intrinsics": [60.0, 60.0, 32.0, 32.0],
-    }
-    problem = make_problem({"input": {**source, "white": 4095}, "base": str(tmp_path)})
-    assert problem.load_pair().image_ref.min() == 255
-
-
 @pytest.mark.parametrize(
     ("words", "code"),
     [
         ("list >&-", 0),
         ("list <&- >&- 2>&-", 0),
+        ("show nothing.yaml", 2),
         # no space for what is printed
         ("--help >/dev/full", 2),
         ("list >/dev/full", 2),
@@ -186,7 +174,8 @@ def test_streams_that_are_closed_or_full(words, code):
         ["sh", "-c", command, sys.executable], env=surroundings, capture_output=True, text=True
     )
     assert done.returncode == code
-    assert ("the system refuses a file" in done.stderr) == (code == 2)
+    assert ("the system refuses a file" in done.stderr) == ("/dev/full" in words)
+    assert done.stderr.startswith("error: ") == (code == 2)
     assert "Traceback" not in done.stderr
 
 
