@@ -146,9 +146,9 @@ def export_case(
         if duals is not None and not duals.residuals.dual <= STATIONARY:
             # multipliers of a point that is not stationary mislead
             duals = None
-        kinds, found = suffixes_of(nlp, names)
+        kinds, segments = suffixes_of(nlp, names)
         lam_g = None if duals is None else duals.lam_g
-        file = write_nl(new / f"{STUB}.nl", nlp, names, lam_g, found if suffixes else ())
+        file = write_nl(new / f"{STUB}.nl", nlp, names, lam_g, segments if suffixes else ())
         if "casadi" in formats:
             for function in FUNCTIONS:
                 # the file writer of CasADi ignores a full disk

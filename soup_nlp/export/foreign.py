@@ -90,10 +90,10 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
 
 
 def _require_same_problem(
-    folder: Path, manifest: Mapping[str, Any], found: Mapping[str, float]
+    folder: Path, manifest: Mapping[str, Any], now: Mapping[str, float]
 ) -> None:
     """Raise ExportError unless the problem has the fingerprint of the export."""
-    for key, value in found.items():
+    for key, value in now.items():
         then = float(manifest["fingerprint"][key])
         if abs(value - then) > SAME * max(1.0, abs(then)):
             raise ExportError(
@@ -111,8 +111,8 @@ def sol_table(imported: Imported) -> list[Kind]:
     state = {k: getattr(run.answer, k) for k in ("lam", "n", "d", "R", "t")}
     facing = run.problem.formulation.min_facing
     with np.errstate(all="ignore"):
-        found = recompute.constraints(state, run.data.rim_ray, facing)
-    rows = [kind(k, v, KKT_LIMIT, superpixels=k != "simplex") for k, v in found.items()]
+        violated = recompute.constraints(state, run.data.rim_ray, facing)
+    rows = [kind(k, v, KKT_LIMIT, superpixels=k != "simplex") for k, v in violated.items()]
     return rows + [kind(k, v, KKT_LIMIT, False) for k, v in imported.violations.items()]
 
 
@@ -151,10 +151,10 @@ def foreign_run(
     It has converged if the solver claims success, the recomputed KKT residuals are within LIMITS
     and KKT_LIMIT, and the exact energy is not above that of the proposal.
     """
-    found = examine(nlp, answer.x, answer.lam_g)
-    r = found.residuals
-    own = layout.unpack(answer.x)
-    soup = own.retracted()
+    examined = examine(nlp, answer.x, answer.lam_g)
+    r = examined.residuals
+    point = layout.unpack(answer.x)
+    soup = point.retracted()
     start, energy = (oracle.energy(s, case.data, case.weights) for s in (case.start.soup, soup))
     good = (
         answer.solved
@@ -169,8 +169,8 @@ def foreign_run(
         status=status,
         converged=good,
         x=answer.x,
-        lam_x=found.lam_x,
-        lam_g=found.lam_g,
+        lam_x=examined.lam_x,
+        lam_g=examined.lam_g,
         objective=nlp.value(answer.x),
         iterations=0,
         seconds=0.0,
@@ -178,13 +178,13 @@ def foreign_run(
         calls={},
     )
     parts = {
-        f"lam_g_{group.kernel.name}": found.lam_g[np.unique(group.table.rows)]
+        f"lam_g_{group.kernel.name}": examined.lam_g[np.unique(group.table.rows)]
         for group in nlp.groups
         if group.kernel.nc
     }
     rest = residuals(nlp, soup, stage, case.data, form.min_facing)
     # a run holds its last iterate in matrices
-    matrices = MatrixLayout(case.data.share, form.gauge).pack(own)
+    matrices = MatrixLayout(case.data.share, form.gauge).pack(point)
     solution = Solution(
         soup=soup,
         status=status,
@@ -193,7 +193,7 @@ def foreign_run(
         energy_start=start,
         energy=energy,
         residuals=rest,
-        multipliers={"lam_x": found.lam_x, **parts},
+        multipliers={"lam_x": examined.lam_x, **parts},
         nlp=nlp.sizes(),
         description=str(nlp),
         seconds={},

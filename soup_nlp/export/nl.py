@@ -190,10 +190,10 @@ def suffix_segment(suffix: Suffix, order: Int) -> Iterator[str]:
     """`S` segment of a suffix, for variables or rows in the order of the file."""
     values = np.asarray(suffix.values)[order]
     real = not np.issubdtype(values.dtype, np.integer)
-    there = np.flatnonzero(values)
-    if len(there):
-        yield f"S{(suffix.of == 'rows') + 4 * real} {len(there)} {suffix.name}"
-        yield from (f"{k} {number(values[k]) if real else values[k]}" for k in there.tolist())
+    nonzero = np.flatnonzero(values)
+    if len(nonzero):
+        yield f"S{(suffix.of == 'rows') + 4 * real} {len(nonzero)} {suffix.name}"
+        yield from (f"{k} {number(values[k]) if real else values[k]}" for k in nonzero.tolist())
 
 
 def start(values: Float, segment: str = "x") -> Iterator[str]:
@@ -306,10 +306,10 @@ def suffixes_of(
 def _owners(group: Group, layout: MatrixLayout | TangentLayout) -> Int | None:
     """(E, 1 or 2) superpixels of each element; None if it has no variables of superpixels."""
     index = group.table.index
-    own = index < layout.count * layout.stride
-    if group.kernel.name == "ridge" or not own[:, 0].all():
+    inside = index < layout.count * layout.stride
+    if group.kernel.name == "ridge" or not inside[:, 0].all():
         return None
-    superpixel = np.where(own, index // layout.stride, index[:, :1] // layout.stride)
+    superpixel = np.where(inside, index // layout.stride, index[:, :1] // layout.stride)
     first = superpixel[:, 0]
     second = np.where(superpixel == first[:, None], -1, superpixel).max(axis=1)
     return np.column_stack([first, second]) if (second >= 0).all() else first[:, None]
@@ -317,12 +317,12 @@ def _owners(group: Group, layout: MatrixLayout | TangentLayout) -> Int | None:
 
 def _labels(owner: Int) -> list[str]:
     """Labels `i` or `i,k`; `i,3` for the third of several elements of a superpixel."""
-    own = [",".join(map(str, row)) for row in owner.tolist()]
-    if len(set(own)) == len(own):
-        return own
+    labels = [",".join(map(str, row)) for row in owner.tolist()]
+    if len(set(labels)) == len(labels):
+        return labels
     seen: dict[str, int] = {}
     out = []
-    for label in own:
+    for label in labels:
         seen[label] = seen.get(label, 0) + 1
         out.append(f"{label},{seen[label]}")
     return out

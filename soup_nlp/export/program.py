@@ -91,11 +91,11 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
                 np.add.at(row_constant, goal[:, k], constant)
     # sums of triplets keep zeros, so that nonlinear entries stay in the structure
     value, row, column = (np.concatenate(column) for column in zip(*linear))
-    own = row == OBJECTIVE
+    in_f = row == OBJECTIVE
     return Program(
         stamped=tuple(stamped),
-        jacobian=sparse.csr_matrix((value[~own], (row[~own], column[~own])), (ng, nx)),
-        gradient=sparse.csr_matrix((value[own], (0 * row[own], column[own])), (1, nx)),
+        jacobian=sparse.csr_matrix((value[~in_f], (row[~in_f], column[~in_f])), (ng, nx)),
+        gradient=sparse.csr_matrix((value[in_f], (0 * row[in_f], column[in_f])), (1, nx)),
         in_rows=in_rows,
         in_objective=in_objective,
         curved_rows=curved_rows | (row_constant != 0),

@@ -224,11 +224,11 @@ def _common(graph: _Graph, nodes: list[int], group: Group) -> set[int]:
         for a in graph.args[node]:
             if a not in support:
                 support[a] = leaf(a)
-        own = frozenset[int]().union(*(support[a] for a in graph.args[node]))
-        support[node] = own
-        if own not in distinct:
-            distinct[own] = len(np.unique(np.sum([mixed[a] for a in own], axis=0)))
-        if distinct[own] <= SHARED_BELOW * group.size:
+        leaves = frozenset[int]().union(*(support[a] for a in graph.args[node]))
+        support[node] = leaves
+        if leaves not in distinct:
+            distinct[leaves] = len(np.unique(np.sum([mixed[a] for a in leaves], axis=0)))
+        if distinct[leaves] <= SHARED_BELOW * group.size:
             common.add(node)
     return common
 

@@ -112,7 +112,7 @@ def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
     if lam_g is not None:
         candidates["solver"] = lam_g
     candidates = {k: v for k, v in candidates.items() if np.isfinite(v).all()}
-    found = []
+    examined = []
     for name, lam in (candidates or {"none": nothing}).items():
         with np.errstate(all="ignore"):
             lam_x = bound_multipliers(nlp, x, lam)
@@ -121,8 +121,8 @@ def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
             np.inf if np.isnan(off[key]) else off[key]
             for key in ("dual_infeasibility", "complementarity")
         )
-        found.append(Optimality(Residuals(primal, dual, gap, name), lam_x, lam))
-    return min(found, key=lambda o: max(o.residuals.dual, o.residuals.complementarity))
+        examined.append(Optimality(Residuals(primal, dual, gap, name), lam_x, lam))
+    return min(examined, key=lambda o: max(o.residuals.dual, o.residuals.complementarity))
 
 
 def bound_multipliers(nlp: NLP, x: Float, lam_g: Float) -> Float:
@@ -220,10 +220,10 @@ class Kind:
         return bool(self.largest <= self.limit)
 
     def __str__(self) -> str:
-        who = "  ".join(f"{i} ({v:.1e})" for i, v in self.worst)
+        listed = "  ".join(f"{i} ({v:.1e})" for i, v in self.worst)
         return (
             f"{'ok  ' if self.ok else 'FAIL'} {self.name:<9} {EQUATIONS[self.name]:<17}"
-            f"{self.largest:>9.1e} {self.limit:>9.1e} {self.count:>6} of {self.total:<6} {who}"
+            f"{self.largest:>9.1e} {self.limit:>9.1e} {self.count:>6} of {self.total:<6} {listed}"
         )
 
 

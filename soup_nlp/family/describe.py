@@ -61,16 +61,16 @@ def classes(nlp: NLP) -> dict[str, Any]:
     return {"objective_class": CLASSES[objective], "constraint_classes": rows}
 
 
-def classification(nlp: NLP, found: dict[str, Any]) -> str:
+def classification(nlp: NLP, kinds: dict[str, Any]) -> str:
     """CUTEst classification such as OQR2-MN-1808-1809.
 
     It has letters for the objective and the constraints, R for twice differentiable, 2 for second
     derivatives, M for a modelling exercise, Y if there are slack variables, n and m.
     """
     place = {word: number for number, word in CLASSES.items()}
-    rows = max(place[c["class"]] for c in found["constraint_classes"].values())
+    rows = max(place[c["class"]] for c in kinds["constraint_classes"].values())
     internal = nlp.x_names()[-1].startswith("s_")
-    letters = LETTERS[place[found["objective_class"]]] + LETTERS[max(rows, 1)]
+    letters = LETTERS[place[kinds["objective_class"]]] + LETTERS[max(rows, 1)]
     return f"{letters}R2-M{'Y' if internal else 'N'}-{nlp.nx}-{nlp.ng}"
 
 

@@ -63,14 +63,14 @@ class Frozen:
         # options of earlier code, whose weights and start are stored in the record
         return make_problem(_present({k: v for k, v in raw.items() if k != "start"}, Problem))
 
-    def weights(self, own: Weights) -> Weights:
-        """Constants of the energy: those of the record where surfaces bend, else `own`.
+    def weights(self, default: Weights) -> Weights:
+        """Constants of the energy: those of the record where surfaces bend, else `default`.
 
         Early records list all constants for surfaces that bend, E_orient's for N = 1,000.
         """
         energy = yaml.safe_load(self.text)["energy"]
         if not self.bending or "bending" not in energy:
-            return own
+            return default
         stored = Weights(**energy["bending"]["weights"])
         return stored.replace(orient=stored.orient * (self.labels.max() + 1) / 1000)
 

@@ -138,14 +138,14 @@ def select(
         "--scenes": (scenes, SCENES),
         "--starts": (starts, STARTS),
     }
-    for where, (asked, there) in known.items():
-        wrong = [str(a) for a in asked if a not in there]
+    for where, (asked, members) in known.items():
+        wrong = [str(a) for a in asked if a not in members]
         if wrong or not len(asked):
             raise ConfigError(
                 "not of the family",
                 where=where,
                 found=", ".join(wrong) or "nothing",
-                expected=", ".join(map(str, there)),
+                expected=", ".join(map(str, members)),
             )
     labels = [_whole(form) for form in forms]
     return [
@@ -159,8 +159,8 @@ def select(
 
 def _whole(form: str) -> str:
     """A formulation completed by the parts of STANDARD."""
-    own = dict(zip(CHOICES, STANDARD.split("/"))) | parse_formulation(form)
-    return "/".join([own.pop("coordinates", own["gauge"]), own["norm"]])
+    words = dict(zip(CHOICES, STANDARD.split("/"))) | parse_formulation(form)
+    return "/".join([words.pop("coordinates", words["gauge"]), words["norm"]])
 
 
 def case_of(record: Frozen, pair: Pair | None = None) -> Case:
@@ -205,9 +205,9 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
 
 def rounded_data(data: EnergyData) -> EnergyData:
     """The energy data with all real numbers rounded."""
-    own = {f.name: getattr(data, f.name) for f in fields(data)}
+    values = {f.name: getattr(data, f.name) for f in fields(data)}
     reals: dict[str, Any] = {
-        k: rounded(v) for k, v in own.items() if np.asarray(v).dtype == np.float64
+        k: rounded(v) for k, v in values.items() if np.asarray(v).dtype == np.float64
     }
     return replace(data, **reals)
 
@@ -244,8 +244,8 @@ def _program(
     data, start = case.data, record.start.normalised(case.data.share)
     depth = rounded(start.depth_at(data.anchor_ray))
     shift = rounded(start.translation / depth[:, None])
-    own = data.anchor_ray, data.radius, data.share, depth, record.start.R, shift
-    base = TangentLayout(*own, exact_chart(data))
+    about = data.anchor_ray, data.radius, data.share, depth, record.start.R, shift
+    base = TangentLayout(*about, exact_chart(data))
     nlp, layout = build_tangent_nlp(soup, data, case.weights, form, layout=base)
     unit = [
         replace(g, table=replace(g.table, data=rounded(g.table.data)))

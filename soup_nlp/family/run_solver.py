@@ -132,9 +132,9 @@ def main(words: list[str] | None = None) -> int:
     with (o.folder / "instancedata.csv").open(newline="") as file:
         rows = list(csv.DictReader(file, delimiter=";"))
     rows = [r for r in rows if all(w in f"{r['name']} {r['file']}" for w in o.words)]
-    found = [run(o.solver, o.folder, row, o.seconds) for row in rows]
-    print(f"{o.solver}: " + ", ".join(f"{found.count(w)} {w}" for w in WORDS))
-    return int("WRONG" in found)
+    verdicts = [run(o.solver, o.folder, row, o.seconds) for row in rows]
+    print(f"{o.solver}: " + ", ".join(f"{verdicts.count(w)} {w}" for w in WORDS))
+    return int("WRONG" in verdicts)
 
 
 if __name__ == "__main__":

@@ -63,11 +63,11 @@ def write_family(
     def rendered(scene: str) -> Pair:
         return load_frozen(scene, chosen[0].size).problem.load_pair()
 
-    for scene, size, own in problems(chosen):
+    for scene, size, members in problems(chosen):
         record = load_frozen(scene, size)
         case = case_of(record, rendered(scene))
-        for form in dict.fromkeys(i.formulation for i in own):
-            starts = [i for i in own if i.formulation == form]
+        for form in dict.fromkeys(i.formulation for i in members):
+            starts = [i for i in members if i.formulation == form]
             shared: Entry = {}
             programs = []
             for instance in starts:
@@ -114,15 +114,15 @@ def _solved(
     message = f"SOUP {VERSION}: best known point of {instance.problem}"
     order = file.variables, file.rows
     write_sol(folder / f"{instance.problem}.sol", x, None, *order, message)
-    found = classes(nlp)
+    kinds = classes(nlp)
     solved = dict(known["solved"].get(instance.problem, {}))
     runs = solved.pop("runs", {})
     r = examine(nlp, x, None).residuals
     return {
         "superpixels": len(case),
         **sizes(nlp, file),
-        **found,
-        "classification": classification(nlp, found),
+        **kinds,
+        "classification": classification(nlp, kinds),
         **qualification(nlp, x),
         "best_known": {
             "objective": _short(nlp.value(x)),

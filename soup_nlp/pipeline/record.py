@@ -224,7 +224,7 @@ def full_size(full: Pair, small: Pair, result: Reconstruction) -> FullSize:
     moved = soup.distance - np.einsum("ni,ni->n", turned, soup.translation)
     source = result.source_next
     shown = np.where(source >= 0, result.labels.ravel()[source], -1).astype(np.int32)
-    there = grown_labels(shown, small.image_next, full.image_next)
-    depth_next = plane_depth(there, turned, moved, full.K_next)
+    labels_next = grown_labels(shown, small.image_next, full.image_next)
+    depth_next = plane_depth(labels_next, turned, moved, full.K_next)
     scores = score_depths(full.truth, {"full": depth_ref.astype(np.float64)})
     return FullSize(depth_ref, depth_next, labels, scores.get("full"))

@@ -139,12 +139,12 @@ def _place(sheet: Pil.Image, image: Image, left: int, top: int, width: int, heig
     sheet.paste(Pil.fromarray(scaled), (left, top))
 
 
-def overview(found: Mapping[str, Picture], title: str) -> Image:
+def overview(drawn: Mapping[str, Picture], title: str) -> Image:
     """The pictures of a result in a grid of three columns.
 
     `_SPARE` ones are left out if they would leave a row incomplete.
     """
-    panels = dict(found)
+    panels = dict(drawn)
     for name in _SPARE:
         if len(panels) % 3:
             panels.pop(name, None)

@@ -264,8 +264,8 @@ def _components(run: Run) -> dict[str, Any]:
     truth = run.pair.truth
     out: dict[str, Any] = {"count": len(run.components)}
     if truth is not None and truth.components is not None:
-        found = component_overlaps(run.components.of_pixel, truth.components)
-        out["truth"] = {str(k): {"component": c, "iou": iou} for k, (c, iou) in found.items()}
+        overlaps = component_overlaps(run.components.of_pixel, truth.components)
+        out["truth"] = {str(k): {"component": c, "iou": iou} for k, (c, iou) in overlaps.items()}
     return out
 
 

@@ -45,7 +45,7 @@ SIDE = 1600
 """Larger side of a picture in the page, pixels; larger pictures are resized."""
 
 
-def page(result: Result, found: Mapping[str, Picture]) -> str:
+def page(result: Result, drawn: Mapping[str, Picture]) -> str:
     """The page of a result: HTML that holds everything it shows."""
     data = {
         "scene": {
@@ -53,17 +53,17 @@ def page(result: Result, found: Mapping[str, Picture]) -> str:
             for key, value in make_scene(result).items()
         },
         "modes": [
-            {"name": name, "word": word, "title": found[name].title,
-             "legend": _legend(found[name]) + NOTES.get(name, "")}
-            for name, word in MODES.items() if name in found
+            {"name": name, "word": word, "title": drawn[name].title,
+             "legend": _legend(drawn[name]) + NOTES.get(name, "")}
+            for name, word in MODES.items() if name in drawn
         ],
     }  # fmt: skip
-    images = {name: _data_uri(picture) for name, picture in found.items()}
+    images = {name: _data_uri(picture) for name, picture in drawn.items()}
     parts = {
         "title": escape(result.name),
         "style": web_file("page.css"),
         "summary": _summary(result),
-        "gallery": "\n".join(_figure(picture, images[name]) for name, picture in found.items()),
+        "gallery": "\n".join(_figure(picture, images[name]) for name, picture in drawn.items()),
         "limits": "\n".join(f"<li>{escape(line)}</li>" for line in limits(result)),
         "components": _components(result),
         "verdict": escape(result.verdict) or "not recorded",

@@ -96,7 +96,7 @@ def pictures(result: Result) -> dict[str, Picture]:
     "depth_ref", "depth_next", "depth_start", "depth_true", "error", "confidence" and "normals".
     Pictures of unknown quantities are left out.
     """
-    found = [
+    drawn = [
         *_images(result),
         *_parts(result),
         *_flow(result),
@@ -105,12 +105,12 @@ def pictures(result: Result) -> dict[str, Picture]:
     error, sigma = relative_error(result), result.array("depth/sigma_ref")
     if error is not None:
         title = "depth error relative to the truth; grey = no truth"
-        found.append(_shares("error", title, _enlarged(error), colourise_error, ERROR_TICKS))
+        drawn.append(_shares("error", title, _enlarged(error), colourise_error, ERROR_TICKS))
     if sigma is not None:
         title = "expected depth error (1 sigma); bright = a guess"
-        found.append(_shares("confidence", title, sigma, colourise_sigma, SIGMA_TICKS))
-    found.append(_normals(result))
-    return {picture.name: picture for picture in found}
+        drawn.append(_shares("confidence", title, sigma, colourise_sigma, SIGMA_TICKS))
+    drawn.append(_normals(result))
+    return {picture.name: picture for picture in drawn}
 
 
 def _images(result: Result) -> list[Picture]:
@@ -189,8 +189,8 @@ def _depths(result: Result) -> list[Picture]:
         if z is None:
             continue
         # the next frame has the scale of the solution
-        own = score if name == "depth_start" else result.summary["metrics"].get("solution", {})
-        colours = colourise_depth(z * float(own.get("scale") or 1.0), near, far)
+        scaled = score if name == "depth_start" else result.summary["metrics"].get("solution", {})
+        colours = colourise_depth(z * float(scaled.get("scale") or 1.0), near, far)
         mre = score.get("mre")
         said = "" if mre is None else f", MRE {mre:.3f}"
         out.append(Picture(name, f"{title}{said}{more}", colours, bar))

@@ -228,12 +228,12 @@ def load(folder: str | Path) -> Result:
     require_layout(tree)
     try:
         metrics = {name: _metrics(row) for name, row in summary["metrics"].items()}
-        found = _result(tree, attrs)
+        loaded = _result(tree, attrs)
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise DataError("result does not hold together", where=place, found=error) from error
     picture = place / "overview.png"
     return replace(
-        found,
+        loaded,
         metrics=metrics,
         summary=summary,
         verdict=_ending(place / "log.txt"),

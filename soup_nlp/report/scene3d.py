@@ -91,9 +91,9 @@ def surface_cells(result: Result, step: int) -> Mask:
     """(h - 1, w - 1) cells of four shown pixels without a jump of the depth."""
     rec = result.reconstruction
     height, width = rec.labels.shape
-    found = triangles(*result.surface, np.isfinite(rec.depth_ref), step)
+    faces = triangles(*result.surface, np.isfinite(rec.depth_ref), step)
     # every cell has two triangles; the first begins at its upper left pixel
-    v, u = np.divmod(found[: len(found) // 2, 0], width)
+    v, u = np.divmod(faces[: len(faces) // 2, 0], width)
     out = np.zeros(((height - 1) // step, (width - 1) // step), bool)
     out[v // step, u // step] = True
     return out

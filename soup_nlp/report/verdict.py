@@ -137,12 +137,12 @@ def _minimum(run: Run) -> list[str]:
         return []
     every = sum(stage.iterations for stage in s.stages)
     made = "refined" if run.refined else "delivered"
-    found = "minimum found by Ipopt" if s.converged else "no minimum reached"
+    outcome = "minimum found by Ipopt" if s.converged else "no minimum reached"
     stages = ", ".join(f"{k} {e:.5g}" for k, e in s.ends.items())
     return [
         f"constrained NLP {s.stages[-1].iterations} iterations of {every}; {made}:"
         f" {DELIVERED[run.delivered]}",
-        f"{found}: E {stages}" if stages else found,
+        f"{outcome}: E {stages}" if stages else outcome,
     ]
 
 

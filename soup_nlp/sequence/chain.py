@@ -132,9 +132,9 @@ def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
                 z1, keep1 = _view(first, frame)
                 z2, keep2 = _view(second, frame)
                 guess = first.still or second.still
-                found = link(a, b, z1, z2, keep1 & keep2, flagged=guess)
+                shared = link(a, b, z1, z2, keep1 & keep2, flagged=guess)
                 every = np.ones_like(keep1)
-                out.append(found or link(a, b, z1, z2, every, flagged=True))
+                out.append(shared or link(a, b, z1, z2, every, flagged=True))
     # consecutive pairs are the first of those that start at a frame
     at = {pair.first: b for b, pair in reversed([*enumerate(pairs)])}
     for a, pair in enumerate(pairs):
@@ -145,7 +145,7 @@ def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
         if frame > pair.second and frame in at:
             other, sure = _view(pairs[at[frame]], frame)
             out.append(link(a, at[frame], z, other, keep & sure, bridge=True))
-    return [found for found in out if found]
+    return [shared for shared in out if shared]
 
 
 def _view(pair: SolvedPair, frame: int) -> tuple[Float, Mask]:
@@ -160,8 +160,8 @@ def _view(pair: SolvedPair, frame: int) -> tuple[Float, Mask]:
 def _carry(z: Float, keep: Mask, still: SolvedPair) -> tuple[Float, Mask]:
     """z (H, W) and mask of the reference frame of a pair without parallax, in its next frame."""
     source = still.result.reconstruction.source_next
-    there = (source >= 0) & (keep & (still.result.components.of_pixel == 0)).ravel()[source]
-    return np.where(there, z.ravel()[source], np.nan), there
+    seen = (source >= 0) & (keep & (still.result.components.of_pixel == 0)).ravel()[source]
+    return np.where(seen, z.ravel()[source], np.nan), seen
 
 
 def solve_scales(total: int, links: Sequence[Link]) -> Float:
@@ -335,8 +335,8 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
     # the background has no track
     share[0], share[:, 0] = 0, 0
     share[share < SAME] = 0
-    found = zip(*linear_sum_assignment(share, maximize=True))
-    return {int(i): int(k) for i, k in found if share[i, k] > 0}
+    matched = zip(*linear_sum_assignment(share, maximize=True))
+    return {int(i): int(k) for i, k in matched if share[i, k] > 0}
 
 
 def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:

@@ -54,11 +54,11 @@ def read_chain(folder: Path) -> tuple[Chain, dict[str, Any]]:
         over = [(int(a), int(b)) for a, b in contents.get("over", ())]
     except (KeyError, TypeError, ValueError) as error:
         raise DataError("chain.json cannot be read", where=folder, found=error) from error
-    found = [
+    solved = [
         read_pair(a, b, folder / "pairs" / f"{a:03d}_{b:03d}")
         for a, b in [*((k, k + 1) for k in range(count - 1)), *over]
     ]
-    return make_chain(found[: count - 1], found[count - 1 :]), contents
+    return make_chain(solved[: count - 1], solved[count - 1 :]), contents
 
 
 def check_chain(folder: Path) -> Iterator[tuple[str, bool]]:
@@ -74,10 +74,12 @@ def check_chain(folder: Path) -> Iterator[tuple[str, bool]]:
     yield "camera poses follow from pairs and scales", _same(poses, recomputed)
 
 
-def _same(stored: Float, found: Float) -> bool:
+def _same(stored: Float, recomputed: Float) -> bool:
     """Whether two arrays are equal up to rounding."""
-    size = float(np.abs(found).max(initial=1.0))
-    return stored.shape == found.shape and bool(np.abs(stored - found).max() <= SAME * size)
+    size = float(np.abs(recomputed).max(initial=1.0))
+    return stored.shape == recomputed.shape and bool(
+        np.abs(stored - recomputed).max() <= SAME * size
+    )
 
 
 def write_fused(path: Path, chain: Chain, contents: Mapping[str, Any]) -> None:

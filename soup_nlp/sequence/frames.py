@@ -103,20 +103,20 @@ def find_images(source: Path) -> list[Path]:
     if root == source:
         every = [root / name for name in glob("*", root_dir=root)]
         images = [p for p in every if p.suffix.lower() in IMAGES]
-        found = [p for p in images if p.match(LAYOUT)] or images
+        chosen = [p for p in images if p.match(LAYOUT)] or images
     else:
         matches = glob(str(source.relative_to(root)), root_dir=root, recursive=True)
-        found = [p for p in (root / name for name in matches) if p.is_file()]
-    names = {*found}
-    found = [p for p in found if names.isdisjoint(_shorter(p))]
-    if len(found) < 2:
+        chosen = [p for p in (root / name for name in matches) if p.is_file()]
+    names = {*chosen}
+    chosen = [p for p in chosen if names.isdisjoint(_shorter(p))]
+    if len(chosen) < 2:
         raise DataError(
             "a sequence needs two images at least",
             where=source,
-            found=len(found),
+            found=len(chosen),
             expected="a folder of images, a pattern in quotes, a video, or scene:NAME",
         )
-    return sorted(found, key=lambda path: [_by_number(part) for part in path.parts])
+    return sorted(chosen, key=lambda path: [_by_number(part) for part in path.parts])
 
 
 def find_depths(images: list[Path]) -> list[Path]:
@@ -140,12 +140,12 @@ def depth_files(folder: Path) -> list[Path]:
     """
     folder = as_path(folder, "folder of depth maps")
     every = [p for p in folder.glob("*") if p.suffix.lower() in DEPTHS]
-    found = [p for p in every if p.name.startswith("depth_")] or every
-    if not found:
+    depths = [p for p in every if p.name.startswith("depth_")] or every
+    if not depths:
         raise DataError(
             "folder holds no depth maps", where=folder, expected="one for every frame of the chain"
         )
-    return sorted(found, key=lambda path: _by_number(path.name))
+    return sorted(depths, key=lambda path: _by_number(path.name))
 
 
 def check_sequence(images: list[Path]) -> None:
@@ -251,16 +251,16 @@ def key_frames(images: Sequence[Path], K: Float, most: int | None = None) -> lis
     read = lru_cache(MAX_STEP + 1)(_small)
     chosen, last = [0], len(images) - 1
     while chosen[-1] < last and (most is None or len(chosen) < most):
-        here = chosen[-1]
-        one, scale = read(images[here])
+        current = chosen[-1]
+        one, scale = read(images[current])
         camera = np.diag([scale, scale, 1.0]) @ K
-        best = here + 1
-        for there in range(here + 1, min(here + MAX_STEP, last) + 1):
-            found = parallax(one, read(images[there])[0], camera)
-            if found is None:
+        best = current + 1
+        for other in range(current + 1, min(current + MAX_STEP, last) + 1):
+            moved = parallax(one, read(images[other])[0], camera)
+            if moved is None:
                 break
-            best = there
-            if found >= KEY_PARALLAX:
+            best = other
+            if moved >= KEY_PARALLAX:
                 break
         chosen.append(best)
     return chosen
@@ -283,10 +283,10 @@ def parallax(one: Image, other: Image, K: Float) -> float | None:
     if start is None or one.shape != other.shape:
         return None
     options = {"winSize": (21, 21), "maxLevel": 4}
-    end, there, _ = cv2.calcOpticalFlowPyrLK(one, other, start, None, **options)
-    again, back, _ = cv2.calcOpticalFlowPyrLK(other, one, end, None, **options)
+    end, forward, _ = cv2.calcOpticalFlowPyrLK(one, other, start, None, **options)
+    again, backward, _ = cv2.calcOpticalFlowPyrLK(other, one, end, None, **options)
     error = np.linalg.norm(start - again, axis=2).ravel()
-    good = (there.ravel() > 0) & (back.ravel() > 0) & (error < 1)
+    good = (forward.ravel() > 0) & (backward.ravel() > 0) & (error < 1)
     if good.sum() < max(MIN_POINTS, MIN_TRACKED * len(good)):
         return None
     p, q = (x.reshape(-1, 2)[good].astype(np.float64) for x in (start, end))

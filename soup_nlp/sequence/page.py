@@ -238,8 +238,8 @@ def _from_first(chain: Chain, track: int, first: int) -> list[RigidMotion]:
 
 def _quaternions(poses: list[RigidMotion]) -> Float:
     """(M, 4) x, y, z, w in the axes of glTF, neighbours in one half of the sphere."""
-    found = np.array([RigidMotion(GLTF @ p.R @ GLTF, p.t).quaternion for p in poses])
-    for k in range(1, len(found)):
-        if found[k] @ found[k - 1] < 0:
-            found[k] *= -1
-    return found
+    quaternions = np.array([RigidMotion(GLTF @ p.R @ GLTF, p.t).quaternion for p in poses])
+    for k in range(1, len(quaternions)):
+        if quaternions[k] @ quaternions[k - 1] < 0:
+            quaternions[k] *= -1
+    return quaternions

@@ -25,9 +25,9 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     """
     if truths is not None and len(truths) != len(chain):
         raise DataError("truth and chain differ in length", found=len(truths), expected=len(chain))
-    own = [*(pair.truth.get("depth_ref") for pair in chain.pairs)]
-    own.append(chain.pairs[-1].truth.get("depth_next"))
-    given = enumerate(own if truths is None else truths)
+    stored = [*(pair.truth.get("depth_ref") for pair in chain.pairs)]
+    stored.append(chain.pairs[-1].truth.get("depth_next"))
+    given = enumerate(stored if truths is None else truths)
     known = {k: z for k, z in given if z is not None and true_pixels(z, None).any()}
     if not known:
         return None
@@ -90,13 +90,13 @@ def link_rows(contents: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def score_text(found: Mapping[str, Any]) -> str:
+def score_text(scores: Mapping[str, Any]) -> str:
     """The scores of a sequence in one sentence."""
     text = (
-        f"MRE {found['mre_own_scale']:.4f} with a scale for every frame,"
-        f" {found['mre_one_scale']:.4f} with one for the sequence ({found['cost']:+.1%})"
+        f"MRE {scores['mre_own_scale']:.4f} with a scale for every frame,"
+        f" {scores['mre_one_scale']:.4f} with one for the sequence ({scores['cost']:+.1%})"
     )
-    if path := found["path"]:
+    if path := scores["path"]:
         text += f"; camera path off by {path['share']:.2%} of its length after a similarity"
     return text
 
@@ -116,17 +116,17 @@ def chain_lines(chain: Chain, contents: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def score_lines(found: Mapping[str, Any] | None) -> list[str]:
+def score_lines(scores: Mapping[str, Any] | None) -> list[str]:
     """Scores by frame as lines of text."""
-    if found is None:
+    if scores is None:
         return ["the truth knows no pixel of any frame"]
     rows = [
         f"{f['frame']:>5}{f['mre_own_scale']:>12.4f}{f['mre_one_scale']:>12.4f}"
         f"{f['coverage']:>10.1%}"
-        for f in found["frames"]
+        for f in scores["frames"]
     ]
     head = f"{'frame':>5}{'own scale':>12}{'one scale':>12}{'coverage':>10}"
-    return ["MRE of the depth, median scales, no depth cap", head, *rows, score_text(found)]
+    return ["MRE of the depth, median scales, no depth cap", head, *rows, score_text(scores)]
 
 
 def path_error(chain: Chain) -> dict[str, float] | None:
@@ -140,11 +140,11 @@ def path_error(chain: Chain) -> dict[str, float] | None:
         # component 0 of a truth is the static scene
         pose = pose @ np.linalg.inv(m[0])
         true.append(pose[:3, 3])
-    there = np.array(true)
-    length = float(np.linalg.norm(np.diff(there, axis=0), axis=1).sum())
-    if length == 0 or len(there) < 3:
+    target = np.array(true)
+    length = float(np.linalg.norm(np.diff(target, axis=0), axis=1).sum())
+    if length == 0 or len(target) < 3:
         return None
-    error = there - aligned(np.array([m.t for m in chain.world_from_camera]), there)
+    error = target - aligned(np.array([m.t for m in chain.world_from_camera]), target)
     rmse = float(np.sqrt((error**2).sum(axis=1).mean()))
     return {"rmse": rmse, "length": length, "share": rmse / length}
 

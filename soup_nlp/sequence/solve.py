@@ -108,18 +108,18 @@ def solve_chain(
     step = _step(stride)
     # frames of a video, or of arrays, are written before their number is known
     claim(folder, SINGLE, overwrite, subject)
-    found = _frames(frames, folder, camera, step, most, depth_scale)
-    count = len(found)
+    chosen = _frames(frames, folder, camera, step, most, depth_scale)
+    count = len(chosen)
     claim(folder, chain_files(count), overwrite, subject)
     which = [(k, k + 1) for k in range(count - 1)]
     over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
     if begin:
-        begin(found, len(which) + len(over))
-    found = one_camera(found, overrides)
-    pairs = solve_pairs(found, [*which, *over], folder, overrides, workers, say)
+        begin(chosen, len(which) + len(over))
+    chosen = one_camera(chosen, overrides)
+    pairs = solve_pairs(chosen, [*which, *over], folder, overrides, workers, say)
     chain = make_chain(pairs[: len(which)], pairs[len(which) :])
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
-        write_chain(new, chain, name, found.names, over)
+        write_chain(new, chain, name, chosen.names, over)
     return chain
 
 
