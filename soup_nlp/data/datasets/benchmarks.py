@@ -48,27 +48,20 @@ class _Kitti(NamedTuple):
     calibration: str
     projections: tuple[str, str]
     disparity: str
-    layout: str
+
+    @property
+    def layout(self) -> str:
+        """Its files, for messages."""
+        return (
+            f"training/{self.images}/NNNNNN_10.png and _11.png, training/{self.calibration}/"
+            f"NNNNNN.txt ({', '.join(self.projections)}); optional {self.disparity}, flow_occ,"
+            " flow_noc, obj_map with NNNNNN_10.png"
+        )
 
 
 _KITTI = {
-    "kitti2012": _Kitti(
-        "image_0",
-        "calib",
-        ("P0", "P1"),
-        "disp_occ",
-        "training/image_0/NNNNNN_10.png and _11.png, training/calib/NNNNNN.txt (P0, P1); optional "
-        "disp_occ, flow_occ, flow_noc with NNNNNN_10.png",
-    ),
-    "kitti2015": _Kitti(
-        "image_2",
-        "calib_cam_to_cam",
-        ("P_rect_02", "P_rect_03"),
-        "disp_occ_0",
-        "training/image_2/NNNNNN_10.png and _11.png, training/calib_cam_to_cam/NNNNNN.txt "
-        "(P_rect_02, P_rect_03); optional disp_occ_0, flow_occ, flow_noc, obj_map with "
-        "NNNNNN_10.png",
-    ),
+    "kitti2012": _Kitti("image_0", "calib", ("P0", "P1"), "disp_occ"),
+    "kitti2015": _Kitti("image_2", "calib_cam_to_cam", ("P_rect_02", "P_rect_03"), "disp_occ_0"),
 }
 
 _VKITTI = {

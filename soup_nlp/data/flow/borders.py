@@ -49,13 +49,15 @@ def follow_flow(
     """
     current = labels.astype(np.int64)
     count = int(current.max()) + 1
-    fit, _ = fit_affine(flow, current, count)
-    refit = False
+    fit, _ = fit_affine(flow, current)
+    changed = np.zeros(count, bool)
     near = np.ones(current.shape, bool)
     for sweep in range(SWEEPS):
-        if refit and sweep % REFIT == 0:
-            fit, _ = fit_affine(flow, current, count)
-            refit, near[:] = False, True
+        if changed.any() and sweep % REFIT == 0:
+            new, _ = fit_affine(flow, current, changed)
+            for old, values in zip(vars(fit).values(), vars(new).values()):
+                old[changed] = values[changed]
+            changed[:], near[:] = False, True
         framed = np.pad(current, 1, mode="edge")
         sides = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
         # only pixels near a change of the last sweep can change
@@ -71,7 +73,7 @@ def follow_flow(
         moved = best != own
         if not moved.any():
             break
-        refit = True
+        changed[own[moved]] = changed[best[moved]] = True
         current[v[moved], u[moved]] = best[moved]
         near[:] = False
         near[v[moved], u[moved]] = True
@@ -129,7 +131,7 @@ class AffineFlow:
 
 
 def fit_affine(
-    flow: Flow, labels: NDArray[np.integer], count: int | None = None
+    flow: Flow, labels: NDArray[np.integer], only: NDArray[np.bool_] | None = None
 ) -> tuple[AffineFlow, Float]:
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
@@ -140,14 +142,14 @@ def fit_affine(
     Args:
         flow: Flow, whose confidence multiplies the weights.
         labels: (H, W) superpixel labels 0..N-1.
-        count: N; None if the last label occurs.
+        only: (N,) superpixels to fit, the others being unknown; None for all.
 
     Returns:
         The fits, and the last weights (P,) of the pixels with positive confidence.
     """
-    v, u = np.nonzero(flow.confidence > 0)
-    which = labels[v, u].astype(np.int64)
-    n = int(labels.max()) + 1 if count is None else count
+    use = flow.confidence > 0
+    v, u = np.nonzero(use if only is None else use & only[labels])
+    which, n = labels[v, u].astype(np.int64), int(labels.max()) + 1 if only is None else len(only)
     base = flow.confidence[v, u].astype(np.float64)
     total = np.maximum(np.bincount(which, base, n), 1e-30)
     centre = np.stack([np.bincount(which, base * x, n) / total for x in (u, v)], axis=1)
@@ -155,8 +157,9 @@ def fit_affine(
     # coordinates are normalised by the size of the superpixel
     fit = AffineFlow(np.zeros((n, 3, 2)), centre, np.sqrt(np.maximum(pixels, 1)), pixels >= 6)
     X = fit.basis(which, u, v)
-    Y = flow.uv[v, u].astype(np.float64)
-    r = np.linalg.norm(Y - np.stack([_medians(which, y, n) for y in Y.T], axis=1)[which], axis=1)
+    uv = flow.uv[v, u]
+    Y = uv.astype(np.float64)
+    r = np.linalg.norm(Y - np.stack([_medians(which, y, n) for y in uv.T], axis=1)[which], axis=1)
     s = np.maximum(1.48 * _medians(which, r, n), SCALE_PX)
     weight = 1.0 / (1.0 + (r / s[which]) ** 2)
     C = fit.coefficients
@@ -170,7 +173,7 @@ def fit_affine(
     return AffineFlow(C, fit.centre, fit.size, fit.known), weight
 
 
-def _medians(which: Int, values: Float, n: int) -> Float:
+def _medians(which: Int, values: NDArray[np.floating], n: int) -> Float:
     """(N,) lower median of the values (P,) of every superpixel; 0 without values."""
     order = np.argsort(values)
     # numpy sorts 16 bits by their digits, which is much faster
