@@ -149,6 +149,17 @@ def test_superpixels_end_at_steps_of_a_prior_that_no_flow_confirms(pan, swing):
     np.testing.assert_array_equal(cut(swing, swing.depth).labels, cut(swing, None).labels)
 
 
+def test_the_number_of_superpixels_does_not_change_what_a_prior_is_found_to_be(swing):
+    found = []
+    for count in (300, 450):
+        raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": count}}
+        pair = replace(swing.pair, depth_prior=swing.depth * np.exp(0.2 * WAVE))
+        given = prepare(make_problem(raw), pair=pair).given
+        found.append(given.as_dict() | {"held": None})
+        assert len(given.held) > 0.9 * count
+    assert found[0] == found[1]
+
+
 @pytest.mark.parametrize("wrong", ["constant", "smooth", "upside down", "unknown", "pixels"])
 def test_a_wrong_prior_changes_nothing(swing, pan, wrong):
     for seen in (swing, pan):
