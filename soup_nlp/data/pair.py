@@ -178,14 +178,14 @@ class Truth:
             where, what = f"truth.{name}", "part of the truth"
             hint = "soup_nlp.Truth(depth_ref=array); files are read by a problem's input"
             made = array_of(value, what, where, expected, kinds, axes, hint)
-            if made.dtype.kind == "f":
-                # float32 cannot be compared with a limit beyond its range
-                made = made.astype(np.float64)
-            if made.dtype.kind == "f" and (abs(made[np.isfinite(made)]) > LARGEST).any():
+            # float32 cannot be compared with a limit beyond its range
+            made = made.astype(np.float64) if made.dtype.kind == "f" else made
+            most = np.abs(made[np.isfinite(made)]).max(initial=0)
+            if most > LARGEST:
                 raise DataError(
                     f"{what} has numbers whose squares overflow",
                     where=where,
-                    found=f"{np.abs(made[np.isfinite(made)]).max():g}",
+                    found=f"{most:g}",
                     expected=f"at most {LARGEST:g}",
                     hint="NaN marks what is unknown",
                 )
