@@ -110,7 +110,7 @@ def test_dis_confidence_drops_where_nothing_matches() -> None:
     assert confidence[35:55, 45:70].mean() < 0.7 * confidence[65:85, 20:100].mean()
 
 
-def test_without_consistency_every_vector_that_stays_in_the_image_counts_alike() -> None:
+def test_without_consistency_vectors_within_the_image_count_alike() -> None:
     first, second = shifted(80, 100, 4, -2)
     second = second.copy()
     second[30:50, 40:60] = np.dstack([texture(20, 20, seed=5)] * 3)

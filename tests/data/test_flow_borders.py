@@ -55,7 +55,7 @@ def test_borders_move_to_the_break_and_no_other(noise):
 
 
 @pytest.mark.parametrize(("step", "split"), [(0.2, 0), (0.03, 6)])
-def test_borders_move_to_a_step_of_depth_where_it_is_known(step, split):
+def test_borders_move_to_a_known_step_of_depth(step, split):
     before = grid()
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     depth = 0.002 * u + 0.001 * v + step * (u >= EDGE)

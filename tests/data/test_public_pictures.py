@@ -114,7 +114,7 @@ SENSOR = {"FocalPlaneXResolution": 4438.36, "FocalPlaneResolutionUnit": 2}
         ({"FocalLength": 5.0}, 1.2, "1.2 times the longer side.*--fov"),
     ],
 )
-def test_the_focal_length_is_that_of_exif_if_it_is_plausible(
+def test_a_plausible_focal_length_of_exif_is_taken(
     tags: dict[str, float], focal: float, word: str, tmp_path: Path
 ) -> None:
     for name in "ab":
