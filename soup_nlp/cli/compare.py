@@ -23,16 +23,8 @@ from soup_nlp.bench.solvers.page import (
 )
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
-from soup_nlp.bench.solvers.runner import family_tasks, is_family, make_tasks
-from soup_nlp.cli.options import (
-    Coordinates,
-    Formulations,
-    Overwrite,
-    Set,
-    Superpixels,
-    listed,
-    resumable,
-)
+from soup_nlp.bench.solvers.runner import family_tasks, is_family, make_task
+from soup_nlp.cli.options import Coordinates, Overwrite, Set, listed, resumable
 from soup_nlp.config.problem import load_problem, title
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import parse_formulations
@@ -57,15 +49,9 @@ def compare(
     solvers: Annotated[
         str, typer.Option(help="Comma-separated, or all; a program that reads .nl may be named.")
     ] = "all",
-    formulation: Formulations = None,
     coordinates: Coordinates = "matrix",
-    superpixels: Superpixels = None,
     seconds: Annotated[float, typer.Option(help="CPU time limit of a run.")] = 60.0,
     iterations: Annotated[int, typer.Option(help="Iteration limit of a run.")] = 300,
-    presolve: Annotated[
-        bool,
-        typer.Option(help="Begin at the presolve's answer (a confirmation) or the initialisation."),
-    ] = False,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Output folder; default out/solvers-NAMES.")
     ] = None,
@@ -84,13 +70,12 @@ def compare(
         raise ConfigError("no solver is named", where="--solvers", found=solvers)
     for name in names:
         find_solver(name)
-    forms = parse_formulations(formulation, coordinates)
+    parse_formulations(None, coordinates)
     limits = Limits(seconds, iterations)
-    sizes = [[f"segmentation.superpixels={n}"] for n in superpixels or ()] or [[]]
     # load all problems first: a wrong file must not stop after hours of runs
     sets = [path for path in problems if is_family(path)]
     files = [path for path in problems if path not in sets]
-    chosen = [load_problem(path, [*(overrides or []), *size]) for path in files for size in sizes]
+    chosen = [load_problem(path, overrides or []) for path in files]
     written = (*FILES, *(OF_FAMILY if sets else ()))
     subjects = [f"family {path.absolute()}" for path in sets] + [p.subject for p in chosen]
     subject = ", ".join(dict.fromkeys(subjects))
@@ -103,7 +88,7 @@ def compare(
         for path in sets:
             yield from family_tasks(path, limits)
         for problem in chosen:
-            yield list(make_tasks(prepare(problem, presolve), forms, limits, presolve))
+            yield [make_task(prepare(problem), limits, coordinates)]
 
     before: list[Row] = []
     rows: list[Row] = []

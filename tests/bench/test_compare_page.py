@@ -36,6 +36,7 @@ PROBLEMS = Path(__file__).parents[2] / "problems"
 SMALL = [
     "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
     "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",
+    "--set", "segmentation.superpixels=12",
 ]  # fmt: skip
 
 
@@ -48,7 +49,7 @@ def row(
         "energy_start": 9.0, "iterations": 3,
         "cpu_seconds": 1.0, "wall_seconds": 9.0, "peak_bytes": 1 << 20, "status": "a | b",
         "machine": "m", "versions": {"casadi": "3"}, "code": "1", "problem_hash": "0",
-        "start": "presolve", "primal": 0.0, "limits": asdict(Limits()), **more,
+        "start": "easy", "primal": 0.0, "limits": asdict(Limits()), **more,
     }  # fmt: skip
 
 
@@ -172,8 +173,8 @@ def test_rows_belong_to_a_start_and_a_size(tmp_path):
 
 
 def test_command(tmp_path, capsys):
-    words = ["compare", str(PROBLEMS / "orbit.yaml"), "-o", str(tmp_path), "--superpixels", "12"]
-    words += ["--solvers", "ipopt-soup", "--seconds", "20", "--presolve", *SMALL]
+    words = ["compare", str(PROBLEMS / "orbit.yaml"), "-o", str(tmp_path)]
+    words += ["--solvers", "soup-nlp", "--seconds", "20", *SMALL]
     assert main(words) == 0
     rows = [json.loads(x) for x in (tmp_path / "runs.jsonl").read_text().splitlines()]
     assert rows[0]["verified"]
@@ -187,8 +188,8 @@ def test_command(tmp_path, capsys):
 def test_files_are_read_before_anything_runs(tmp_path, capsys):
     words = ["-o", str(tmp_path), "--solvers", "lm,lm", "--seconds", "5", *SMALL]
     orbit = str(PROBLEMS / "orbit.yaml")
-    assert main(["compare", orbit, "orbitt.yaml", "--superpixels", "9", *words]) == 2
-    assert main(["compare", orbit, "--superpixels", "9", "--superpixels", "0", *words]) == 2
+    assert main(["compare", orbit, "orbitt.yaml", *words]) == 2
+    assert main(["compare", orbit, *words, "--set", "segmentation.superpixels=0"]) == 2
     assert "superpixels" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -196,15 +197,15 @@ def test_files_are_read_before_anything_runs(tmp_path, capsys):
 def test_an_input_that_cannot_be_used_leaves_the_others_page(tmp_path, monkeypatch, capsys):
     calls = []
 
-    def second_fails(problem: Problem, presolve: bool) -> Case:
+    def second_fails(problem: Problem) -> Case:
         calls.append(problem)
         if len(calls) == 2:
             raise DataError("image is gone")
-        return prepare(problem, presolve)
+        return prepare(problem)
 
     monkeypatch.setattr("soup_nlp.cli.compare.prepare", second_fails)
     orbit = str(PROBLEMS / "orbit.yaml")
-    words = ["--superpixels", "9", "--solvers", "lm,lm", "--seconds", "5", "--no-presolve"]
+    words = ["--solvers", "lm,lm", "--seconds", "5"]
     out = tmp_path / "out"
     assert main(["compare", orbit, orbit, "-o", str(out), *words, *SMALL]) == 2
     assert "1 runs" in (out / "README.md").read_text()

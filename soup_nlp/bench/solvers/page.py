@@ -29,14 +29,14 @@ LABELS = {
     "energy": "relative gap of the exact energy to the best",
     "objective": "relative gap of the objective to the best",
 }
-CONFIRMATIONS = ("presolve", "easy")
-"""Starts that are solutions."""
+CONFIRMATION = "easy"
+"""The start of the family that is a solution."""
 FEASIBLE = 1e-5
 """Largest violation of a feasible point."""
 LIMITS = (
     "Times are CPU times of one run each, set-up included, on the machine named; so is the limit.",
-    "A confirmation begins at a solution (the presolve's answer, or `easy`): energies hardly move, "
-    "and the comparison is of how quickly a solver proves it. The other starts are the problem.",
+    "A confirmation begins at a solution (`easy`): energies hardly move, and"
+    " the comparison is of how quickly a solver proves it. The other starts are the problem.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
     "Options are those of `soup_nlp/bench/solvers/plugins.py`, the package's own ones being tuned "
@@ -92,7 +92,7 @@ def page(frame: pd.DataFrame) -> str:
         "Verified: KKT residuals and exact energy, recomputed from the solver's point, are those of"
         " an optimum, to one tolerance for all, whether or not it claims one."
     )
-    begun = frame["start"].isin(CONFIRMATIONS)
+    begun = frame["start"] == CONFIRMATION
     facts = [*sorted(frame["machine"].unique()), ", ".join(sorted(packages)), f"code {code}"]
     lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(frame), ""]
     lines += ["![performance profiles](profile.png)"]
@@ -184,7 +184,7 @@ def reached(frame: pd.DataFrame) -> pd.Series:
 def by_start(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Runs of the family by start and size, "hard, N = 100" and so on; `easy` is a confirmation."""
     return {
-        f"{'confirmation' if start in CONFIRMATIONS else start}, N = {n}": group
+        f"{'confirmation' if start == CONFIRMATION else start}, N = {n}": group
         for (start, n), group in frame.groupby(["start", "superpixels"], sort=False)
     }
 

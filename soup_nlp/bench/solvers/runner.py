@@ -42,29 +42,20 @@ KEY = ("problem", "problem_hash", "superpixels", "formulation", "start")
 """Entries of a label that identify a task."""
 
 
-def make_tasks(
-    case: Case, forms: Sequence[Mapping[str, str]], limits: Limits, presolved: bool
-) -> Iterator[tuple[Label, Maker]]:
-    """Label and maker of the task of every formulation.
-
-    `presolved` says that the case starts at the answer of the presolve.
-    """
+def make_task(case: Case, limits: Limits, coordinates: str) -> tuple[Label, Maker]:
+    """Label and maker of the task of a case in its formulation."""
+    form = case.formulation(coordinates=coordinates, hessian="exact", compiled=False)
     ceiling = oracle.energy(case.start.soup, case.data, case.weights)["total"]
-    for chosen in forms:
-        form = case.formulation(**chosen, hessian="exact", compiled=False)
-        label = {
-            "problem": case.problem.name,
-            "problem_hash": case.problem.digest(),
-            "superpixels": len(case),
-            "formulation": form_label(form),
-            "start": "presolve" if presolved else "proposal",
-            "energy_limit": ceiling * (1 + ENERGY_SLACK),
-        }
-
-        def build(hessian: Hessian, form: Formulation = form) -> Program:
-            return *case.nlp(form.replace(hessian=hessian)), form
-
-        yield label, task_maker(case, build, limits)
+    label = {
+        "problem": case.problem.name,
+        "problem_hash": case.problem.digest(),
+        "superpixels": len(case),
+        "formulation": form_label(form),
+        "start": "proposal",
+        "energy_limit": ceiling * (1 + ENERGY_SLACK),
+    }
+    build = lambda hessian: (*case.nlp(form.replace(hessian=hessian)), form)  # noqa: E731
+    return label, task_maker(case, build, limits)
 
 
 def task_maker(case: Case, build: Build, limits: Limits) -> Maker:
