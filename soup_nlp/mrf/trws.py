@@ -40,10 +40,7 @@ class TRWSResult:
         labels: (N,) int64, the best labelling met.
         energy: Its energy by :func:`mrf_energy`, in float64.
         lower_bound: Largest bound met, at most ``energy``; -inf before the first iteration ended.
-        bound_history: (K,) bound after each iteration, as computed (rounding included).
-        energy_history: (K,) energy decoded after each iteration, in the working type.
-        best_history: (K,) least energy up to each iteration, ``init_labels`` included.
-        iterations: K, each one forward and one backward pass.
+        iterations: Number of iterations, each one forward and one backward pass.
         status: ``"gap"``, ``"stagnation"``, ``"iterations"`` or ``"interrupted"``.
         ties: Nodes whose label was a tie, to rounding, when ``labels`` were decoded; 0 if they
             are ``init_labels``.
@@ -52,9 +49,6 @@ class TRWSResult:
     labels: np.ndarray
     energy: float
     lower_bound: float
-    bound_history: np.ndarray
-    energy_history: np.ndarray
-    best_history: np.ndarray
     iterations: int
     status: str
     ties: int
@@ -88,8 +82,8 @@ def solve_trws(
         dtype: float64, or float32 for half the memory; the bound is then exact to that rounding.
         init_labels: (N,) labels that the result is never worse than; they do not steer the method.
         callback: Called after every iteration as ``callback(iteration, bound, energy, best
-            energy)``; a true answer or a KeyboardInterrupt, there or anywhere in the iterations,
-            ends them with status ``"interrupted"``.
+            energy)``, numbers of the working type; a true answer or a KeyboardInterrupt, there or
+            anywhere in the iterations, ends them with status ``"interrupted"``.
 
     Raises:
         ModelError: A cost is not finite in the working type.
@@ -124,10 +118,8 @@ def solve_trws(
     energy = mrf_energy(labels, unary, edges, pairwise)
     if begin is not None and first < energy:
         energy, labels, ties = first, begin, 0  # float32 took a worse labelling for a better one
-    bounds, energies, bests = np.array(rows).reshape(-1, 3).T.copy()
-    bound = min(float(bounds.max(initial=-math.inf)), energy)
-    history = bounds, energies, bests, len(rows)
-    return TRWSResult(labels, energy, bound, *history, status, ties)
+    bound = min(max((row[0] for row in rows), default=-math.inf), energy)
+    return TRWSResult(labels, energy, bound, len(rows), status, ties)
 
 
 def mrf_energy(

@@ -22,8 +22,12 @@ from soup_nlp.model.energy_data import EnergyData
 
 WALKS: Mapping[str, float] = {"walk_plane": 3, "walk_motion": 3, "walk_all": 2}
 """Kinds of random walks around the current belief, and their relative numbers."""
-NEIGHBOURS: Mapping[str, float] = {"neighbour_plane": 3, "neighbour_both": 5}
-"""Kinds that take over what neighbours have: the plane, or plane and motion."""
+NEIGHBOURS: Mapping[str, float] = {
+    "neighbour_plane": 3,
+    "neighbour_motion": 4,
+    "neighbour_both": 5,
+}
+"""Kinds that take over what neighbours have: plane, motion or both."""
 KINDS = ("current", "swept", *WALKS, *NEIGHBOURS)
 """Kinds of particles by number."""
 STEP, WIDTH = 0.5, 1.2
@@ -144,8 +148,12 @@ class Proposer:
         if kind in WALKS:
             return self._walk(soup, kind, count)
         who = self._some(count)
-        Z, g = self._extrapolated(soup, who)
         R, T = soup.R[who], soup.translation[who]
+        if kind == "neighbour_motion":
+            n = np.broadcast_to(soup.n[:, None], T.shape)
+            D = np.broadcast_to(soup.distance[:, None], who.shape)
+            return Particles(n, D, R, T)
+        Z, g = self._extrapolated(soup, who)
         if kind == "neighbour_plane":
             # every other one keeps its motion, the rest take the scale along with the depth
             own = soup.depth_at(self.data.anchor_ray)[:, None]

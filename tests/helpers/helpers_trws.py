@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 from hypothesis import strategies as st
@@ -10,7 +11,7 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
 from soup_nlp.mrf.levels import colours
-from soup_nlp.mrf.trws import TRWSResult
+from soup_nlp.mrf.trws import solve_trws
 
 FOREVER = {"gap": -1.0, "stagnation": -1.0}
 seeds = st.integers(0, 2**32 - 1)
@@ -157,6 +158,14 @@ def random_tree(rng, n):
     return np.array([(name[rng.integers(k)], name[k]) for k in range(1, n)])
 
 
-def rises(result: TRWSResult, slack: float = 1e-10) -> bool:
+def followed(*problem, **options) -> SimpleNamespace:
+    """The result of TRW-S, with bound, energy and least energy of every iteration."""
+    rows = []
+    result = solve_trws(*problem, callback=lambda _, *row: rows.append(row), **options)
+    names = ("bound_history", "energy_history", "best_history")
+    return SimpleNamespace(**vars(result), **dict(zip(names, np.array(rows).reshape(-1, 3).T)))
+
+
+def rises(result: SimpleNamespace, slack: float = 1e-10) -> bool:
     scale = max(1.0, abs(result.energy))
     return bool((np.diff(result.bound_history) >= -slack * scale).all())

@@ -9,6 +9,7 @@ from helpers_trws import (
     brute,
     colour_order,
     dense,
+    followed,
     local_polytope,
     padded,
     ragged,
@@ -21,7 +22,7 @@ from helpers_trws import (
 from hypothesis import given, settings
 
 from soup_nlp.mrf.levels import colours, plan_levels
-from soup_nlp.mrf.trws import mrf_energy, solve_trws
+from soup_nlp.mrf.trws import mrf_energy
 
 # --- the original, node by node ---------------------------------------------------------------
 
@@ -33,7 +34,7 @@ def test_equals_plain_loops(seed):
     unary, edges, tables = ragged(rng, n, int(rng.integers(0, 3 * n + 1)))
     bounds, energies, labellings = textbook(unary, edges, tables, colour_order(n, edges), 8)
     for k in (1, 8):
-        result = solve_trws(*padded(unary, edges, tables), max_iter=k, **FOREVER)
+        result = followed(*padded(unary, edges, tables), max_iter=k, **FOREVER)
         np.testing.assert_allclose(result.bound_history, bounds[:k], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(result.energy_history, energies[:k], rtol=1e-12, atol=1e-12)
         best = int(np.argmin(energies[:k]))
@@ -53,7 +54,7 @@ def test_equals_plain_loops_on_a_grid(monkeypatch):
     )
     unary, tables = rng.random((48, 7)), rng.random((len(edges), 7, 7))
     bounds, energies, _ = textbook(unary, edges, tables, colour_order(48, edges), 5)
-    result = solve_trws(unary, edges, tables, max_iter=5, **FOREVER)
+    result = followed(unary, edges, tables, max_iter=5, **FOREVER)
     np.testing.assert_allclose(result.bound_history, bounds, rtol=1e-12)
     np.testing.assert_allclose(result.energy_history, energies, rtol=1e-12)
     assert rises(result)
@@ -71,7 +72,7 @@ def test_trees_are_exact(seed):
     counts = rng.integers(1, 4, n)
     unary = [rng.normal(size=k) for k in counts]
     tables = [rng.normal(size=(counts[a], counts[b])) for a, b in edges]
-    result = solve_trws(
+    result = followed(
         *padded(unary, edges, tables), max_iter=3000, gap=1e-9, stagnation=1e-13, patience=50
     )
     least = brute(unary, edges, tables)
@@ -87,7 +88,7 @@ def test_bound_linear_program_brute_force_in_this_order(seed):
     n = int(rng.integers(2, 7))
     unary, edges, tables = ragged(rng, n, int(rng.integers(1, 16)), most=4)
     arrays = padded(unary, edges, tables)
-    result = solve_trws(*arrays, max_iter=60)
+    result = followed(*arrays, max_iter=60)
     relaxed, least = local_polytope(unary, edges, tables), brute(unary, edges, tables)
     slack = 1e-7 * max(1.0, abs(least))
     assert result.lower_bound <= relaxed + slack
@@ -104,7 +105,7 @@ def test_bound_linear_program_brute_force_in_this_order(seed):
 def test_binary_bound_reaches_the_relaxation_of_a_frustrated_cycle():
     edges = np.array([[0, 1], [1, 2], [0, 2]])
     table = np.eye(2)[None].repeat(3, axis=0)  # equal neighbours cost 1: one pair must be equal
-    result = solve_trws(np.zeros((3, 2)), edges, table, max_iter=50)
+    result = followed(np.zeros((3, 2)), edges, table, max_iter=50)
     assert local_polytope(np.zeros((3, 2)), edges, table) == pytest.approx(0.0)
     assert result.lower_bound == pytest.approx(0.0)
     assert result.energy == pytest.approx(1.0)
@@ -115,8 +116,8 @@ def test_binary_bound_reaches_the_relaxation_of_a_frustrated_cycle():
 def test_larger_problem_float32_follows_float64():
     rng = np.random.default_rng(5)
     unary, edges, tables = dense(rng, 120, 700, 12)
-    full = solve_trws(unary, edges, tables, max_iter=20, **FOREVER)
-    half = solve_trws(unary, edges, tables, max_iter=20, dtype=np.float32, **FOREVER)
+    full = followed(unary, edges, tables, max_iter=20, **FOREVER)
+    half = followed(unary, edges, tables, max_iter=20, dtype=np.float32, **FOREVER)
     scale = abs(full.energy)
     np.testing.assert_allclose(half.bound_history, full.bound_history, atol=1e-4 * scale)
     assert half.energy == pytest.approx(mrf_energy(half.labels, unary, edges, tables), rel=1e-12)
