@@ -46,54 +46,51 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
             return np.asarray((1 / A[pairs, 2] ** 4).mean(axis=1) ** -0.25)
         return np.full(len(pairs), scene)
 
-    arap = cont = orient = prior = depth = order = 0.0
-    if len(e["edges"]):
-        i, k = e["edges"].T
-        length = unit(e["edges"]) * e["edge_unit"]
-        dR = s["R"][i] - s["R"][k]
-        shift = T[i] - T[k]
-        if bool(e["arap_at_anchors"]):
-            shift = shift + np.einsum("eij,ej->ei", dR, (A[i] + A[k]) / 2)
-        stretch = _length(A[i] - A[k]) - _length(B[i] - B[k])
-        parts = (
-            e["rotation_scale"] * np.sqrt((dR**2).sum((1, 2))),
-            _length(shift) / length,
-            np.abs(stretch) / length,
-        )
-        leak = w["leak_arap"]
-        cut = sum((1 - leak) * np.minimum(p, w["sigma_arap"]) + leak * p for p in parts)
-        arap = float((e["edge_weight"] * cut).sum())
-        apart = _length(e["anchor_ray"][i] - e["anchor_ray"][k])
-        rho = 1 / A[:, 2]
-        change = (rho[i] - rho[k]) / ((rho[i] ** 4 + rho[k] ** 4) / 2) ** 0.25
-        change = np.abs(change - e["prior_relief"])
-        prior = float((e["prior_weight"] * change / apart).sum())
-        off = np.abs(np.log(A[i, 2]) - np.log(A[k, 2]) - e["depth_change"])
-        depth = float((e["depth_weight"] * off).sum())
+    i, k = e["edges"].T
+    length = unit(e["edges"]) * e["edge_unit"]
+    dR = s["R"][i] - s["R"][k]
+    shift = T[i] - T[k]
+    if bool(e["arap_at_anchors"]):
+        shift = shift + np.einsum("eij,ej->ei", dR, (A[i] + A[k]) / 2)
+    stretch = _length(A[i] - A[k]) - _length(B[i] - B[k])
+    parts = (
+        e["rotation_scale"] * np.sqrt((dR**2).sum((1, 2))),
+        _length(shift) / length,
+        np.abs(stretch) / length,
+    )
+    leak = w["leak_arap"]
+    cut = sum((1 - leak) * np.minimum(p, w["sigma_arap"]) + leak * p for p in parts)
+    arap = float((e["edge_weight"] * cut).sum())
+    apart = _length(e["anchor_ray"][i] - e["anchor_ray"][k])
+    rho = 1 / A[:, 2]
+    change = (rho[i] - rho[k]) / ((rho[i] ** 4 + rho[k] ** 4) / 2) ** 0.25
+    change = np.abs(change - e["prior_relief"])
+    prior = float((e["prior_weight"] * change / apart).sum())
+    off = np.abs(np.log(A[i, 2]) - np.log(A[k, 2]) - e["depth_change"])
+    depth = float((e["depth_weight"] * off).sum())
 
     image = lift(s, e["pixel_ray"], every)[1] @ e["K_next"].T
     miss = _length(image[..., :2] / image[..., 2:] - e["pixel_target"])
     proj = float((e["pixel_weight"] * np.minimum(miss, w["sigma_proj"])).sum())
 
-    if len(e["pairs"]):
-        i, k = e["pairs"].T
-        Xi, Yi = lift(s, e["boundary_ray"], i)
-        Xk, Yk = lift(s, e["boundary_ray"], k)
-        factor = e["pair_factor"] / (unit(e["pairs"]) * e["pair_unit"])
-        before = factor * np.sqrt(((Xi - Xk) ** 2).sum((1, 2)))
-        after = factor * np.sqrt(((Yi - Yk) ** 2).sum((1, 2)))
-        gap = np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
-        cont = float((e["pair_weight"] * gap).sum())
-        turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
-        orient = float((e["orient_weight"] * np.minimum(turn, w["sigma_orient"])).sum())
-        middle = e["boundary_ray"].mean(axis=1, keepdims=True)
-        rhos = [1 / lift(s, middle, who)[0][:, 0, 2] for who in (i, k)]
-        sign = np.sign(e["order_weight"])
-        behind, front = np.where(sign > 0, rhos, rhos[::-1])
-        near = ((A[i, 2] ** -4 + A[k, 2] ** -4) / 2) ** 0.25
-        lack = ((1 + e["order_step"]) * behind - front) / near
-        hinge = (lack + np.sqrt(lack**2 + 0.01**2)) / 2
-        order = float((sign * e["order_weight"] * hinge).sum())
+    i, k = e["pairs"].T
+    Xi, Yi = lift(s, e["boundary_ray"], i)
+    Xk, Yk = lift(s, e["boundary_ray"], k)
+    factor = e["pair_factor"] / (unit(e["pairs"]) * e["pair_unit"])
+    before = factor * np.sqrt(((Xi - Xk) ** 2).sum((1, 2)))
+    after = factor * np.sqrt(((Yi - Yk) ** 2).sum((1, 2)))
+    gap = np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
+    cont = float((e["pair_weight"] * gap).sum())
+    turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
+    orient = float((e["orient_weight"] * np.minimum(turn, w["sigma_orient"])).sum())
+    middle = e["boundary_ray"].sum(axis=1, keepdims=True)
+    rhos = [1 / lift(s, middle, who)[0][:, 0, 2] for who in (i, k)]
+    sign = np.sign(e["order_weight"])
+    behind, front = np.where(sign > 0, rhos, rhos[::-1])
+    near = ((A[i, 2] ** -4 + A[k, 2] ** -4) / 2) ** 0.25
+    lack = ((1 + e["order_step"]) * behind - front) / near
+    hinge = (lack + np.sqrt(lack**2 + 0.01**2)) / 2
+    order = float((sign * e["order_weight"] * hinge).sum())
     terms = {"arap": arap, "proj": proj, "cont": cont, "orient": orient, "prior": prior}
     if e["depth_weight"].any():
         terms["depth"] = depth

@@ -57,8 +57,7 @@ def read_pair(first: int, second: int, place: Path) -> SolvedPair:
     """The pair of two frames from its result folder."""
     result = load(place)
     tree = result.tree
-    static = result.components.of_superpixel == 0
-    parallax = float(np.median(tree["start"]["parallax"][static]))
+    parallax = float(np.median(tree["start"]["parallax"][result.components.of_superpixel == 0]))
     # a chain holds many pairs, whose other arrays it does not need
     kept = replace(result, tree={})
     return SolvedPair(first, second, kept, dict(tree.get("truth", {})), parallax)
@@ -133,8 +132,7 @@ def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
                 z2, keep2 = _view(second, frame)
                 guess = first.still or second.still
                 shared = link(a, b, z1, z2, keep1 & keep2, flagged=guess)
-                every = np.ones_like(keep1)
-                out.append(shared or link(a, b, z1, z2, every, flagged=True))
+                out.append(shared or link(a, b, z1, z2, np.ones_like(keep1), flagged=True))
     # consecutive pairs are the first of those that start at a frame
     at = {pair.first: b for b, pair in reversed([*enumerate(pairs)])}
     for a, pair in enumerate(pairs):
@@ -179,20 +177,17 @@ def solve_scales(total: int, links: Sequence[Link]) -> Float:
         raise DataError("a pair shares no pixel with the others", where=f"pair {alone}")
     if total == 1:
         return np.ones(1)
-    rows = np.zeros((len(links), total))
-    at = np.arange(len(links))
-    rows[at, ends[:, 1]] += 1
-    rows[at, ends[:, 0]] -= 1
+    unit = np.eye(total)
+    rows = unit[ends[:, 1]] - unit[ends[:, 0]]
     value = np.array([k.log_ratio for k in links])
     sigma = np.maximum([k.spread for k in links], LEAST_SPREAD)
     # a flagged link gets a low weight
     sigma = np.where([k.flagged for k in links], 10 * np.maximum(sigma, 0.1), sigma)
     A, b = rows[:, 1:] / sigma[:, None], value / sigma
-    first = np.linalg.lstsq(A, b, rcond=None)[0]
+    answer = np.linalg.lstsq(A, b, rcond=None)[0]
     if len(links) > total - 1:
-        answer = least_squares(lambda x: A @ x - b, first, jac=lambda x: A, loss="cauchy")
-        first = answer.x
-    return np.exp(np.concatenate([[0.0], first]))
+        answer = least_squares(lambda x: A @ x - b, answer, jac=lambda x: A, loss="cauchy").x
+    return np.exp(np.concatenate([[0.0], answer]))
 
 
 MADE_BY = "soup_nlp.sequence.solve.solve_pairs(...)"
@@ -299,8 +294,8 @@ def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> 
     """
     for several in (pairs, over):
         expect(several, (list, tuple), "pairs of a chain", MADE_BY)
-    for pair in (*pairs, *over):
-        expect(pair, SolvedPair, "pair of a chain", MADE_BY)
+        for pair in several:
+            expect(pair, SolvedPair, "pair of a chain", MADE_BY)
     if not pairs or [(p.first, p.second) for p in pairs] != [(k, k + 1) for k in range(len(pairs))]:
         raise DataError("pairs of a chain are not consecutive", found=[p.first for p in pairs])
     links = find_links([*pairs, *over])

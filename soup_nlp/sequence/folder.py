@@ -77,9 +77,8 @@ def check_chain(folder: Path) -> Iterator[tuple[str, bool]]:
 def _same(stored: Float, recomputed: Float) -> bool:
     """Whether two arrays are equal up to rounding."""
     size = float(np.abs(recomputed).max(initial=1.0))
-    return stored.shape == recomputed.shape and bool(
-        np.abs(stored - recomputed).max() <= SAME * size
-    )
+    same = stored.shape == recomputed.shape
+    return same and np.allclose(stored, recomputed, rtol=0, atol=SAME * size)
 
 
 def write_fused(path: Path, chain: Chain, contents: Mapping[str, Any]) -> None:

@@ -123,7 +123,7 @@ def exported(tmp_path_factory):
     return out
 
 
-def test_the_file_has_nine_coordinates_and_the_energy_of_the_soup(exported):
+def test_the_file_has_nine_coordinates(exported):
     case, nlp, layout, (v, r), manifest = problem_of(exported)
     assert isinstance(layout, TangentLayout)
     assert manifest["formulation"]["coordinates"] == "tangent"

@@ -271,7 +271,7 @@ def swinging(tmp_path_factory) -> Case:
 
 
 @pytest.mark.parametrize("norm", NORMS)
-def test_two_readers_agree_on_a_pair_with_a_depth_prior_and_an_order(swinging, norm, tmp_path):
+def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, norm, tmp_path):
     data, eps = swinging.data, 2e-5
     form = swinging.formulation(norm=norm, hessian="exact", compiled=False, eps=eps, eps_pixel=eps)
     nlp, layout = swinging.nlp(form)

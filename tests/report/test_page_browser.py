@@ -168,7 +168,7 @@ def test_a_click_tells_depth_sigma_and_component(browser, small_run):
     assert "No point" in browser.value("document.getElementById('picked').textContent")
 
 
-def test_the_least_confidence_hides_points_and_what_is_shown_is_saved(browser, small_run):
+def test_the_least_confidence_hides_points(browser, small_run):
     browser.value("soupView.setMode('image_ref'); soupView.setTime(0); soupView.setFar(1e9)")
     size = "soupView.ply().size"
     browser.value("soupView.setLeast(0)")
