@@ -211,8 +211,7 @@ def surface_motions(
     noise = reference_noise(residual)
     most = systematic_error(noise) + NOISES * noise
     motions = dominant(views, o)
-    fit = views.fit(motions)
-    choice = Choice(motions, np.argmin(fit.penalised(), axis=1), fit)
+    label = np.argmin(views.fit(motions).penalised(), axis=1)
     whole = surface[seg.pairs[:, 0]] == surface[seg.pairs[:, 1]]
     surface = joined(surface, usable, seg)
     bends = np.zeros(len(seg), bool)
@@ -220,7 +219,8 @@ def surface_motions(
     while left:
         every = left.pop()
         at = every[usable[every]]
-        tried = candidates(views, choice, at, noise, o)
+        held = [motions[c] for c in np.unique(label[at])]
+        tried = candidates(views, at, motions[0], held, noise, o.seed)
         given = len(tried)
         tried += _least_median(views, at, noise, o)
         excess = views.some(at).fit(tried).cost - residual[at, None]

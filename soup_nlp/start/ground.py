@@ -15,10 +15,10 @@ from __future__ import annotations
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import BELOW as DOWN
-from soup_nlp.start.components import GROUND, connected_pieces, largest, quantile
+from soup_nlp.start.components import GROUND, connected_pieces, largest, outlines, quantile
 
 LEVEL = 0.92
 """Least cosine between the normal of the ground and the vertical of the image."""
@@ -30,10 +30,9 @@ LEAST_ON, MOST_BELOW = 0.05, 0.05
 STANDS = 1.35
 """Ratio to the inverse depth of the ground from which on a superpixel stands above it; superpixels
 on an outline contain pixels of both sides."""
-WHOLE = 1.15
-"""Largest ratio of depths on a boundary for which both sides are one surface."""
-FLOATS, GAP = 1.25, 1.1
-"""Least ratios to the depth of a region's lower border: of the ground, and of what is below it."""
+STEP, FLOATS = 0.15, 0.2
+"""Least log ratios to the depth of a region on its outline: of another surface, and of the plane of
+the ground along its lower border."""
 FEWEST, MOST_AREA = 3, 0.15
 """Least number of superpixels and least share of the image of a region that floats."""
 IN_FRONT = 0.6
@@ -128,7 +127,7 @@ def above_ground(
 
 
 def floating(
-    soup: Soup, seg: Segmentation, ray: Float, boundary_ray: Float, floor: Float, component: Int
+    soup: Soup, seg: Segmentation, K_ref: Float, floor: Float, component: Int
 ) -> list[tuple[Mask, float]]:
     """Masks (N,) of the regions that float above the ground, and their depth ratios to it.
 
@@ -138,48 +137,38 @@ def floating(
     Args:
         soup: Start, its components scaled.
         seg: Superpixels and graphs.
-        ray: (N, 3) rays of the anchors.
-        boundary_ray: (P, 3) rays of the middles of shared boundaries.
+        K_ref: (3, 3) intrinsics of the reference frame.
         floor: (N,) inverse depth of the ground (`ground`).
         component: (N,) group that moves as one.
     """
     if not floor.any():
         return []
+    ray = rays(K_ref, seg.anchors)
     mu = 1 / soup.depth_at(ray)
-    i, k = seg.pairs.T
-    depth = soup.depth_across(seg.pairs, boundary_ray)
-    plane = np.linalg.lstsq(ray[floor > 0], floor[floor > 0])[0]
-    far = 1 / np.maximum(boundary_ray @ plane, 1e-9)
     stands = (floor == 0) | (mu > STANDS * floor)
     near_ground = ~stands & (mu > (1 - BELOW) * floor)
-    link = np.abs(np.log(depth[0] / depth[1])) < np.log(WHOLE)
-    region = connected_pieces(stands, seg, link & (component[i] == component[k]))
-    # every pair in both directions: own side, other side, gap to it and to the ground
-    own, other = np.concatenate([seg.pairs, seg.pairs[:, ::-1]]).T
-    gap = np.log(np.concatenate([depth[1] / depth[0], depth[0] / depth[1]]))
-    rise = np.log(np.concatenate([far / depth[0], far / depth[1]]))
-    length = np.tile(seg.boundary_length, 2).astype(float)
-    row = np.tile(seg.boundary[..., 1].mean(axis=1), 2)
-    way = seg.anchors[other] - seg.anchors[own]
-    down = way[:, 1] / np.linalg.norm(way, axis=1) > DOWN
-    area = np.bincount(seg.labels.ravel())
+    middle = rays(K_ref, seg.boundary.mean(axis=1))
+    depth = soup.depth_across(seg.pairs, middle)
+    step = np.log(depth[1] / depth[0])
+    i, k = seg.pairs.T
+    whole = (np.abs(step) < STEP) & (component[i] == component[k])
+    region = 1 + connected_pieces(stands, seg, whole)
+    around, across = outlines(region, seg), region[i] != region[k]
+    plane = np.linalg.lstsq(ray[floor > 0], floor[floor > 0])[0]
+    # of every entry of the outlines: log ratios of the depths of other side and ground to the own
+    gap = np.concatenate([step[across], -step[across]])
+    rise = -np.log(depth * np.maximum(middle @ plane, 1e-9))[:, across].ravel()
     out = []
-    for c in np.unique(region[stands]):
-        mine = region == c
-        if mine.sum() < FEWEST or area[mine].sum() > MOST_AREA * area.sum():
+    for c in range(1, int(region.max()) + 1):
+        mine, edge = region == c, around.component == c
+        if mine.sum() < FEWEST or seg.sizes[mine].sum() > MOST_AREA * seg.sizes.sum():
             continue
-        edge = mine[own] & ~mine[other]
-        low = edge & down
-        weight = length * np.maximum(row - seg.anchors[mine, 1].min(), 1.0) ** 2
-        on = low & near_ground[other]
-        if not on.any() or weight[on].sum() < IN_FRONT * weight[low].sum():
+        low = edge & around.below
+        on = low & near_ground[around.neighbour]
+        if not on.any() or around.weight[on].sum() < IN_FRONT * around.weight[low].sum():
             continue
-        behind = length[edge & (gap > np.log(WHOLE))].sum() > IN_FRONT * length[edge].sum()
-        above = quantile(rise[on], weight[on], GROUND)
-        if (
-            behind
-            and above > np.log(FLOATS)
-            and quantile(gap[on], weight[on], GROUND) > np.log(GAP)
-        ):
+        behind = around.contact[edge & (gap > STEP)].sum() > IN_FRONT * around.contact[edge].sum()
+        above, off = (quantile(v[on], around.weight[on], GROUND) for v in (rise, gap))
+        if behind and above > FLOATS and off > STEP:
             out.append((mine, float(np.exp(above))))
     return out

@@ -151,7 +151,8 @@ def _one_motion_each(
         # one motion already, and what a few pixels would change in it is not to be trusted
         if len(at) < PIECE_SIZE or len(np.unique(label[at])) == 1:
             continue
-        tried = candidates(views, choice, at, noise, o)
+        held = [choice.motions[c] for c in np.unique(label[at])]
+        tried = candidates(views, at, choice.motions[0], held, noise, o.seed)
         cost = views.some(at).fit(tried).penalised()
         m = int(np.argmin(np.minimum(cost, CLIP).mean(axis=0)))
         agrees = cost[:, m] < choice.error[at] + gain
@@ -161,19 +162,20 @@ def _one_motion_each(
     return Choice.of(views, motions, label)
 
 
-def candidates(views: Views, choice: Choice, at: Int, noise: float, o: SeededStart) -> list[Motion]:
+def candidates(
+    views: Views, at: Int, main: Motion, held: list[Motion], noise: float, seed: int
+) -> list[Motion]:
     """Candidate motions for superpixels `at`, fitted to all their pixels.
 
-    These are a translation with the main rotation, before and after refinement, the refined present
-    motions of these superpixels, and the motion of their own essential matrix.
+    These are a translation with the rotation of `main`, before and after refinement, the refined
+    motions that the superpixels hold, and the motion of their own essential matrix.
     """
     step = max(1, len(at) * views.ray.shape[1] // PIXELS)
     r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
     w = views.weight[at].ravel()[::step]
     own = r, q, w, views.focal[0]
-    start = [fit_translation(choice.motions[0].R, *own, max(noise, 0.1))]
-    start += [choice.motions[c] for c in np.unique(choice.label[at])]
-    found = estimate(*own, max(3 * noise, 0.3), o.seed)
+    start = [fit_translation(main.R, *own, max(noise, 0.1)), *held]
+    found = estimate(*own, max(3 * noise, 0.3), seed)
     refined = [refine_near(m, *own, max(noise, 0.1)) for m in start]
     return [*refined, start[0], *([] if found is None else [found])]
 

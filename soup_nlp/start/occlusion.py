@@ -30,7 +30,7 @@ from soup_nlp.start.components import (
 from soup_nlp.start.merge import SMALL
 from soup_nlp.start.propose import Start
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import FlowFit, followed
+from soup_nlp.start.views import FlowFit
 
 WIDEST = 8
 """Largest width of a strip beside an outline, pixels."""
@@ -83,7 +83,7 @@ def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
 
     def target(which: Int, at: Float) -> Float:
         # (M, ..., 2) pixels of the next frame
-        moved = followed(fitted.fit, fitted.views, which, rays(pair.K_ref, at))
+        moved = fitted.followed(which, rays(pair.K_ref, at))
         return moved + pair.K_next[:2, 2]
 
     landed = [target(ends[:, e], edge) for e in (0, 1)]

@@ -73,7 +73,7 @@ def _error_under(
         return error
     known = known & (error < CONTRADICTED_PX) & (mu > 0)
     known &= fit.parallax[:, 0] * np.abs(mu) > LEAST_PARALLAX_PX
-    area = np.bincount(seg.labels.ravel()).astype(float)
+    area = seg.sizes.astype(float)
     floor = ground(mu, views.anchor, area, known, o.seed)
     least = (1 - BELOW) * floor
     moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t

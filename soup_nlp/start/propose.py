@@ -8,7 +8,6 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow
-from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import (
@@ -284,13 +283,12 @@ def _on_ground(
     What lies below the ground is lifted, and what floats above it is lowered.
     """
     known = known & (component == largest(component))
-    area = np.bincount(seg.labels.ravel()).astype(float)
+    area = seg.sizes.astype(float)
     floor = ground(1 / soup.depth_at(anchor), anchor, area, known, o.seed)
     soup, lifted = above_ground(soup, anchor, area, known, component, floor)
     tie = np.where(lifted & (tie != FIXED), TIES.index("ground"), tie)
-    middle = rays(K_ref, seg.boundary.mean(axis=1))
     lam, component = soup.lam.copy(), component.copy()
-    for region, farther in floating(soup, seg, anchor, middle, floor, component):
+    for region, farther in floating(soup, seg, K_ref, floor, component):
         # it moves by itself, as its flow says at any depth
         lam[region] *= farther
         component[region] = component.max() + 1

@@ -158,7 +158,7 @@ class FlowFit(NamedTuple):
         poor: (N,) True where these are a neighbour's, because too few pixels have a usable flow.
         fit: (N, 3, 2) affine flow, see `affine_flow`.
         residual: (N,) its mean error, pixels.
-        jump: (P,) jump of the flow on the boundary of every neighbour pair, see `flow_jump`.
+        jump: (P,) mean difference of the affine flows of two neighbours on their boundary, pixels.
     """
 
     views: Views
@@ -173,43 +173,26 @@ class FlowFit(NamedTuple):
     ) -> FlowFit:
         """Fit a flow; arguments and errors are those of `look`."""
         views, poor = look(seg, flow, K_ref, K_next, o)
-        fit, residual = affine_flow(views)
-        jump = flow_jump(fit, views, seg.pairs, rays(K_ref, seg.boundary))
-        return cls(views, poor, fit, residual, jump)
+        found = cls(views, poor, *affine_flow(views), np.zeros(0))
+        edge = rays(K_ref, seg.boundary)
+        one, other = (found.followed(which, edge) for which in seg.pairs.T)
+        return found._replace(jump=np.linalg.norm(one - other, axis=-1).mean(axis=1))
+
+    def followed(self, which: Int, ray: Float) -> Float:
+        """(M, ..., 2) where the affine flows of superpixels `which` (M,) bring rays (M, ..., 3).
+
+        In pixels from the next frame's principal point.
+        """
+        v, wide = self.views, (slice(None), *(None,) * (ray.ndim - 2))
+        off = (ray - v.anchor[which][wide])[..., :2] / v.radius[which][(*wide, None)]
+        moved = self.fit[which, 0][wide] + np.einsum("m...c,mcd->m...d", off, self.fit[which, 1:])
+        return np.asarray(moved)
 
     @property
     def centre(self) -> Float:
         """(N, 3) rays of the next frame to which the anchors move."""
         moved = self.fit[:, 0] / self.views.focal
         return np.concatenate([moved, np.ones((len(moved), 1))], axis=1)
-
-
-def followed(fit: Float, views: Views, which: Int, ray: Float) -> Float:
-    """(M, ..., 2) where affine flows bring rays, pixels from the next frame's principal point.
-
-    Args:
-        fit: (N, 3, 2) affine flow of every superpixel, see `affine_flow`.
-        views: Anchors and radii of every superpixel.
-        which: (M,) superpixel whose flow is followed.
-        ray: (M, ..., 3) rays of the reference frame.
-    """
-    wide = (slice(None), *(None,) * (ray.ndim - 2))
-    off = (ray - views.anchor[which][wide])[..., :2] / views.radius[which][(*wide, None)]
-    moved = fit[which, 0][wide] + np.einsum("m...c,mcd->m...d", off, fit[which, 1:])
-    return np.asarray(moved)
-
-
-def flow_jump(fit: Float, views: Views, pairs: Int, boundary_ray: Float) -> Float:
-    """(P,) mean difference of the affine flows of two neighbours on their boundary, pixels.
-
-    Args:
-        fit: (N, 3, 2) affine flow of every superpixel, see `affine_flow`.
-        views: Anchors and radii of every superpixel.
-        pairs: (P, 2) neighbours.
-        boundary_ray: (P, B, 3) rays of the shared boundaries, reference frame.
-    """
-    ends = [followed(fit, views, which, boundary_ray) for which in pairs.T]
-    return np.linalg.norm(ends[0] - ends[1], axis=-1).mean(axis=1)
 
 
 def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Float, Float]:

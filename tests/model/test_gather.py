@@ -17,7 +17,7 @@ from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import gather
 from soup_nlp.start.propose import propose
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import affine_flow, flow_jump, look
+from soup_nlp.start.views import FlowFit
 
 WIDTH, HEIGHT = 192, 144
 K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -33,12 +33,11 @@ def world():
     pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
     labels, _ = cut_by_part(scene, pair, 100)
     seg = build_segmentation(labels, pair.image_ref, neighbours=10)
-    views, _ = look(seg, pair.flow, K, K, OPTIONS)
-    jump = flow_jump(affine_flow(views)[0], views, seg.pairs, camera.rays(K, seg.boundary))
+    fitted = FlowFit.of(seg, pair.flow, K, K, OPTIONS)
     component = np.array(
         [np.bincount(pair.truth.components[labels == i]).argmax() for i in range(len(seg))]
     )
-    return views, seg, jump, component, unit(pair.truth.motions)
+    return fitted.views, seg, fitted.jump, component, unit(pair.truth.motions)
 
 
 def unit(M: np.ndarray) -> list[Motion]:

@@ -89,8 +89,7 @@ def test_what_is_well_known_stays_below(scene):
 
 
 def street(car: float) -> tuple[Segmentation, np.ndarray, np.ndarray, np.ndarray]:
-    """Segmentation, rays, boundary rays and depth of a road with a car `car` times as far as it
-    stands."""
+    """Segmentation, camera, rays and depth of a road with a car `car` times as far as it stands."""
     side, rows, columns = 8, 20, 30
     labels = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     labels = labels.repeat(side, axis=0).repeat(side, axis=1)
@@ -104,16 +103,16 @@ def street(car: float) -> tuple[Segmentation, np.ndarray, np.ndarray, np.ndarray
     body = (row >= 9) & (row <= 13) & (column >= 10) & (column <= 14)
     foot = HIGH / ((14 * side - height / 2) / 150)
     Z = np.where(body, car * foot, Z)
-    return seg, ray, rays(K, seg.boundary.mean(axis=1)), Z
+    return seg, K, ray, Z
 
 
 @pytest.mark.parametrize("car", [0.5, 1.0])
 def test_what_floats_is_found_with_its_distance(car):
-    seg, ray, middle, Z = street(car)
+    seg, K, ray, Z = street(car)
     body = np.isclose(Z, Z[13 * 30 + 12])
     floor = ground(1 / Z, ray, np.ones(len(Z)), ~body, 0)
     assert floor.any()
-    found = floating(facing(Z), seg, ray, middle, floor, np.zeros(len(Z), int))
+    found = floating(facing(Z), seg, K, floor, np.zeros(len(Z), int))
     if car == 1.0:
         # it stands where it is, and so does the wall
         assert found == []
