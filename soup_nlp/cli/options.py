@@ -10,12 +10,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
 from soup_nlp.config.presets import PRESETS
@@ -223,38 +222,25 @@ class SolveLog(logging.Handler):
         self.lines: list[str] = []
         self._stages = _stages(problem)
         self._detail, self._announced, self._mark = "", set[str](), time.perf_counter()
-        self._bars: Bars | None = None
-        self._task, self._step, self._done = TaskID(0), "", 0
-        if self.console.is_terminal and not quiet:
-            text = TextColumn("{task.description:<13}")
-            left = TextColumn("left"), TimeRemainingColumn(compact=True)
-            columns = (
-                text,
-                BarColumn(20),
-                TimeElapsedColumn(),
-                *left,
-                TextColumn("{task.fields[it]}"),
-            )
-            self._bars = Bars(*columns, console=self.console, transient=True)
+        live = self.console.is_terminal and not quiet
+        name, left = TextColumn("{task.description:<13}"), TextColumn("left")
+        remaining, step = TimeRemainingColumn(compact=True), TextColumn("{task.fields[it]}")
+        columns = name, BarColumn(20), TimeElapsedColumn(), left, remaining, step
+        self._bars = Bars(*columns, console=self.console, transient=True, disable=not live)
+        self._task = self._bars.add_task("", total=None, it="")
+        self._step, self._done = "", 0
 
     def __enter__(self) -> SolveLog:
         self._logger = logging.getLogger(PACKAGE)
         self._level = self._logger.level
         self._logger.setLevel(logging.INFO)
         self._logger.addHandler(self)
-        if self._bars is not None:
-            self._bars.start()
-            self._task = self._bars.add_task("", total=None, it="")
+        self._bars.start()
         self._begin()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._bars is not None:
+    def __exit__(self, *error: object) -> None:
+        if not self._bars.disable:
             self._bars.stop()
         self._logger.removeHandler(self)
         self._logger.setLevel(self._level)
@@ -278,8 +264,6 @@ class SolveLog(logging.Handler):
     def iteration(self, progress: Progress) -> None:
         """Add an iteration of presolve, Ipopt or TRW-S."""
         self.lines.append(str(progress))
-        if self._bars is None:
-            return
         if progress.stage != self._step:
             self._done += bool(self._step)
             self._step = progress.stage
@@ -314,8 +298,7 @@ class SolveLog(logging.Handler):
         """Show the bar of the next stage."""
         name, total = next(iter(self._stages.items()), ("files", None))
         self._step, self._done = "", 0
-        if self._bars is not None:
-            self._bars.reset(self._task, total=total, description=name, it="")
+        self._bars.reset(self._task, total=total, description=name, it="")
 
     def _print(self, line: str) -> None:
         if not self.quiet:

@@ -176,9 +176,23 @@ def broken(folder: Path) -> list[str]:
     return wrong + sorted(n for n in own - listed.keys() if not n.startswith(".soup_nlp"))
 
 
-def table(kills: int, names: Sequence[str], seed: int = 0) -> list[dict[str, object]]:
+Rows = list[dict[str, object]]
+
+
+def told(rows: Rows, **row: object) -> None:
+    """Add a row and print it."""
+    rows.append(row)
+    print(json.dumps(row), flush=True)
+
+
+def unfinished(*folders: Path) -> list[str]:
+    """Temporary files of the program in some folders."""
+    return [n for p in folders if p.is_dir() for n in os.listdir(p) if ".soup_nlp-" in n]
+
+
+def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
     """One row per kill, and one per command for the run after all of its kills."""
-    rng, rows = random.Random(seed), []
+    rng, rows = random.Random(seed), Rows()
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         (root / "tmp").mkdir()
@@ -186,33 +200,24 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> list[dict[str, obj
         every = commands(root, names)
         try:
             for command in every:
+                name, folder = command.name, command.folder
                 _, seconds = run(command.words)
                 share = kills // len(every) + (command is every[0]) * (kills % len(every))
                 for k in range(share):
                     word = list(SIGNALS)[k % len(SIGNALS)]
-                    writing = k % 8 >= 4
-                    how = "before"
+                    writing, how = k % 8 >= 4, "before"
                     while how == "before":
                         delay = rng.uniform(0, 0.1 if writing else seconds)
                         how, spent = disturbed(command, SIGNALS[word], delay, writing)
                         seconds = spent if how == "before" and not writing else seconds
                     time.sleep(0.3)
                     when = f"writing + {delay:.3f} s" if writing else f"{delay:.2f} s"
-                    row = {"command": command.name, "signal": word, "when": when, "ended": how}
-                    rows.append(row | {"broken": broken(command.folder)})
-                    print(json.dumps(rows[-1]), flush=True)
-                code, _ = run(command.words)
-                places = [p for p in (root, command.folder, command.folder / "pairs") if p.is_dir()]
-                names_left = [n for p in places for n in os.listdir(p)]
-                names_left = [n for n in names_left if ".soup_nlp-" in n] + os.listdir(root / "tmp")
-                row = {
-                    "command": command.name,
-                    "signal": "none",
-                    "when": "",
-                    "ended": f"exit {code}",
-                }
-                rows.append(row | {"broken": broken(command.folder), "left": names_left})
-                print(json.dumps(rows[-1]), flush=True)
+                    bad = broken(folder)
+                    told(rows, command=name, signal=word, when=when, ended=how, broken=bad)
+                ended = f"exit {run(command.words)[0]}"
+                left = unfinished(root, folder, folder / "pairs") + os.listdir(root / "tmp")
+                bad = broken(folder)
+                told(rows, command=name, signal="none", ended=ended, broken=bad, left=left)
         finally:
             tempfile.tempdir = None
             del os.environ["TMPDIR"]
@@ -248,24 +253,9 @@ def fill(folder: Path) -> None:
             file.flush()
 
 
-def on_disk(command: Command, place: Path, states: Sequence[str], size: int) -> Iterator[dict]:
-    """Rows of a command on a file system, one for each state of it."""
-    target = place / command.name
-    words = [w.replace(str(command.folder), str(target)) for w in command.words]
-    with disk(place, size):
-        for state in states:
-            before = listed(target)
-            if state == "taken":
-                fill(place)
-            row = {"command": command.name, "disk": state, "size": size, "exit": run(words)[0]}
-            row |= {"broken": broken(target), "earlier kept": listed(target) == before}
-            places = [p for p in (place, target) if p.is_dir()]
-            yield row | {"left": [n for p in places for n in os.listdir(p) if ".soup_nlp-" in n]}
-
-
-def full_disks(names: Sequence[str]) -> list[dict[str, object]]:
-    """One row per command and state of the disk."""
-    rows: list[dict[str, object]] = []
+def full_disks(names: Sequence[str]) -> Rows:
+    """One row per command and state of a file system of its own."""
+    rows = Rows()
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         for command in commands(root, names):
@@ -274,13 +264,19 @@ def full_disks(names: Sequence[str]) -> list[dict[str, object]]:
             # whole pages, and the folders
             size = sum(-(-p.stat().st_size // 4096) * 4096 + 4096 for p in files)
             shutil.rmtree(command.folder)
-            for states, space in (
-                (("free", "taken"), 2 * size + (1 << 18)),
-                (("small",), size // 2),
-            ):
-                for row in on_disk(command, root / "disk", states, space):
-                    rows.append(row)
-                    print(json.dumps(row), flush=True)
+            target = root / "disk" / command.name
+            words = [w.replace(str(command.folder), str(target)) for w in command.words]
+            spaces = {("free", "taken"): 2 * size + (1 << 18), ("small",): size // 2}
+            for states, space in spaces.items():
+                with disk(root / "disk", space):
+                    for state in states:
+                        before = listed(target)
+                        if state == "taken":
+                            fill(root / "disk")
+                        row = {"command": command.name, "disk": state, "size": space}
+                        row |= {"exit": run(words)[0], "broken": broken(target)}
+                        kept, left = listed(target) == before, unfinished(root / "disk", target)
+                        told(rows, **row, left=left, **{"earlier kept": kept})
     return rows
 
 
