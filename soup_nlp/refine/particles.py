@@ -144,7 +144,7 @@ class Proposer:
         self.focal = float(data.K_next[0, 0])
 
     def propose(self, soup: Soup, kind: str, count: int) -> Particles:
-        """At most `count` particles of a kind around a soup: no more neighbours than there are."""
+        """`count` particles of a kind around a soup; of neighbours, no more than there are."""
         if kind in WALKS:
             return self._walk(soup, kind, count)
         who = self._some(count)
@@ -155,7 +155,7 @@ class Proposer:
             return Particles(n, D, R, T)
         Z, g = self._extrapolated(soup, who)
         if kind == "neighbour_plane":
-            # every other one keeps its motion, the rest take the scale along with the depth
+            # every second particle keeps the motion, the others scale the translation with the depth
             own = soup.depth_at(self.data.anchor_ray)[:, None]
             scale = np.where(np.arange(who.shape[1]) % 2, 1.0, Z / own)
             R = np.broadcast_to(soup.R[:, None], R.shape)
