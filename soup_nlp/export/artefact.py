@@ -188,7 +188,7 @@ def _description(
             "knn_edges": len(case.segmentation.edges),
             "neighbour_pairs": len(case.segmentation.pairs),
             **nlp.sizes(),
-            **file.counts(),
+            **file.counts,
         },
         "nl": {"file": f"{STUB}.nl", "bytes": file.size, "sha256": file.sha256},
         "objective_at_start": nlp.value(nlp.x0),

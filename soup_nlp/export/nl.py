@@ -40,11 +40,9 @@ class NLFile:
         variables: (nx,) variable of the NLP for each variable of the file.
         rows: (ng,) constraint of the NLP for each row of the file.
         nonlinear: Number of variables nonlinear in (constraints, objective, both).
-        nonlinear_rows: Number of leading rows with an expression.
-        jacobian_nonzeros: Entries of the J segments.
-        gradient_nonzeros: Entries of the G segment.
         defined: Defined variables by use: both, constraints, objective (several), one constraint,
             the objective alone.
+        counts: Nonzeros and nonlinear parts, for the manifest and the index of the family.
     """
 
     path: Path
@@ -52,20 +50,9 @@ class NLFile:
     size: int
     variables: Int = field(repr=False)
     rows: Int = field(repr=False)
-    nonlinear: tuple[int, int, int]
-    nonlinear_rows: int
-    jacobian_nonzeros: int
-    gradient_nonzeros: int
+    nonlinear: tuple[int, ...]
     defined: tuple[int, int, int, int, int]
-
-    def counts(self) -> dict[str, Any]:
-        """Counts of nonzeros and nonlinear parts, for the manifest and the index of the family."""
-        return {
-            "gradient_nonzeros": self.gradient_nonzeros,
-            "nonlinear_rows": self.nonlinear_rows,
-            "nonlinear_variables": dict(zip(("rows", "objective", "both"), self.nonlinear)),
-            "defined_variables": sum(self.defined),
-        }
+    counts: dict[str, Any]
 
 
 Of = Literal["variables", "rows"]
@@ -136,18 +123,22 @@ def write_nl(
     write_text(path.with_suffix(".col"), "".join(f"{name}\n" for name in x_names))
     # the objective's name follows those of the rows
     write_text(path.with_suffix(".row"), "".join(f"{name}\n" for name in [*g_names, "E"]))
-    both = program.in_rows & program.in_objective
+    used = program.in_rows, program.in_objective, program.in_rows & program.in_objective
+    nonlinear = tuple(int(mask.sum()) for mask in used)
     return NLFile(
         path=path,
         sha256=hashlib.sha256(data).hexdigest(),
         size=len(data),
         variables=variables,
         rows=rows,
-        nonlinear=(int(program.in_rows.sum()), int(program.in_objective.sum()), int(both.sum())),
-        nonlinear_rows=int(program.curved_rows.sum()),
-        jacobian_nonzeros=int(J.nnz),
-        gradient_nonzeros=int(G.nnz),
+        nonlinear=nonlinear,
         defined=body.classes,
+        counts={
+            "gradient_nonzeros": int(G.nnz),
+            "nonlinear_rows": int(program.curved_rows.sum()),
+            "nonlinear_variables": dict(zip(("rows", "objective", "both"), nonlinear)),
+            "defined_variables": sum(body.classes),
+        },
     )
 
 

@@ -128,7 +128,7 @@ def qualification(nlp: NLP, x: Float) -> dict[str, Any]:
 def sizes(nlp: NLP, file: NLFile) -> dict[str, Any]:
     """Counts of variables, rows, nonzeros and nonlinear parts."""
     finite = np.isfinite(nlp.lbx) | np.isfinite(nlp.ubx)
-    return {**nlp.sizes(), "bounded_variables": int(finite.sum()), **file.counts()}
+    return {**nlp.sizes(), "bounded_variables": int(finite.sum()), **file.counts}
 
 
 # --- answers of solvers --------------------------------------------------------------------------

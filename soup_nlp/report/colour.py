@@ -11,14 +11,8 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import AnyFloat, Image, Mask
 
-ERROR_LIMIT = 0.2
-"""Relative depth error at the upper end of the colours."""
-
 UNKNOWN = 150
 """Grey level of unknown values."""
-
-SIGMA_LIMIT = 0.3
-"""Standard deviation of log depth at the upper end of the colours."""
 
 VIVID = (
     *((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75)),
@@ -64,20 +58,6 @@ def colourise_depth(depth: AnyFloat, near: float | None = None, far: float | Non
     return _paint((1 / safe - 1 / far) / (1 / near - 1 / far), known, "turbo")
 
 
-def colourise_error(relative_error: AnyFloat) -> Image:
-    """Relative depth error in colour, from 0 (dark) to `ERROR_LIMIT` and above (bright).
-
-    Args:
-        relative_error: (H, W) |z_gt - z| / z_gt; grey where not finite.
-    """
-    return _paint_up_to(ERROR_LIMIT, np.abs(relative_error), "inferno")
-
-
-def colourise_sigma(sigma: AnyFloat) -> Image:
-    """Standard deviation of log depth (H, W) in colour, from 0 (dark) to `SIGMA_LIMIT` (bright)."""
-    return _paint_up_to(SIGMA_LIMIT, sigma, "viridis")
-
-
 def component_colours(count: int) -> Image:
     """(count, 3) colours of components: slate for the first, vivid colours for the others."""
     vivid = np.array(VIVID, float)
@@ -97,10 +77,10 @@ def wheel_key(size: int = 64) -> Image:
     return out
 
 
-def _paint_up_to(limit: float, value: AnyFloat, name: str) -> Image:
-    """(H, W, 3) colours of values (H, W) from 0 to a limit, grey where not finite."""
-    known = np.isfinite(value)
-    return _paint(np.clip(np.where(known, value, 0.0) / limit, 0.0, 1.0), known, name)
+def colourise_shares(values: AnyFloat, limit: float, name: str) -> Image:
+    """Numbers (H, W) from 0 to a limit and above in a map of OpenCV, grey where not finite."""
+    known = np.isfinite(values)
+    return _paint(np.clip(np.where(known, values, 0.0) / limit, 0.0, 1.0), known, name)
 
 
 def _paint(level: NDArray[np.float64], known: Mask, name: str) -> Image:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,14 +11,11 @@ from scipy.ndimage import distance_transform_edt
 from soup_nlp.arrays import AnyFloat, Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.report.colour import (
-    ERROR_LIMIT,
-    SIGMA_LIMIT,
     Image,
     colourise_depth,
-    colourise_error,
     colourise_flow,
     colourise_normals,
-    colourise_sigma,
+    colourise_shares,
     component_colours,
     depth_range,
     draw_superpixels,
@@ -29,9 +26,8 @@ from soup_nlp.report.result import Result
 
 DENSE = 0.5
 """If a smaller share of the pixels is known, as with laser points, each is drawn larger."""
-ERROR_TICKS = (0.0, 0.05, 0.1, 0.15, ERROR_LIMIT)
-SIGMA_TICKS = (0.0, 0.1, 0.2, SIGMA_LIMIT)
-"""Values below the legends of error and sigma."""
+ERROR_TICKS, SIGMA_TICKS = (0.0, 0.05, 0.1, 0.15, 0.2), (0.0, 0.1, 0.2, 0.3)
+"""Values below the legends of error and sigma; the last one has the brightest colour."""
 DEPTHS = (
     ("ref", "depth_ref", "depth of the reference frame", "solution", ""),
     (
@@ -105,10 +101,10 @@ def pictures(result: Result) -> dict[str, Picture]:
     error, sigma = relative_error(result), result.array("depth/sigma_ref")
     if error is not None:
         title = "depth error relative to the truth; grey = no truth"
-        drawn.append(_shares("error", title, _enlarged(error), colourise_error, ERROR_TICKS))
+        drawn.append(_shares("error", title, _enlarged(error), "inferno", ERROR_TICKS))
     if sigma is not None:
         title = "expected depth error (1 sigma); bright = a guess"
-        drawn.append(_shares("confidence", title, sigma, colourise_sigma, SIGMA_TICKS))
+        drawn.append(_shares("confidence", title, sigma, "viridis", SIGMA_TICKS))
     drawn.append(_normals(result))
     return {picture.name: picture for picture in drawn}
 
@@ -221,17 +217,13 @@ def relative_error(result: Result) -> AnyFloat | None:
 
 
 def _shares(
-    name: str,
-    title: str,
-    values: AnyFloat,
-    colourise: Callable[[AnyFloat], Image],
-    ticks: Sequence[float],
+    name: str, title: str, values: AnyFloat, colours: str, ticks: Sequence[float]
 ) -> Picture:
-    """Picture of shares (H, W) with a legend from 0 to the last tick and above."""
+    """Picture of shares (H, W) in a map of OpenCV, with a legend up to the last tick and above."""
     limit, texts = ticks[-1], [f"{100 * x:.0f} %" for x in ticks]
     texts[-1] = f"\u2265 {texts[-1]}"
-    bar = Bar(colourise(np.linspace(0, limit, 128)[None]), tuple(texts))
-    return Picture(name, title, colourise(values), bar)
+    bar = Bar(colourise_shares(np.linspace(0, limit, 128)[None], limit, colours), tuple(texts))
+    return Picture(name, title, colourise_shares(values, limit, colours), bar)
 
 
 def _normals(result: Result) -> Picture:

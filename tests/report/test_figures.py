@@ -9,9 +9,9 @@ from soup_nlp.report.colour import (
     UNKNOWN,
     colour_wheel,
     colourise_depth,
-    colourise_error,
     colourise_flow,
     colourise_normals,
+    colourise_shares,
     component_colours,
     depth_range,
     draw_superpixels,
@@ -45,7 +45,11 @@ BRIGHT = level("inferno", 255)
             [1.0, 4 / 2.5, 4.0, 0.01, 1e6, np.nan, 0.0, -1.0, np.inf],
             [NEAR, level("turbo", 128), FAR, NEAR, FAR, GREY, GREY, GREY, GREY],
         ),
-        (colourise_error, [0.0, 0.2, 7.0, np.nan], [level("inferno", 0), BRIGHT, BRIGHT, GREY]),
+        (
+            lambda error: colourise_shares(error, 0.2, "inferno"),
+            [0.0, 0.2, 7.0, np.nan],
+            [level("inferno", 0), BRIGHT, BRIGHT, GREY],
+        ),
         (
             colourise_normals,
             [[0, 0, -1.0], [1.0, 0, 0], [0, 1.0, 0], [np.nan, 0, 0]],
