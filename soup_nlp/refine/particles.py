@@ -155,7 +155,7 @@ class Proposer:
             return Particles(n, D, R, T)
         Z, g = self._extrapolated(soup, who)
         if kind == "neighbour_plane":
-            # every second particle keeps the motion, the others scale the translation with the depth
+            # every second particle keeps the motion, the others scale it with the depth
             own = soup.depth_at(self.data.anchor_ray)[:, None]
             scale = np.where(np.arange(who.shape[1]) % 2, 1.0, Z / own)
             R = np.broadcast_to(soup.R[:, None], R.shape)
