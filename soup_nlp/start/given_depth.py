@@ -123,7 +123,7 @@ def by_prior(
     soup = scaled.taking(tilted, ~strong).normalised()
     tie = np.where(held & (start.component != main), TIES.index("given depth"), start.tie)
     # without a flow to weigh it against, terms on shape must not undo the prior
-    error = own if evidence.confirmed else np.where(np.isfinite(own), LEAST_SIGMA, np.inf)
+    error = own if evidence.determined else np.where(np.isfinite(own), LEAST_SIGMA, np.inf)
     decides = np.where(held, own, np.inf)
     return replace(start, soup=soup, tie=tie), Given(evidence, prior, decides, opened, error, held)
 
