@@ -73,12 +73,10 @@ def _error_under(
         return error
     known = known & (error < CONTRADICTED_PX) & (mu > 0)
     known &= fit.parallax[:, 0] * np.abs(mu) > LEAST_PARALLAX_PX
-    area = seg.sizes.astype(float)
-    floor = ground(mu, views.anchor, area, known, o.seed)
+    floor = ground(mu, views.anchor, seg.sizes.astype(float), known, o.seed)
     least = (1 - BELOW) * floor
     moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t
-    lifted = views.distance(moved)
-    return np.where(mu < least, np.maximum(error, lifted), error)
+    return np.where(mu < least, np.maximum(error, views.distance(moved)), error)
 
 
 def towards_border(core: Mask, seg: Segmentation) -> Mask:
@@ -94,17 +92,16 @@ def towards_border(core: Mask, seg: Segmentation) -> Mask:
     height, width = seg.labels.shape
     region = connected_pieces(core, seg)
     x, y = seg.anchors.T
-    side = np.argmin(np.stack([y, height - 1 - y, x, width - 1 - x]), axis=0)
-    lines = seg.labels[0], seg.labels[-1], seg.labels[:, 0], seg.labels[:, -1]
+    left, top, right, bottom = away = np.stack([x, y, width - 1 - x, height - 1 - y])
+    rows, columns = seg.labels, seg.labels.T
+    sides = (columns[0], y, left), (rows[0], x, top), (columns[-1], y, right), (rows[-1], x, bottom)
     inside = np.zeros(len(seg), bool)
-    for s, (line, at) in enumerate(zip(lines, (0, height - 1, 0, width - 1))):
-        reach = core & (side == s) & np.isin(region, region[line[core[line]]])
+    for line, along, depth in sides:
+        reach = core & (depth == away.min(axis=0)) & np.isin(region, region[line[core[line]]])
         if reach.sum() < PIECE_SIZE:
             continue
-        own = seg.anchors[reach]
-        foot = own.copy()
-        foot[:, 1 if s < 2 else 0] = at
+        place = np.column_stack([along, depth])
         # joggled, because the points may lie on one line
-        hull = Delaunay(np.concatenate([own, foot]), qhull_options="QJ")
-        inside |= hull.find_simplex(seg.anchors) >= 0
+        hull = Delaunay(np.concatenate([place[reach], place[reach] * [1, 0]]), qhull_options="QJ")
+        inside |= hull.find_simplex(place) >= 0
     return inside
