@@ -101,7 +101,8 @@ def parse_name(name: str) -> Instance:
     raise ConfigError(
         "no instance of the family",
         found=name,
-        expected=f"SOUP-SCENE-GAUGE-NORM-NSIZE-START, such as {example().name}",
+        expected="SOUP-SCENE-GAUGE-NORM-NSIZE-START",
+        hint="such as SOUP-street-unit-offset-smooth-N100-easy",
     )
 
 
@@ -110,11 +111,6 @@ def _by_name() -> dict[str, Instance]:
     every = select(SIZES, SCENES, formulations())
     first = {i.problem: i for i in every if i.start == STARTS[0]}
     return first | {name: i for i in every for name in (i.name, i.short)}
-
-
-def example() -> Instance:
-    """The smallest instance, for messages."""
-    return Instance("street", STANDARD, 100, "easy")
 
 
 def formulations() -> list[str]:

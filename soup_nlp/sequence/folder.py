@@ -190,7 +190,8 @@ def write_chain(
     contents = {"name": name, "sources": list(sources), "over": list(over), **summary(chain)}
     contents |= {"depth_png_scale": scale, "score": score(chain)}
     write_json(folder / "chain.json", contents)
-    write_text(folder / "trajectory.tum", trajectory(chain))
+    head = f"# timestamp tx ty tz qx qy qz qw; timestamp: frame number; unit: {UNIT}"
+    write_text(folder / "trajectory.tum", tum_text([head], chain.world_from_camera))
     write_fused(folder / "scene.ply", chain, contents)
     pictures, _ = depth_pictures(chain)
     write_video(
@@ -210,6 +211,15 @@ def renew_chain_page(folder: Path) -> Path:
 
 def summary(chain: Chain) -> dict[str, Any]:
     """Scales, links, poses and tracks as plain values."""
+
+    def pixels(track: int) -> dict[int, int]:
+        """Pixels of a track by frame."""
+        return {
+            k: pair.result.components[label].pixels
+            for k, pair in enumerate(chain.pairs)
+            if (label := chain.label(k, track)) is not None
+        }
+
     return {
         "frames": len(chain),
         "unit": UNIT,
@@ -231,25 +241,9 @@ def summary(chain: Chain) -> dict[str, Any]:
         ],
         "world_from_camera": [m.matrix for m in chain.world_from_camera],
         "tracks": [
-            {"track": t, "path": chain.path(t), "pixels": pixels(chain, t)}
-            for t in chain.track_numbers
+            {"track": t, "path": chain.path(t), "pixels": pixels(t)} for t in chain.track_numbers
         ],
     }
-
-
-def pixels(chain: Chain, track: int) -> dict[int, int]:
-    """Pixels of a track by frame."""
-    return {
-        k: chain.pairs[k].result.components[label].pixels
-        for k in range(len(chain.pairs))
-        if (label := chain.label(k, track)) is not None
-    }
-
-
-def trajectory(chain: Chain) -> str:
-    """Poses of the camera in the format of the TUM benchmark, world_from_camera."""
-    head = f"# timestamp tx ty tz qx qy qz qw; timestamp: frame number; unit: {UNIT}"
-    return tum_text([head], chain.world_from_camera)
 
 
 def write_video(path: Path, pictures: list[Image]) -> None:
