@@ -176,10 +176,7 @@ def family(
     ],
     sizes: Annotated[str, typer.Option(help=f"Superpixels, of {_list(SIZES)}.")] = QUICK,
     scenes: Annotated[str, typer.Option(help="Rendered scenes.")] = _list(SCENES),
-    formulation: Annotated[
-        list[str] | None,
-        typer.Option("--formulation", help="gauge/norm; may be repeated."),
-    ] = None,
+    formulation: Formulations = None,
     coordinates: Coordinates = "matrix",
     starts: Annotated[
         str, typer.Option(help="easy (presolved), hard (initialisation), cold (constant depth).")
