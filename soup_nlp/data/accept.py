@@ -21,7 +21,7 @@ ImageLike: TypeAlias = Any
 """An array (H, W), (H, W, C) or (C, H, W) with 1, 3 or 4 channels, of 8 bits or of floats from 0 to
 1, a file, or a PIL image."""
 CameraLike: TypeAlias = Any
-"""A 3x3 matrix, four numbers (fx, fy, cx, cy) in pixels, or a file of either."""
+"""A 3x3 matrix, four numbers (fx, fy, cx, cy) in pixels, or a file with one of these."""
 FlowLike: TypeAlias = Any
 """Displacements in pixels, (H, W, 2) or (2, H, W), or a file (.flo, KITTI .png, .npy)."""
 
@@ -29,23 +29,23 @@ _PICTURES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", 
 """Modes of PIL images of 8 bits or fewer a channel."""
 
 
-def is_path(given: object) -> bool:
+def is_path(value: object) -> bool:
     """Whether the argument is the path of a file."""
-    return isinstance(given, str | os.PathLike)
+    return isinstance(value, str | os.PathLike)
 
 
-def image_of(given: ImageLike, where: str) -> Image:
+def image_of(source: ImageLike, where: str) -> Image:
     """(H, W, 3) uint8 RGB of an array, a file or a PIL image; grey is repeated, alpha dropped.
 
     Raises:
         DataError: it is not such an image.
     """
-    if is_path(given):
-        return read_image(Path(given))
-    if hasattr(given, "convert") and getattr(given, "mode", None) in _PICTURES:
-        given = given.convert("RGB")
+    if is_path(source):
+        return read_image(Path(source))
+    if hasattr(source, "convert") and getattr(source, "mode", None) in _PICTURES:
+        source = source.convert("RGB")
     expected = "uint8 (H, W, 3) array, path or PIL image"
-    image = array_of(given, "image", where, expected, kinds="fiub")
+    image = array_of(source, "image", where, expected, kinds="fiub")
     if image.ndim == 2:
         image = image[:, :, None]
     elif image.ndim == 3 and image.shape[0] in (1, 3, 4) and image.shape[2] not in (1, 3, 4):
@@ -57,7 +57,7 @@ def image_of(given: ImageLike, where: str) -> Image:
         raise DataError(
             "image must be 8-bit RGB, or floats from 0 to 1",
             where=where,
-            found=f"{image.dtype} {np.shape(given)}",
+            found=f"{image.dtype} {np.shape(source)}",
             expected="uint8 (H, W, 3)",
             hint="image / 255, if its values are 0 to 255" if floats else None,
         )
@@ -66,35 +66,35 @@ def image_of(given: ImageLike, where: str) -> Image:
     return np.ascontiguousarray(image)
 
 
-def camera_of(given: CameraLike, where: str) -> Float:
-    """(3, 3) intrinsics of a matrix, of (fx, fy, cx, cy), or of a file.
+def camera_of(source: CameraLike, where: str) -> Float:
+    """(3, 3) intrinsics from a matrix, from (fx, fy, cx, cy), or from a file.
 
     Raises:
         DataError: it is not a camera.
     """
-    if is_path(given):
-        return read_intrinsics(Path(given))
+    if is_path(source):
+        return read_intrinsics(Path(source))
     try:
-        four = np.array(given, dtype=np.float64)
+        four = np.array(source, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        return check_intrinsics(given, where)
-    return check_intrinsics(intrinsics(*four) if four.shape == (4,) else given, where)
+        return check_intrinsics(source, where)
+    return check_intrinsics(intrinsics(*four) if four.shape == (4,) else source, where)
 
 
-def prior_of(given: object) -> Float:
+def prior_of(source: object) -> Float:
     """(H, W) values of a depth prior, NaN where they are not positive and finite.
 
     Raises:
-        DataError: it is neither a map nor the file of one.
+        DataError: it is neither a map nor the path of a map file.
     """
-    if is_path(given):
-        return read_depth(Path(str(given)), 1.0)
-    values = array_of(given, "depth prior", "prior", "numbers (H, W), or a path")
+    if is_path(source):
+        return read_depth(Path(str(source)), 1.0)
+    values = array_of(source, "depth prior", "prior", "numbers (H, W), or a path")
     return known_depth(values, "prior")
 
 
 def array_of(
-    given: object,
+    value: object,
     what: str,
     where: str,
     expected: str,
@@ -105,11 +105,11 @@ def array_of(
     """An object as NumPy array.
 
     Args:
-        given: The object.
-        what: Its name for the message.
-        where: Its place.
+        value: The object.
+        what: Its name, for the message.
+        where: Its origin, for the message.
         expected: What it should be, for the message.
-        kinds: Kinds of numbers of NumPy that it may have.
+        kinds: Accepted kinds of NumPy's data types, a letter each.
         axes: Its shape, such as "(H, W, 2)"; any shape if empty.
         hint: What to try, for the message.
 
@@ -117,7 +117,7 @@ def array_of(
         DataError: it is not an array of these numbers or of this shape.
     """
     try:
-        array = np.asarray(given)
+        array = np.asarray(value)
     except (TypeError, ValueError, RuntimeError, OverflowError):
         array = np.empty(0, object)
     sizes = axes.strip("()").split(", ") if axes else [str(size) for size in array.shape]
@@ -125,9 +125,9 @@ def array_of(
         str(size) == wanted for size, wanted in zip(array.shape, sizes) if wanted.isdigit()
     )
     if array.dtype.kind not in kinds or not fits:
-        found = f"{type(given).__name__} {printable(repr_of(given), 60)}"
+        shown = f"{type(value).__name__} {printable(repr_of(value), 60)}"
         if array.dtype.kind in "fiub":
-            found = f"{array.dtype} {array.shape}"
+            shown = f"{array.dtype} {array.shape}"
         what = f"{what} is no array of its kind"
-        raise DataError(what, where=where, found=found, expected=expected, hint=hint)
+        raise DataError(what, where=where, found=shown, expected=expected, hint=hint)
     return array

@@ -35,7 +35,7 @@ def census(image: Image) -> FloatMap:
 
 
 def census_at(layers: FloatMap, u: NDArray[np.floating], v: NDArray[np.floating]) -> FloatMap:
-    """(2, ..., 4) census at sub-pixel places (R, C) with C < 32768; the border repeats."""
+    """(2, ..., 4) census at sub-pixel positions (R, C) with C < 32768; the border repeats."""
     x, y = np.asarray(u, np.float32), np.asarray(v, np.float32)
     # cv2.remap accepts fewer than 32768 rows
     parts = [slice(a, a + 30000) for a in range(0, len(x), 30000)]

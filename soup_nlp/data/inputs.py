@@ -55,8 +55,8 @@ class PriorOptions(Section):
             return pair
         name = str(path(self.source))
         network = is_network(name)
-        found = prior_of(learned_map(name, pair.image_ref) if network else name)
-        return replace(pair, depth_prior=resized_prior(found, pair, name))
+        prior = prior_of(learned_map(name, pair.image_ref) if network else name)
+        return replace(pair, depth_prior=resized_prior(prior, pair, name))
 
 
 def resized_prior(prior: Float, pair: Pair, where: str) -> Float:
@@ -131,9 +131,9 @@ class FilesInput(FramesInput):
         truth = Truth(depth(self.depth), depth(self.depth_next), unit=self.unit)
         read = read_camera if self.undistort else lambda file: (read_intrinsics(file), np.zeros(0))
         lenses: list[tuple[Float | None, Float]] = []
-        for given in (self.intrinsics, self.intrinsics_next or self.intrinsics):
-            four = intrinsics(*given) if isinstance(given, list) else None
-            lenses.append(read(path(given)) if isinstance(given, str) else (four, np.zeros(0)))
+        for camera in (self.intrinsics, self.intrinsics_next or self.intrinsics):
+            four = intrinsics(*camera) if isinstance(camera, list) else None
+            lenses.append(read(path(camera)) if isinstance(camera, str) else (four, np.zeros(0)))
         return make_pair(
             [path(self.ref), path(self.next)],
             [K for K, _ in lenses],

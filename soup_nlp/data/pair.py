@@ -35,7 +35,7 @@ LARGEST = 1e100
 
 def check_size(
     what: str,
-    found: tuple[int, ...],
+    shape: tuple[int, ...],
     expected: tuple[int, ...],
     where: object,
     hint: str | None = None,
@@ -44,11 +44,11 @@ def check_size(
 
     `what` names both arrays, e.g. "flow and reference image".
     """
-    if found[:2] != expected[:2]:
+    if shape[:2] != expected[:2]:
         raise DataError(
             f"{what} differ in size",
             where=where,
-            found=found,
+            found=shape,
             expected=f"{expected[:2]} (height, width)",
             hint=hint,
         )
@@ -82,17 +82,17 @@ class Flow:
 
     def __post_init__(self) -> None:
         put = partial(object.__setattr__, self)
-        given: FlowLike = self.uv
-        if is_path(given):
-            put("source", str(given) if self.source == "unknown" else self.source)
-            given = read_flow(given)
+        flow: FlowLike = self.uv
+        if is_path(flow):
+            put("source", str(flow) if self.source == "unknown" else self.source)
+            flow = read_flow(flow)
         expected = "numbers (H, W, 2) or (2, H, W) in pixels, or a path"
-        uv = flow_layout(array_of(given, "flow", self.source, expected), self.source)
+        uv = flow_layout(array_of(flow, "flow", self.source, expected), self.source)
         put("uv", uv if uv.dtype.kind == "f" and uv.dtype.itemsize >= 4 else uv.astype(np.float32))
         if self.confidence is None:
-            known = (np.abs(self.uv) < UNKNOWN_FLOW).all(axis=2)
-            put("uv", np.where(known[..., None], self.uv, 0))
-            put("confidence", known.astype(np.float32))
+            valid = (np.abs(self.uv) < UNKNOWN_FLOW).all(axis=2)
+            put("uv", np.where(valid[..., None], self.uv, 0))
+            put("confidence", valid.astype(np.float32))
         what, expected = "flow confidence", "numbers (H, W) from 0 to 1"
         sure = array_of(self.confidence, what, self.source, expected, "fiub", "(H, W)")
         put("confidence", sure if sure.dtype.kind == "f" else sure.astype(np.float32))
@@ -260,12 +260,12 @@ class Pair:
         expect(self.name, str, "name of the pair", "text")
         truths = "soup_nlp.Truth(depth_ref=..., ...) or None"
         expect(self.truth, (Truth, NoneType), "truth of the pair", truths)
-        given = self.image_ref, self.image_next
+        images = self.image_ref, self.image_next
         for what in ("image_ref", "image_next"):
             put(what, image_of(getattr(self, what), what))
         if self.K_ref is None:
             # a file may have EXIF
-            files = [Path(image) if is_path(image) else None for image in given]
+            files = [Path(image) if is_path(image) else None for image in images]
             pictures = self.image_ref, self.image_next
             cameras, sigma = estimated_cameras(files, pictures, fov)
             put("focal_sigma", sigma)

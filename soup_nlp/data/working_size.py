@@ -16,7 +16,7 @@ from soup_nlp.data.pair import Flow, Pair, Truth
 Size = tuple[int, int]
 
 ALIKE = 1.1
-"""Largest ratio of two focal lengths of which flow methods find displacements reliably."""
+"""Largest ratio of two focal lengths between which flow methods are reliable."""
 
 
 def working_size(pair: Pair, megapixels: float | None) -> Pair:
@@ -62,21 +62,21 @@ def resized_flow(flow: Flow, pair: Pair, other: Pair) -> Flow:
     """The flow of a pair at the sizes of `other`, the resized pair."""
     size = other.size
     confidence = resized(flow.confidence, size)
-    known = np.maximum(confidence, np.finfo(np.float32).tiny)
-    mean = resized(flow.uv * flow.confidence[..., None], size) / known[..., None]
+    weight = np.maximum(confidence, np.finfo(np.float32).tiny)
+    mean = resized(flow.uv * flow.confidence[..., None], size) / weight[..., None]
     uv = np.empty((*size, 2), np.float32)
     at = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float32)[::-1]
     for k in range(2):
-        own = pair.size[1 - k] / size[1 - k]
-        next_ = other.image_next.shape[1 - k] / pair.image_next.shape[1 - k]
+        ref_scale = pair.size[1 - k] / size[1 - k]
+        next_scale = other.image_next.shape[1 - k] / pair.image_next.shape[1 - k]
         # target of the centre of a pixel, in pixels of the resized next image
-        uv[..., k] = ((at[k] + 0.5) * own + mean[..., k]) * next_ - 0.5 - at[k]
+        uv[..., k] = ((at[k] + 0.5) * ref_scale + mean[..., k]) * next_scale - 0.5 - at[k]
     uv[confidence == 0] = 0
     return Flow(uv, np.clip(confidence, 0, 1), flow.source)
 
 
 def resized(image: NDArray[Any], size: Sequence[int]) -> NDArray[Any]:
-    """An image or a flow at a size (height, width): the mean of pixels; if larger, the nearest one.
+    """An image or a flow resized to (height, width): pixel means, or nearest pixels to enlarge.
 
     Interpolation would make displacements between those of two objects.
     """
@@ -113,8 +113,8 @@ def _truth(truth: Truth, pair: Pair, small: Pair) -> Truth:
 def at_common_focal(pair: Pair) -> Pair:
     """The pair with one image reduced to the focal lengths of the other one.
 
-    The finer one is reduced, since a blurred image shifts against a sharp one. It is the same pair
-    if the focal lengths differ by less than a tenth.
+    The finer image is reduced, since a blurred image shifts against a sharp one. The pair is
+    returned unchanged if the focal lengths differ by less than a tenth.
     """
     ratio = np.diag(pair.K_next)[1::-1] / np.diag(pair.K_ref)[1::-1]
     if 1 / ALIKE <= np.sqrt(ratio.prod()) <= ALIKE:

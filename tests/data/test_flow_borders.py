@@ -90,8 +90,8 @@ def test_a_superpixel_without_flow_attracts_nothing():
     flow.uv[hole] = 50
     np.testing.assert_array_equal(follow_flow(before, flow), before)
     fit, weight = fit_affine(flow, before)
-    assert not fit.known[before[20, 20]]
-    assert fit.known.sum() == 47
+    assert not fit.fitted[before[20, 20]]
+    assert fit.fitted.sum() == 47
     assert len(weight) == (~hole).sum()
 
 

@@ -108,12 +108,12 @@ class KittiInput(PairInput):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        own = _KITTI[self.kind]
-        base = training_folder(path(self.root), own.layout)
+        kitti = _KITTI[self.kind]
+        base = training_folder(path(self.root), kitti.layout)
         name = f"{int(self.index):06d}"
-        images = [need(base / own.images / f"{name}_{k}.png", own.layout) for k in (10, 11)]
-        calibration = need(base / own.calibration / f"{name}.txt", own.layout)
-        left, right = read_kitti_projections(calibration, own.projections)
+        images = [need(base / kitti.images / f"{name}_{k}.png", kitti.layout) for k in (10, 11)]
+        calibration = need(base / kitti.calibration / f"{name}.txt", kitti.layout)
+        left, right = read_kitti_projections(calibration, kitti.projections)
         K = left[:, :3].copy()
         baseline = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
         if not baseline > 0:
@@ -123,7 +123,7 @@ class KittiInput(PairInput):
                 found=f"{baseline:g} m",
                 expected="a positive length (0.53 to 0.55 m in KITTI)",
             )
-        kinds = own.disparity, "flow_occ", "flow_noc", "obj_map"
+        kinds = kitti.disparity, "flow_occ", "flow_noc", "obj_map"
         files = [base / kind / f"{name}_10.png" for kind in kinds]
         disparity = read_if(read_depth_png16, files[0], KITTI_DISPARITY)
         flow, visible = (read_if(read_kitti_flow, file) for file in files[1:3])
@@ -174,8 +174,8 @@ class VkittiInput(SceneFrames):
         root = need_folder(path(self.root), layout)
 
         def file(pattern: str, number: int) -> Path:
-            head, rest = pattern.format(self.scene, self.variation, number).split("/", 1)
-            return max(root.glob(head), default=root / head) / rest
+            head, tail = pattern.format(self.scene, self.variation, number).split("/", 1)
+            return max(root.glob(head), default=root / head) / tail
 
         numbers = (self.frame, self.frame + self.step)
         images = [need(file(image, number), layout) for number in numbers]

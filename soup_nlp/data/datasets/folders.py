@@ -92,7 +92,7 @@ class FolderInput(FramesInput):
         return _plain_folder(path(self.path), self)
 
 
-def _plain_folder(folder: Path, own: FolderInput, usual: float = MILLIMETRES) -> Pair:
+def _plain_folder(folder: Path, options: FolderInput, usual: float = MILLIMETRES) -> Pair:
     """The pair of a plain folder; `usual` are the values per unit of a depth without a scale."""
     folder = need_folder(folder, LAYOUT)
     marked, summary = is_file(folder / MARK), None
@@ -117,18 +117,18 @@ def _plain_folder(folder: Path, own: FolderInput, usual: float = MILLIMETRES) ->
     depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
     moving = read_if(read_mask, _find(folder, ("moving",), _IMAGES))
     truth = Truth(
-        depth_ref=read_if(read_depth, depth, own.depth_scale, usual),
-        depth_next=read_if(read_depth, depth_next, own.depth_scale, usual),
+        depth_ref=read_if(read_depth, depth, options.depth_scale, usual),
+        depth_next=read_if(read_depth, depth_next, options.depth_scale, usual),
         flow=read_if(read_flow, _find(folder, ("flow",), _FLOWS)),
         occluded=read_if(read_mask, _find(folder, ("occluded",), _IMAGES)),
         # connected regions of the pixels that move
         components=None if moving is None else label(moving, connectivity=2).astype(np.int32),
-        points=read_if(_read_points, folder / "points.npz", own.unit),
-        unit=own.unit,
+        points=read_if(_read_points, folder / "points.npz", options.unit),
+        unit=options.unit,
     )
     cameras = [K, K if K_next is None else K_next]
     name = folder.resolve().name
-    return make_pair(images, cameras, truth, name, own.white, cropped=own.cropped)
+    return make_pair(images, cameras, truth, name, options.white, cropped=options.cropped)
 
 
 def _read_points(path: Path, unit: str) -> Float:
@@ -174,8 +174,8 @@ class TumInput(PairInput):
         """See `PairInput`."""
         folder = need_folder(path(self.path), TUM_LAYOUT)
         if _find(folder, ("frame_0", "image_ref"), _IMAGES) and not is_file(folder / "rgb.txt"):
-            own = FolderInput(kind="folder", path=self.path, depth_scale=self.depth_scale)
-            return _plain_folder(folder, own, TUM_SCALE)
+            options = FolderInput(kind="folder", path=self.path, depth_scale=self.depth_scale)
+            return _plain_folder(folder, options, TUM_SCALE)
         images = _tum_list(need(folder / "rgb.txt", TUM_LAYOUT))
         depths = read_if(_tum_list, folder / "depth.txt") or []
         numbers = self.frame, self.frame + self.step
@@ -263,9 +263,9 @@ class MotorcycleInput(PairInput):
         focal, cx, cy, doffs, baseline = 994.978, 311.193, 254.877, 31.086, 0.193001
         d = np.asarray(disparity, dtype=np.float64)
         d = np.where(np.isfinite(d) & (d > 0), d, np.nan)
-        known = np.isfinite(d)
-        flow = np.dstack([-d, np.where(known, 0.0, np.nan)])
-        target = np.where(known, np.arange(d.shape[1]) - d, np.inf)
+        valid = np.isfinite(d)
+        flow = np.dstack([-d, np.where(valid, 0.0, np.nan)])
+        target = np.where(valid, np.arange(d.shape[1]) - d, np.inf)
         right_of = np.full_like(target, np.inf)
         right_of[:, :-1] = np.minimum.accumulate(target[:, :0:-1], axis=1)[:, ::-1]
         motion = np.eye(4)
@@ -273,10 +273,10 @@ class MotorcycleInput(PairInput):
         truth = Truth(
             depth_ref=focal * baseline / (d + doffs),
             flow=flow,
-            occluded=known & ((target >= right_of) | leaves(flow, right.shape[:2])),
-            components=np.where(known, 0, -1).astype(np.int32),
+            occluded=valid & ((target >= right_of) | leaves(flow, right.shape[:2])),
+            components=np.where(valid, 0, -1).astype(np.int32),
             motions=motion[None],
-            scene_flow=np.where(known[:, :, None], [-baseline, 0.0, 0.0], np.nan),
+            scene_flow=np.where(valid[:, :, None], [-baseline, 0.0, 0.0], np.nan),
         )
         return Pair(
             image_ref=np.ascontiguousarray(left[:, :, :3]),

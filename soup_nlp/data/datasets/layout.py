@@ -1,4 +1,4 @@
-"""What the kinds of input share: their base, required and optional files, the pair of images."""
+"""Shared parts of the kinds of input: base class, required and optional files, pair of images."""
 
 from __future__ import annotations
 
@@ -123,8 +123,8 @@ def make_pair(
 
     Args:
         images: Reference and next image.
-        cameras: (3, 3) intrinsics of both frames, pixels. Without any, images are rotated by their
-            EXIF orientation. Those that are None are estimated, see `estimated_cameras`.
+        cameras: (3, 3) intrinsics of both frames, pixels; None is estimated (`estimated_cameras`).
+            If both are None, images are rotated by their EXIF orientation.
         truth: Truth from its files.
         name: Name of the pair.
         white: Value of white in 16-bit images, see `read_images`.
@@ -141,10 +141,10 @@ def make_pair(
     if any(K is None for K in cameras):
         estimated, guessed = estimated_cameras(images, pictures, fov)
         focal_sigma = max(focal_sigma, guessed)
-    own = [estimated[k] if K is None else K for k, K in enumerate(cameras)]
-    check_cameras(own, pictures, images, cropped)
+    matrices = [estimated[k] if K is None else K for k, K in enumerate(cameras)]
+    check_cameras(matrices, pictures, images, cropped)
     for k, coefficients in enumerate(distortion):
-        pictures[k], own[k] = undistorted(pictures[k], own[k], coefficients)
-    known = truth if truth.known() else None
-    images_and_cameras = pictures[0], pictures[1], own[0], own[1]
-    return Pair(*images_and_cameras, truth=known, name=name, focal_sigma=focal_sigma)
+        pictures[k], matrices[k] = undistorted(pictures[k], matrices[k], coefficients)
+    truth_or_none = truth if truth.known() else None
+    images_and_cameras = pictures[0], pictures[1], matrices[0], matrices[1]
+    return Pair(*images_and_cameras, truth=truth_or_none, name=name, focal_sigma=focal_sigma)

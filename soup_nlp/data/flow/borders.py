@@ -18,7 +18,7 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
 
 SCALE_PX = 0.25
-"""Smallest residual, pixels, that a fit may treat as that of an outlier."""
+"""Smallest residual that a fit may treat as an outlier, pixels."""
 ROUNDS = 5
 """Re-weighted fits of an affine flow."""
 SWEEPS, REFIT = 24, 8
@@ -63,17 +63,17 @@ def follow_flow(
         # only pixels near a change of the last sweep can change
         border = near & (flow.confidence > 0) & np.any([side != current for side in sides], axis=0)
         v, u = np.nonzero(border)
-        own, uv = current[v, u], flow.uv[v, u].astype(np.float64)
-        best, least = own.copy(), fit.residual(own, u, v, uv) - margin_px
+        owner, uv = current[v, u], flow.uv[v, u].astype(np.float64)
+        best, least = owner.copy(), fit.residual(owner, u, v, uv) - margin_px
         for side in sides:
             other = side[v, u]
             residual = fit.residual(other, u, v, uv)
-            better = (residual < least) & (other != own)
+            better = (residual < least) & (other != owner)
             best[better], least[better] = other[better], residual[better]
-        moved = best != own
+        moved = best != owner
         if not moved.any():
             break
-        changed[own[moved]] = changed[best[moved]] = True
+        changed[owner[moved]] = changed[best[moved]] = True
         current[v[moved], u[moved]] = best[moved]
         near[:] = False
         near[v[moved], u[moved]] = True
@@ -94,10 +94,10 @@ def follow_depth(labels: NDArray[np.integer], log_depth: Float) -> Labels:
     Returns:
         (H, W) int32 labels as those of `follow_flow`.
     """
-    known = np.isfinite(log_depth)
-    units = np.where(known, log_depth, 0.0) / LEAST_STEP
+    finite = np.isfinite(log_depth)
+    units = np.where(finite, log_depth, 0.0) / LEAST_STEP
     both = np.stack([units, np.zeros_like(units)], axis=-1)
-    return follow_flow(labels, Flow(both.astype(np.float32), known.astype(np.float32), "depth"))
+    return follow_flow(labels, Flow(both.astype(np.float32), finite.astype(np.float32), "depth"))
 
 
 # --- affine flow of superpixels ---
@@ -111,13 +111,13 @@ class AffineFlow:
         coefficients: (N, 3, 2) of (1, (u - u0) / size, (v - v0) / size) -> flow, pixels.
         centre: (N, 2) u0, v0.
         size: (N,) square root of the number of pixels with positive confidence.
-        known: (N,) False for superpixels with fewer than six such pixels, whose fit is meaningless.
+        fitted: (N,) False for superpixels with fewer than six such pixels, too few for a fit.
     """
 
     coefficients: Float
     centre: Float
     size: Float
-    known: NDArray[np.bool_]
+    fitted: NDArray[np.bool_]
 
     def basis(self, which: Int, u: Int, v: Int) -> Float:
         """(P, 3) the three functions at pixels of superpixels `which` (P,)."""
@@ -126,8 +126,8 @@ class AffineFlow:
 
     def residual(self, which: Int, u: Int, v: Int, uv: Float) -> Float:
         """(P,) distance, pixels, of flows (P, 2) from those of superpixels `which` (P,)."""
-        own = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
-        return np.where(self.known[which], np.linalg.norm(uv - own, axis=1), np.inf)
+        predicted = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
+        return np.where(self.fitted[which], np.linalg.norm(uv - predicted, axis=1), np.inf)
 
 
 def fit_affine(
@@ -135,7 +135,7 @@ def fit_affine(
 ) -> tuple[AffineFlow, Float]:
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
-    s is the larger one of `SCALE_PX` and the spread of the superpixel, 1.48 times the weighted mean
+    s is the larger of `SCALE_PX` and the spread of the superpixel, 1.48 times the weighted mean
     absolute residual. The first weights follow from the distance to the median flow of the
     superpixel, since plain least squares would fit a slope across two motions without outliers.
 
@@ -170,13 +170,13 @@ def fit_affine(
         spread = 1.48 * np.bincount(which, base * weight * r, n) / mass
         s = np.maximum(spread, SCALE_PX)
         weight = 1.0 / (1.0 + (r / s[which]) ** 2)
-    return AffineFlow(C, fit.centre, fit.size, fit.known), weight
+    return AffineFlow(C, fit.centre, fit.size, fit.fitted), weight
 
 
 def _medians(which: Int, values: NDArray[np.floating], n: int) -> Float:
     """(N,) lower median of the values (P,) of every superpixel; 0 without values."""
     order = np.argsort(values)
-    # numpy sorts 16 bits by their digits, which is much faster
+    # numpy uses radix sort for 16-bit integers, which is much faster
     order = order[np.argsort(which.astype(np.uint16)[order], kind="stable")]
     count = np.bincount(which, minlength=n)
     middle = np.cumsum(count) - count + np.maximum(count - 1, 0) // 2

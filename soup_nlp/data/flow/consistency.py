@@ -1,8 +1,9 @@
-"""Confidence of a flow from its forward-backward consistency, and plausibility of given flows.
+"""Confidence of a flow from its forward-backward consistency, and plausibility of imported flows.
 
-Given flows that do not belong to their images, or are in other units, are detected: the next image
-is warped by the flow. With a right flow it differs from the reference image at most half as much as
-without a flow (16 pairs, rendered and real); with a wrong flow, as much or more.
+Imported flows that do not belong to their images, or are in other units, are detected: the next
+image is warped by the flow. With a correct flow, the warped image differs from the reference image
+at most half as much as without a flow (16 pairs, rendered and real); with a wrong flow, as much or
+more.
 """
 
 from __future__ import annotations
@@ -53,9 +54,9 @@ def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
 
 def sampled(image: NDArray[Any], x: FloatMap, y: FloatMap) -> FloatMap:
     """(H, W) or (H, W, C) values of an image at pixels (x, y) of (H, W); the border repeats."""
-    given = np.ascontiguousarray(image, dtype=np.float32)
+    values = np.ascontiguousarray(image, dtype=np.float32)
     kind, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
-    return np.asarray(cv2.remap(given, x, y, kind, borderMode=border))
+    return np.asarray(cv2.remap(values, x, y, kind, borderMode=border))
 
 
 def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -88,9 +89,9 @@ def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:
 BETTER = 0.8
 """Ratio of two photometric errors below which the changed flow is clearly better."""
 WORSE = 0.02
-"""Excess over the error without a flow of a flow that is refused, standard deviations of grey."""
+"""Least excess of the error of a rejected flow over that without a flow, standard deviations."""
 USELESS = 0.9
-"""Ratio to the error without a flow above which a warning is given."""
+"""A warning is given if the error of a flow exceeds this times the error without a flow."""
 
 _BLUR = 2.0  # pixels
 _CAP = 1.0  # standard deviations of grey
@@ -100,7 +101,7 @@ _FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 2, 2, 3, 4)
 
 
 def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
-    """Compare the images along a flow of a pair that was not computed here.
+    """Compare the images of a pair along a flow that was not computed here.
 
     Args:
         flow: The flow.
@@ -120,7 +121,7 @@ def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
     step = 1 + int(np.sqrt(flow.confidence.size / _PIXELS))
     height, width = pair.size
     v, u = (x.astype(np.float32) for x in np.mgrid[0:height:step, 0:width:step])
-    uv, known = flow.uv[::step, ::step], flow.confidence[::step, ::step] > 0
+    uv, usable = flow.uv[::step, ::step], flow.confidence[::step, ::step] > 0
     ref, following = _grey(pair.image_ref)[::step, ::step], _grey(pair.image_next)
 
     def differences(uv: FloatMap | Float) -> FloatMap:
@@ -128,26 +129,26 @@ def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
         x, y = (np.asarray(p + uv[..., k], np.float32) for k, p in enumerate((u, v)))
         inside = (x >= 0) & (y >= 0) & (x < following.shape[1]) & (y < following.shape[0])
         gap = np.minimum(np.abs(sampled(following, x, y) - ref), _CAP)
-        return np.where(known & inside, gap, np.nan)
+        return np.where(usable & inside, gap, np.nan)
 
     def mean(of: FloatMap, other: FloatMap) -> float:
         """Mean over the pixels that have both differences; infinite if these are few."""
         both = np.isfinite(of) & np.isfinite(other)
-        return float(of[both].mean()) if both.sum() > _LEAST * known.sum() else np.inf
+        return float(of[both].mean()) if both.sum() > _LEAST * usable.sum() else np.inf
 
     along = differences(uv)
     # without motion a pixel keeps its ray
     A = (pair.K_next @ np.linalg.inv(pair.K_ref))[:2]
     at = np.stack([u, v], axis=-1)
     without = differences(at @ A[:, :2].T + A[:, 2] - at)
-    own, none = mean(along, along), mean(without, without)
+    error_along, error_without = mean(along, along), mean(without, without)
     problem, hint, least = "", "", BETTER
-    if own > none + WORSE and not backward:
+    if error_along > error_without + WORSE and not backward:
         problem = "flow does not fit the images: it is worse than no flow"
         hint = "is it of these two images, in this order, in pixels?"
     for cause, changed in _changes(uv, pair).items():
         new = differences(changed)
-        # pixels that leave the image along one flow only say nothing
+        # a pixel that leaves the image along either flow is not compared
         both = [(mean(new, old), mean(old, new)) for old in (along, without)]
         # images without contrast agree with every flow
         relative = max((a / b if b > WORSE else 1.0 for a, b in both if a < np.inf), default=np.inf)
@@ -157,14 +158,15 @@ def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
         raise DataError(
             problem,
             where=flow.source,
-            found=f"difference of the images {own:.3f} along the flow, {none:.3f} without a flow",
+            found=f"difference of the images {error_along:.3f} along the flow,"
+            f" {error_without:.3f} without a flow",
             expected="displacements (u right, v down) in pixels, to the other image",
             hint=hint,
         )
-    if not backward and none > WORSE and own > USELESS * none:
+    if not backward and error_without > WORSE and error_along > USELESS * error_without:
         warnings.warn(
             f"flow {flow.source} explains the images hardly better than no flow"
-            f" ({own:.3f} and {none:.3f}): is it of these images?",
+            f" ({error_along:.3f} and {error_without:.3f}): is it of these images?",
             DataWarning,
             stacklevel=2,
         )
@@ -178,7 +180,7 @@ def _grey(image: Image) -> FloatMap:
 
 
 def _changes(uv: FloatMap, pair: Pair) -> dict[str, FloatMap | Float]:
-    """Flows that would be right if the given one were wrong in a usual way."""
+    """Flows that would be right if the imported flow had one of the usual mistakes."""
     size = np.array(pair.size[::-1], np.float64)
     return {
         "with its channels u and v exchanged": uv[..., ::-1],

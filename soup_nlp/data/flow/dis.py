@@ -1,9 +1,9 @@
 """Flow by the dense inverse search of OpenCV, with forward-backward confidence.
 
-A coarse-to-fine search loses large displacements with a change of scale, as of the ground near a
-driving camera. The dominant homographies of a first flow explain most of such a motion. The flow is
-therefore computed again on images that a homography aligns: what remains is small, and where its
-round trip closes better than the first flow's, it is taken.
+A coarse-to-fine search loses large displacements with a change of scale, such as those of the
+ground near a driving camera. The dominant homographies of a first flow explain most of such a
+motion. The flow is therefore computed again on images that a homography aligns: the remaining
+displacements are small. The new flow is used where its round trip closes better than the first one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _INLIER = 2.0  # pixels
 _ROUND_TRIP_CAP = 3.0  # pixels
 _WINDOW = 25  # side of the window of a score, pixels
 _MARGIN = 0.3  # by how much a flow under a homography must be better, pixels
-_GREY_CAP, _PER_GREY = 30.0, 0.05  # pixels that one grey level of difference counts for
+_GREY_CAP, _PER_GREY = 30.0, 0.05  # cap of a difference in grey levels; pixels per grey level
 
 
 def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> list[Float]:
@@ -54,8 +54,8 @@ def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> l
         if H is None or inlier is None or inlier.sum() < least:
             break
         out.append(np.asarray(H, dtype=np.float64))
-        rest = inlier.ravel() == 0
-        ref, target = ref[rest], target[rest]
+        outlier = inlier.ravel() == 0
+        ref, target = ref[outlier], target[outlier]
     return out
 
 
@@ -98,12 +98,12 @@ def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, Fl
     near = cv2.warpPerspective(
         nxt, H, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
-    rest, back = match(ref, near)
+    residual, back = match(ref, near)
     v, u = np.mgrid[0:height, 0:width].astype(np.float64)
-    at = np.stack([u + rest[..., 0], v + rest[..., 1], np.ones_like(u)], axis=-1) @ H.T
+    at = np.stack([u + residual[..., 0], v + residual[..., 1], np.ones_like(u)], axis=-1) @ H.T
     behind = at[..., 2] <= 1e-6
     at = at[..., :2] / np.where(behind, 1.0, at[..., 2])[..., None]
-    gap = round_trip_error(rest, back)
+    gap = round_trip_error(residual, back)
     inside = (at >= 0).all(axis=-1) & (at <= np.array(nxt.shape[::-1]) - 1.0).all(axis=-1)
     gap[behind | ~inside] = np.inf
     flow = np.stack([at[..., 0] - u, at[..., 1] - v], axis=-1)
@@ -114,8 +114,8 @@ def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, Fl
 def _score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap) -> FloatMap:
     height, width = ref.shape
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
-    there = sampled(nxt, u + flow[..., 0], v + flow[..., 1])
-    grey = np.minimum(np.abs(there - ref), _GREY_CAP)
+    target = sampled(nxt, u + flow[..., 0], v + flow[..., 1])
+    grey = np.minimum(np.abs(target - ref), _GREY_CAP)
     cost = np.minimum(gap, _ROUND_TRIP_CAP) + np.float32(_PER_GREY) * grey
     score = cv2.blur(cost.astype(np.float32), (_WINDOW, _WINDOW))
     score[~np.isfinite(gap)] = 2 * (_ROUND_TRIP_CAP + _PER_GREY * _GREY_CAP)
@@ -128,8 +128,8 @@ MIN_SIDE = 16
 FINEST_SCALE, PATCH_SIZE, PATCH_STRIDE = 0, 8, 2
 """Full resolution, and denser patches than those of OpenCV's medium preset (stride 3)."""
 ITERATIONS, ALPHA, DELTA, GAMMA = 20, 30.0, 1.0, 10.0
-"""A longer (5) and smoother (alpha 20) refinement than the preset's, which weighs gradients above
-intensities (delta 5): the error falls on driving, indoor and rendered pairs."""
+"""Longer and smoother refinement than the preset (5 iterations, alpha 20), with less weight on
+intensities (preset: delta 5): the error falls on driving, indoor and rendered pairs."""
 PLANES = 4
 """Dominant homographies under which the flow is computed again."""
 

@@ -2,8 +2,8 @@
 
 Where the layer has more contrast than the scene, the flow follows the layer: it is zero, consistent
 and fully confident, and the depth of the road becomes infinite. The motion of the scene becomes
-visible when the gradients that both images share at the same place are removed. It is then searched
-along the epipolar lines of the rigid motion of the remaining flow.
+visible when the gradients that both images share at the same pixel are removed. The flow of the
+scene is then searched along the epipolar lines of the rigid motion of the remaining flow.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ WINDOW = 31
 TAU = 0.35
 """Truncation of the census cost."""
 STRIDE = 4
-"""Distance of the examined pixels, pixels."""
+"""Distance between the examined pixels, pixels."""
 STILL_PX = 0.5
 """Largest displacement of a static pixel, pixels."""
 MOVED_PX = 2.0
@@ -58,8 +58,8 @@ def without_still_layer(ref: Image, nxt: Image) -> tuple[Image, Image]:
         for a, b in zip(first, second, strict=True)
     ]
     return tuple(  # type: ignore[return-value]
-        _integrated(own[0] - shared[0], own[1] - shared[1], float(image.mean()))
-        for own, image in ((first, ref), (second, nxt))
+        _integrated(derivatives[0] - shared[0], derivatives[1] - shared[1], float(image.mean()))
+        for derivatives, image in ((first, ref), (second, nxt))
     )
 
 
@@ -97,7 +97,7 @@ def corrected(
 
     Args:
         ref: (H, W) grey reference image without the layer (`without_still_layer`).
-        nxt: (H', W') grey next image without it.
+        nxt: (H', W') grey next image without the layer.
         flow: Flow of the original images.
         R: (3, 3) rotation of the motion of the other pixels.
         t: (3,) unit translation of that motion.
@@ -105,25 +105,25 @@ def corrected(
         K_next: (3, 3) intrinsics of the next frame.
 
     Returns:
-        The corrected flow, whose confidence there decreases with the distance in pixels from the
-        epipolar line. None if too few static pixels are contradicted.
+        The corrected flow; its confidence at corrected pixels decreases with the distance in pixels
+        from the epipolar line. None if too few static pixels are contradicted.
     """
     height, width = nxt.shape
-    own = np.ascontiguousarray(census(ref)[:, ::STRIDE, ::STRIDE])
-    there, side = census(nxt), max(1, WINDOW // STRIDE)
+    census_ref = np.ascontiguousarray(census(ref)[:, ::STRIDE, ::STRIDE])
+    census_next, side = census(nxt), max(1, WINDOW // STRIDE)
     v, u = np.mgrid[0 : ref.shape[0] : STRIDE, 0 : ref.shape[1] : STRIDE].astype(np.float32)
 
     def cost_at(x: FloatMap, y: FloatMap) -> FloatMap:
         """Mean census difference over a window to pixels (x, y) of the next image, or `TAU`."""
         inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-        c = np.abs(census_at(there, x, y) - own).sum(axis=(0, 3)) / 16
+        c = np.abs(census_at(census_next, x, y) - census_ref).sum(axis=(0, 3)) / 16
         c = np.where(inside, np.minimum(c, TAU), TAU).astype(np.float32)
         return np.asarray(cv2.blur(c, (side, side)), np.float32)
 
-    found, cost = _swept(cost_at, u, v, R, t, K_ref, K_next, REACH * width / K_next[0, 0])
+    swept, cost = _swept(cost_at, u, v, R, t, K_ref, K_next, REACH * width / K_next[0, 0])
     now = flow.uv[::STRIDE, ::STRIDE]
     gain = cost_at(u + now[..., 0], v + now[..., 1]) - cost
-    moved = np.linalg.norm(found - now, axis=2)
+    moved = np.linalg.norm(swept - now, axis=2)
     contradicted = still(flow)[::STRIDE, ::STRIDE] & (gain > MIN_GAIN_STATIC) & (moved > MOVED_PX)
     if contradicted.mean() < MIN_CONTRADICTED:
         return None
@@ -135,7 +135,7 @@ def corrected(
 
     gain = cv2.blur(gain, (9, 9))
     wrong = (full(gain) > MIN_GAIN) & (full(moved) > MOVED_PX)
-    guess = np.where(wrong[..., None], full(found), flow.uv).astype(np.float32)
+    guess = np.where(wrong[..., None], full(swept), flow.uv).astype(np.float32)
     uv = _nearby(ref, nxt, guess)
     off = _distance_from_line(uv, R, t, K_ref, K_next)
     sure = (np.linalg.norm(uv - guess, axis=2) < 3) & (full(cost) < MAX_COST)
@@ -158,7 +158,7 @@ def _swept(
 ) -> tuple[FloatMap, FloatMap]:
     """Flow of least cost of pixels (u, v) along their epipolar lines, and its cost.
 
-    It is that of planes swept over depth, up to a shift of `most` over depth: they are parallel to
+    Planes are swept over depth, up to a ratio `most` of translation to depth. They are parallel to
     the image, or horizontal like the ground in an upright image.
     """
     ray = rays(K_ref, np.stack([u, v], axis=-1).astype(float))
@@ -189,7 +189,7 @@ def _nearby(ref: Image, nxt: Image, guess: FloatMap) -> FloatMap:
 def _distance_from_line(
     uv: FloatMap, R: Float, t: Float, K_ref: Float, K_next: Float
 ) -> NDArray[np.float64]:
-    """(H, W) pixels between where a flow ends and the epipolar line of its pixel."""
+    """(H, W) distance of the end of a flow vector from the epipolar line of its pixel, pixels."""
     height, width = uv.shape[:2]
     v, u = np.mgrid[0:height, 0:width].astype(float)
     line = np.cross(t, rays(K_ref, np.stack([u, v], axis=-1)) @ R.T)

@@ -99,7 +99,7 @@ class Network:
                 "network failed", where=self.source, found=_first_line(error)
             ) from error
 
-    def nothing(self, kind: str, outputs: list[Any], expected: str) -> DataError:
+    def no_output(self, kind: str, outputs: list[Any], expected: str) -> DataError:
         """The error of a network without an output of the expected shape."""
         shapes = [np.shape(o) for o in outputs]
         what = f"network gives no {kind}"
@@ -111,7 +111,7 @@ class Network:
         outputs, (rows, cols) = self.outputs(first, second)
         flows = [o for o in outputs if np.ndim(o) == 4 and o.shape[:2] == (1, 2)]
         if not flows:
-            raise self.nothing("flow", outputs, "(1, 2, h, w)")
+            raise self.no_output("flow", outputs, "(1, 2, h, w)")
         best = max(reversed(flows), key=lambda o: o.shape[2] * o.shape[3])
         flow = np.moveaxis(best[0].astype(np.float32), 0, 2)
         # displacements are in pixels of the images that the network saw
@@ -135,8 +135,8 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
         DataError: the library or the file is missing, or the network gives no flow.
     """
     if image_ref.shape != image_next.shape:
-        found = f"{image_ref.shape} and {image_next.shape}"
-        raise DataError("a network needs two RGB images of one size", found=found)
+        shapes = f"{image_ref.shape} and {image_next.shape}"
+        raise DataError("a network needs two RGB images of one size", found=shapes)
     network = Network(source, 2)
     forward = network.flow(image_ref, image_next)
     backward = network.flow(image_next, image_ref)
@@ -146,7 +146,7 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
 
 
 def learned_map(source: str, image: Image) -> FloatMap:
-    """(h, w) depth or inverse depth of one image by a network; NaN where it is not positive.
+    """(h, w) depth or inverse depth of an image by a network; NaN where it is not positive.
 
     Args:
         source: Path of an .onnx file with an output (1, h, w) or (1, 1, h, w), the last one of
@@ -161,10 +161,10 @@ def learned_map(source: str, image: Image) -> FloatMap:
     maps = [np.squeeze(o) for o in outputs if np.ndim(o) in (3, 4)]
     maps = [m for m in maps if m.ndim == 2]
     if not maps:
-        raise network.nothing("map", outputs, "(1, 1, h, w)")
-    found = cv2.resize(maps[-1].astype(np.float32), (cols, rows), interpolation=cv2.INTER_LINEAR)
-    # what was added to reach a multiple of 8 goes again
-    whole = found if network.size else found[: image.shape[0], : image.shape[1]]
+        raise network.no_output("map", outputs, "(1, 1, h, w)")
+    resized = cv2.resize(maps[-1].astype(np.float32), (cols, rows), interpolation=cv2.INTER_LINEAR)
+    # cut off the padding to a multiple of 8
+    whole = resized if network.size else resized[: image.shape[0], : image.shape[1]]
     return np.where(np.isfinite(whole) & (whole > 0), whole, np.nan).astype(np.float32)
 
 

@@ -142,25 +142,26 @@ class FlowOptions(Section):
                 hint="every other source has a confidence of its own",
             )
         flow = resolve_flow(pair, source)
-        own = flow.confidence.copy()
+        confidence = flow.confidence.copy()
         if self.backward:
             back = load_flow(path(self.backward))
             size = pair.image_next.shape
             check_size("backward flow and next image", back.uv.shape, size, self.backward)
             check_flow(back, pair, backward=True)
-            known = np.where(back.confidence[..., None] > 0, back.uv, np.nan)
-            gap = round_trip_error(flow.uv, known)
-            own *= confidence_of(gap) if self.consistency else np.isfinite(gap)
+            back_uv = np.where(back.confidence[..., None] > 0, back.uv, np.nan)
+            gap = round_trip_error(flow.uv, back_uv)
+            confidence *= confidence_of(gap) if self.consistency else np.isfinite(gap)
         if self.confidence:
-            own *= Flow(flow.uv, read_confidence(path(self.confidence)), self.confidence).confidence
-        if not own.any():
+            checked = Flow(flow.uv, read_confidence(path(self.confidence)), self.confidence)
+            confidence *= checked.confidence
+        if not confidence.any():
             raise DataError(
                 "the flow has confidence 0 everywhere",
                 where=self.backward or self.confidence,
                 expected="a backward flow that leads back, or a map that is not black",
                 hint="the backward flow is from the next image to the reference image, in pixels",
             )
-        return Flow(flow.uv, own, flow.source)
+        return Flow(flow.uv, confidence, flow.source)
 
     def is_file(self) -> bool:
         """Whether the source is the file of a flow."""

@@ -41,19 +41,19 @@ def _numbers(text: str, where: PathLike, what: str) -> list[float]:
     return values
 
 
-def check_intrinsics(given: object, where: object) -> Float:
+def check_intrinsics(rows: object, where: object) -> Float:
     """Rows of numbers as (3, 3) intrinsics.
 
     Raises:
         DataError: it is not a finite, upper-triangular 3x3 matrix with positive focal lengths.
     """
     try:
-        K = np.array(given, dtype=np.float64)
+        K = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise DataError(
             "intrinsics are no matrix of numbers",
             where=where,
-            found=printable(repr_of(given), 80),
+            found=printable(repr_of(rows), 80),
             expected="(3, 3)",
         ) from error
     if K.shape != (3, 3):
@@ -129,7 +129,7 @@ def _named(text: str, where: PathLike) -> list[float]:
     """fx, fy, cx, cy and distortion of a text with names; empty if it has none.
 
     Raises:
-        DataError: the model of the lens is another one than OpenCV's.
+        DataError: the distortion model of the lens is not OpenCV's.
     """
     if re.search("fisheye|equidistant|KannalaBrandt", text, re.IGNORECASE):
         raise DataError(
@@ -144,7 +144,7 @@ def _named(text: str, where: PathLike) -> list[float]:
         last = max((k + 1 for k, name in enumerate(DISTORTION) if name in named), default=0)
         return [named.get(name, 0.0) for name in (*CAMERA, *DISTORTION[:last])]
     try:
-        # a header and tags of OpenCV are not known to YAML
+        # the YAML parser rejects OpenCV's header and tags
         tree = parse_yaml(re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE))
     except ValueError:
         return []
@@ -152,9 +152,9 @@ def _named(text: str, where: PathLike) -> list[float]:
         return []
 
     def entry(names: str) -> list[float]:
-        found: Any = next((v for k, v in tree.items() if re.fullmatch(names, str(k))), [])
-        found = found.get("data", []) if isinstance(found, dict) else found
-        return [float(x) for x in np.ravel(found)]
+        value: Any = next((v for k, v in tree.items() if re.fullmatch(names, str(k))), [])
+        value = value.get("data", []) if isinstance(value, dict) else value
+        return [float(x) for x in np.ravel(value)]
 
     try:
         K = entry("camera_?[mM]atrix|K")
@@ -164,7 +164,7 @@ def _named(text: str, where: PathLike) -> list[float]:
 
 
 def undistorted(image: Image, K: Float, distortion: Float) -> tuple[Image, Float]:
-    """An image (H, W, 3) without distortion, all of whose pixels are known, and its intrinsics."""
+    """An undistorted image (H, W, 3) without empty pixels, and its intrinsics."""
     padded = np.zeros(14)
     padded[: len(distortion)] = distortion
     size = image.shape[1], image.shape[0]
@@ -188,7 +188,7 @@ def read_kitti_projections(path: PathLike, names: Sequence[str]) -> list[Float]:
         names: Names of the projections.
     """
     lines = read_text(path, "calibration file").splitlines()
-    entries = {name.strip(): rest for name, _, rest in (line.partition(":") for line in lines)}
+    entries = {name.strip(): text for name, _, text in (line.partition(":") for line in lines)}
     out = []
     for name in names:
         if name not in entries:

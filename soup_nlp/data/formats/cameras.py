@@ -18,14 +18,14 @@ from soup_nlp.geometry.camera import intrinsics
 GUESS = 1.2
 """Default focal length relative to the longer side of the image (45 degrees of view)."""
 GUESS_SIGMA = 0.4
-"""Standard deviation of its logarithm: the cameras of nine data sets have 0.58 to 1.91."""
+"""Standard deviation of the logarithm of `GUESS`; cameras of nine data sets have 0.58 to 1.91."""
 NARROWEST, WIDEST = 10.0, 150.0
 """Plausible fields of view along the longer side, degrees."""
 
 _LONGER_35 = 36.0  # longer side of a frame of 35 mm film, mm
 _UNITS = {2: 25.4, 3: 10.0}  # millimetres in EXIF's units of length: inches and centimetres
-_SENSORS = (13.2, 17.3, 18.7, 22.3, 23.5, 28.4, 36.0, 43.8, 53.7)  # widths that are built, mm
-_SMALL = (2.5, 9.5)  # between these, sensors of any width are built, mm
+_SENSORS = (13.2, 17.3, 18.7, 22.3, 23.5, 28.4, 36.0, 43.8, 53.7)  # widths of large sensors, mm
+_SMALL = (2.5, 9.5)  # range in which small sensors of any width exist, mm
 _LONGEST_OF_SMALL = 14.0  # focal length that a lens of a small sensor rarely exceeds, mm
 
 
@@ -54,9 +54,9 @@ def estimated_cameras(
         DataWarning: `fov` is not given (the warning names the origin of the focal length), or a
             focal length of EXIF is implausible.
     """
-    of_exif = [exif_focal(path, image) for path, image in zip(paths, images, strict=True)]
-    some = next((focal for focal in of_exif if focal), None)
-    relative = [focal or some or GUESS for focal in of_exif]
+    exif_focals = [exif_focal(path, image) for path, image in zip(paths, images, strict=True)]
+    first_exif = next((focal for focal in exif_focals if focal), None)
+    relative = [focal or first_exif or GUESS for focal in exif_focals]
     sizes = [(image.shape[1], image.shape[0]) for image in images]
     if fov is not None:
         if not 0 < fov < 180:
@@ -67,23 +67,25 @@ def estimated_cameras(
         first = sizes[0][0] / (2 * math.tan(math.radians(fov) / 2)) / max(sizes[0])
         relative = [first * focal / relative[0] for focal in relative]
     out: list[Float] = []
-    for path, own, focal, (width, height) in zip(paths, of_exif, relative, sizes, strict=True):
+    for path, exif, focal, (width, height) in zip(paths, exif_focals, relative, sizes, strict=True):
         focal *= max(width, height)
         out.append(intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2))
         if fov is None and (len(out) == 1 or not np.array_equal(out[0], out[-1])):
-            other = "the EXIF of the other frame" if some else f"{GUESS} times the longer side"
+            other = (
+                "the EXIF of the other frame" if first_exif else f"{GUESS} times the longer side"
+            )
             text = (
                 f"{path or 'image'}: no intrinsics; focal length {focal:.0f} px from"
-                f" {'EXIF' if own else other} ({_degrees(focal / width):.0f} degrees of view"
+                f" {'EXIF' if exif else other} ({_degrees(focal / width):.0f} degrees of view"
                 " horizontally), principal point in the middle"
             )
-            if not some:
+            if not first_exif:
                 text += (
                     ". The flow corrects it where it determines it; a wrong focal length stretches"
                     " and bends depth: give --intrinsics or --fov"
                 )
             warnings.warn(text, DataWarning, stacklevel=2)
-    return out, 0.0 if some or fov is not None else GUESS_SIGMA
+    return out, 0.0 if first_exif or fov is not None else GUESS_SIGMA
 
 
 def _degrees(focal: float) -> float:
@@ -95,18 +97,18 @@ def exif_focal(path: PathLike | None, image: Image) -> float | None:
     """Focal length of EXIF relative to the longer side of a picture; None if not determined.
 
     It follows from the equivalent for 35 mm film, or else from the focal length in millimetres and
-    the resolution of the sensor. An implausible one is ignored with a warning.
+    the resolution of the sensor. An implausible focal length is ignored with a warning.
     """
     tags = {} if path is None else exif_tags(path)
-    found = [_number(tags, Base.FocalLengthIn35mmFilm) / _LONGER_35, _by_sensor(tags, image)]
-    given = [focal for focal in found if focal > 0]
-    for focal in given:
+    candidates = [_number(tags, Base.FocalLengthIn35mmFilm) / _LONGER_35, _by_sensor(tags, image)]
+    focals = [focal for focal in candidates if focal > 0]
+    for focal in focals:
         if NARROWEST <= _degrees(focal) <= WIDEST:
             return focal
-    if given:
+    if focals:
         warnings.warn(
-            f"{path}: the focal length of EXIF is ignored, since {given[0]:.3g} times the longer"
-            f" side ({_degrees(given[0]):.1f} degrees of view) is implausible",
+            f"{path}: the focal length of EXIF is ignored, since {focals[0]:.3g} times the longer"
+            f" side ({_degrees(focals[0]):.1f} degrees of view) is implausible",
             DataWarning,
             stacklevel=2,
         )
@@ -116,8 +118,8 @@ def exif_focal(path: PathLike | None, image: Image) -> float | None:
 def _by_sensor(tags: Mapping[int, Any], image: Image) -> float:
     """Focal length over the width of the sensor; 0 if unknown.
 
-    A picture that was cropped has other sides than EXIF says. One that was reduced by a program
-    that changed the size in EXIF, but not the resolution, has a sensor that is not built.
+    The sides of a cropped picture differ from those in EXIF. Where a program reduced a picture and
+    its size in EXIF, but not the resolution in EXIF, the width is that of no existing sensor.
     """
     short, long = sorted(image.shape[:2])
     low, high = sorted(_number(tags, x) for x in (Base.ExifImageWidth, Base.ExifImageHeight))
@@ -135,7 +137,7 @@ def _number(tags: Mapping[int, Any], tag: int) -> float:
     """Value of a tag; 0 if it is no positive number."""
     try:
         value = float(tags.get(tag, 0))
-    except Exception:  # of whatever the file holds there
+    except Exception:  # a malformed tag may raise any type
         return 0.0
     return value if math.isfinite(value) and value > 0 else 0.0
 

@@ -34,14 +34,14 @@ def assumed(where: object, missing: str, taken: str) -> None:
     warnings.warn(f"{where}: {missing}; assumed: {taken}", DataWarning, stacklevel=3)
 
 
-def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
+def check_body(count: int, expected: int, path: PathLike, what: str) -> None:
     """Raise DataError unless a file body has the number of bytes given by its header."""
-    if found != expected:
-        problem = "is truncated" if found < expected else "has bytes left over"
+    if count != expected:
+        problem = "is truncated" if count < expected else "has bytes left over"
         raise DataError(
             f"{what} {problem}",
             where=path,
-            found=f"{found} bytes after the header",
+            found=f"{count} bytes after the header",
             expected=f"{expected} bytes",
             hint="copy or download the file again",
         )
@@ -50,8 +50,8 @@ def check_body(found: int, expected: int, path: PathLike, what: str) -> None:
 def decode(path: PathLike, what: str) -> NDArray[Any]:
     """Decode an image file as stored, with all its bits, to grey, BGR or BGRA.
 
-    OpenCV decodes it, or else Pillow, which tolerates more, to 8 bits. The size in the header is
-    checked before, since a small file can have many pixels of one colour.
+    OpenCV decodes the file; Pillow, to 8 bits, decodes what OpenCV rejects. The size in the header
+    is checked first, since a small file can have many pixels of one colour.
     """
     content = read_bytes(path, what)
     try:
@@ -80,14 +80,14 @@ def _decode_by_pillow(content: bytes, path: PathLike, what: str) -> NDArray[np.u
             return np.asarray(image.convert("RGB"))[:, :, ::-1]
     except UnidentifiedImageError:
         heic = content[4:8] == b"ftyp" and content[8:12] != b"avif"
-        found = f"{'a HEIC picture or a video, ' if heic else ''}{len(content)} bytes that start"
-        found, hint = f"{found} with {content[:12]!r}", "convert it to PNG or JPEG first"
+        problem = f"{'a HEIC picture or a video, ' if heic else ''}{len(content)} bytes that start"
+        problem, hint = f"{problem} with {content[:12]!r}", "convert it to PNG or JPEG first"
     except Exception as error:  # decoders raise many types
-        found, hint = str(error), "copy or download the file again: it may be damaged"
+        problem, hint = str(error), "copy or download the file again: it may be damaged"
     raise DataError(
-        f"{what} is truncated" if "truncated" in found.lower() else f"{what} cannot be decoded",
+        f"{what} is truncated" if "truncated" in problem.lower() else f"{what} cannot be decoded",
         where=path,
-        found=found,
+        found=problem,
         expected="an image file that OpenCV or Pillow reads (PNG, JPEG, TIFF, WebP, AVIF ...)",
         hint=hint,
     )
@@ -96,12 +96,12 @@ def _decode_by_pillow(content: bytes, path: PathLike, what: str) -> NDArray[np.u
 def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]:
     """Decode a 16-bit PNG: (H, W) for one channel, (H, W, 3) in BGR order for three."""
     image = decode(path, what)
-    found = 1 if image.ndim == 2 else image.shape[2]
-    if image.dtype != np.uint16 or found != channels:
+    count = 1 if image.ndim == 2 else image.shape[2]
+    if image.dtype != np.uint16 or count != channels:
         raise DataError(
             f"{what} is not of the expected kind",
             where=path,
-            found=f"{image.dtype} with {found} channel(s)",
+            found=f"{image.dtype} with {count} channel(s)",
             expected=f"16-bit PNG with {channels} channel(s)",
             hint="an 8-bit or colour-coded picture of the data does not hold the values",
         )
@@ -109,10 +109,10 @@ def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]
 
 
 def exif_tags(path: PathLike) -> dict[int, Any]:
-    """EXIF tags of an image file, of the picture and of the camera; none if there are none.
+    """EXIF tags of an image file, those of the picture and of the camera; empty without EXIF.
 
     Warns:
-        DataWarning: EXIF is malformed; whatever is wrong in it does not end a run.
+        DataWarning: EXIF is malformed and is ignored.
     """
     content = read_bytes(path, "image")
     try:
@@ -140,9 +140,9 @@ def read_images(
     """Read the pictures of one scene as 8-bit RGB.
 
     8 and 16 bit, grey, RGB and RGBA are accepted. Grey is repeated in the three channels, and alpha
-    is dropped. 16-bit values v become 255 v / white; without `white` the values that occur in all
-    pictures, without the outermost, become 0 to 255. An image with an EXIF rotation is rejected
-    unless `turn` is set, since its camera may be that of either orientation.
+    is dropped. 16-bit values v become 255 v / white; without `white`, the range of the values of
+    all pictures between the percentiles `OUTER` becomes 0 to 255. An image with an EXIF rotation is
+    rejected unless `turn` is set, since its camera may be that of either orientation.
 
     Args:
         paths: Image files (PNG, JPEG, TIFF, PPM ...).

@@ -166,8 +166,8 @@ def _read_flow_png(path: PathLike, what: str) -> Float:
     """(H, W, 2) values of a 16-bit flow PNG, R and G; NaN where B is 0."""
     bgr = decode_png16(path, 3, what)
     code = bgr[:, :, :0:-1].astype(np.float64)
-    known = bgr[:, :, 0] > 0
-    if known.any() and code[known, 0].max() <= 1:
+    valid = bgr[:, :, 0] > 0
+    if valid.any() and code[valid, 0].max() <= 1:
         raise DataError(
             f"{what} has its channels exchanged",
             where=path,
@@ -175,7 +175,7 @@ def _read_flow_png(path: PathLike, what: str) -> Float:
             expected="R and G for u and v, B for the mask",
             hint="OpenCV writes channels in the order B, G, R: reverse them before",
         )
-    code[~known] = np.nan
+    code[~valid] = np.nan
     return code
 
 
@@ -213,9 +213,9 @@ def read_confidence(path: PathLike) -> NDArray[Any]:
     """The confidence of a .npy file, or of a grey image of 8 or 16 bits (black is 0, white 1)."""
     if Path(path).suffix == ".npy":
         return read_npy(path, "confidence file")
-    found = decode(path, "confidence map")
-    whole = found.dtype.kind == "u"
-    return found / np.iinfo(found.dtype).max if whole else found
+    image = decode(path, "confidence map")
+    whole = image.dtype.kind == "u"
+    return image / np.iinfo(image.dtype).max if whole else image
 
 
 # --- depth ----------------------------------------------------------------------------------------
@@ -295,8 +295,8 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
 
     Args:
         path: The file.
-        scale: Values per unit of length of a .png, see `read_depth_png16`; None for the usual ones.
-        usual: These values.
+        scale: Values per unit of length of a .png, see `read_depth_png16`; None for `usual`.
+        usual: Values per unit of length that are assumed.
 
     Warns:
         DataWarning: the usual scale is assumed.

@@ -110,8 +110,8 @@ def _room(b: SceneBuilder) -> Scene:
     """camera moving sideways, three independently moving objects among furniture"""
     objects = b.furniture(FRONT + BACK)
     moving = [b.rng.integers(3), *(3 + b.rng.permutation(4)[:2])]
-    rest = [part for k, part in enumerate(objects) if k not in moving]
-    bodies = [Body([*b.interior(), *rest])]
+    static = [part for k, part in enumerate(objects) if k not in moving]
+    bodies = [Body([*b.interior(), *static])]
     for rank, k in enumerate(moving):
         shift = np.array([b.sign(), 0, b.sign()]) * b.uniform([0.03, 0, 0.01], [0.06, 0, 0.06])
         if rank == 2:
@@ -161,7 +161,7 @@ def _still(b: SceneBuilder) -> Scene:
 
 def _banner(b: SceneBuilder) -> Scene:
     """a banner that bends, standing in a rigid room before a moving camera"""
-    rest = b.furniture(BACK)
+    things = b.furniture(BACK)
     bend, change = b.sign() * b.uniform(0.5, 0.8), b.sign() * b.uniform(0.12, 0.25)
     axis = b.uniform(-0.2, 0.2)
     z, up = 3.5, 0.81  # its foot is on the floor, in the image
@@ -173,7 +173,7 @@ def _banner(b: SceneBuilder) -> Scene:
     pose = placed(x, -up, z, yaw=b.uniform(-10, 10))
     cloth = Part(shape, pose, b.paint(0.25, dots), glow=0.4)
     turn, shift = b.uniform(-0.5, 0.5, 3), b.uniform(-0.015, 0.015, 3)
-    bodies = [Body([*b.interior(), *rest]), Body([cloth], about([x, 0, z], turn, shift))]
+    bodies = [Body([*b.interior(), *things]), Body([cloth], about([x, 0, z], turn, shift))]
     return Scene(bodies, *_sideways(b))
 
 
@@ -186,7 +186,7 @@ _LAYOUTS: everyday.Layouts = {
     "banner": (_banner, 0.8, 1.0),
     **everyday.LAYOUTS,
 }
-"""The place of a scene in this table is part of its seed, so that new ones go last."""
+"""The index of a scene in this table is part of its seed, so that new scenes are appended."""
 
 SCENES = {name: str(layout.__doc__) for name, (layout, *_) in _LAYOUTS.items()}
 """Description of every scene by name."""

@@ -52,16 +52,16 @@ def _pan(b: SceneBuilder) -> Scene:
     """camera that only turns; something crosses the view at odd seeds"""
     x, way = b.uniform(-0.3, 0.3), b.sign()
     if (b.seed + 1) // 2 % 2:
-        rest, pitch, up = _landscape(b), b.uniform(0, 4), b.uniform(1.6, 3)
+        static, pitch, up = _landscape(b), b.uniform(0, 4), b.uniform(1.6, 3)
         z = b.uniform(8, 11)
         crosses = b.car(z * x, z, 90 * way)
         shift = [way * b.uniform(0.2, 0.5), 0.0, 0.0]
     else:
         things = b.furniture(FRONT + BACK)
         crosses = b.furniture(((x, 2.8),))
-        rest, pitch, up = [*b.interior(), *things], -9, b.uniform(1.2, 1.5)
+        static, pitch, up = [*b.interior(), *things], -9, b.uniform(1.2, 1.5)
         shift = [way * b.uniform(0.05, 0.1), 0.0, b.uniform(-0.05, 0.05)]
-    bodies = [Body(rest)]
+    bodies = [Body(static)]
     if b.seed % 2:
         bodies.append(Body(crosses, about(shift=shift)))
     size = b.uniform(2, 6)
@@ -87,26 +87,26 @@ def _handheld(b: SceneBuilder) -> Scene:
     far = b.uniform(8, 12)
     if b.seed % 2:
         tiles = Panels((0.8, 0.8), (0.97, 0.97), (0.58, 0.52, 0.46), variation=0.2)
-        rest = [floor(b.plain(WALLS[2], 0.8, tiles, contrast=0.3)), backdrop(far, b.wall(1.0))]
+        static = [floor(b.plain(WALLS[2], 0.8, tiles, contrast=0.3)), backdrop(far, b.wall(1.0))]
         for k in range(3):
             x = (k - 1 + b.uniform(-0.3, 0.3)) * 0.7 * far * b.half_width
             half = b.uniform([0.4, 0.5, 0.3], [0.9, 1.1, 0.5])
-            rest.append(block(half, x, far - half[2], b.paint(0.4)))
+            static.append(block(half, x, far - half[2], b.paint(0.4)))
     else:
-        rest = [floor(b.plain(GRASS, 0.5)), b.sky(60)]
-        rest.append(Part(Box((30, b.uniform(0.5, 1.0), 0.6)), placed(0, -0.5, far), b.wall(0.6)))
+        static = [floor(b.plain(GRASS, 0.5)), b.sky(60)]
+        static.append(Part(Box((30, b.uniform(0.5, 1.0), 0.6)), placed(0, -0.5, far), b.wall(0.6)))
         for slot in (-0.9, -0.3, 0.4, 0.9):
             z = far + b.uniform(1, 8)
-            rest += b.tree(z * b.half_width * slot, z, b.uniform(3, 6))
+            static += b.tree(z * b.half_width * slot, z, b.uniform(3, 6))
     people = _small_people(b, int(b.rng.integers(3, 6)), far)
     shift = b.drift(0.7 * far * b.uniform(0.01, 0.03), [1, 0.4, 0.7])
     pose = placed(0, -b.uniform(1.3, 1.7), 0, yaw=b.uniform(-8, 8), pitch=-b.uniform(5, 11))
-    return Scene([Body(rest), *people], *views(pose, shift, b.uniform(-0.8, 0.8, 3)))
+    return Scene([Body(static), *people], *views(pose, shift, b.uniform(-0.8, 0.8, 3)))
 
 
 def _swing(b: SceneBuilder) -> Scene:
     """camera that hardly moves; a box swings close to it, a tower slides"""
-    rest = b.furniture(BACK)
+    things = b.furniture(BACK)
     z, x = b.uniform(1.8, 2.6), b.uniform(-0.2, 0.2)
     side = 0.42 * z * np.sqrt(b.uniform(0.10, 0.17) * 4 * b.half_width * b.half_height)
     half = side * b.uniform(0.85, 1.15, 3)
@@ -120,7 +120,7 @@ def _swing(b: SceneBuilder) -> Scene:
     across = -np.sign(x) * b.uniform(0.5, 0.7) * away * b.half_width
     tower = block((0.22, high, 0.22), across, away, b.paint(0.3), yaw=30)
     slides = about(shift=[b.sign() * b.uniform(0.04, 0.08), 0, 0.03])
-    static = Body([*b.interior(), *rest])
+    static = Body([*b.interior(), *things])
     shift = b.drift(b.uniform(0.025, 0.05), [1, 0.5, 0.6])
     view = views(placed(0, -1.4, 0, pitch=-b.uniform(4, 9)), shift, b.uniform(-0.4, 0.4, 3))
     return Scene([static, Body([box], swings), Body([tower], slides)], *view)
@@ -129,18 +129,18 @@ def _swing(b: SceneBuilder) -> Scene:
 def _jam(b: SceneBuilder) -> Scene:
     """camera that creeps in a traffic jam; vehicles over half of the image move differently"""
     lanes = Panels((3.4, 5.0), (0.035, 0.5), (0.78, 0.78, 0.74), (-1.75, b.uniform(0, 5)))
-    rest = [floor(b.plain(ASPHALT, 2.0, lanes, contrast=0.3)), b.sky(76)]
+    static = [floor(b.plain(ASPHALT, 2.0, lanes, contrast=0.3)), b.sky(76)]
     panes = windows((2.6, 2.9), (0.4, 0.5))
     for side in (-1, 1):
         z = 2.0
         while z < 70:
             long, high = b.uniform(8, 16), b.uniform(4, 9)
             half = 3.0, high / 2, long / 2
-            rest.append(block(half, side * b.uniform(10.5, 12), z + long / 2, b.wall(2.0, panes)))
+            static.append(block(half, side * b.uniform(10.5, 12), z + long / 2, b.wall(2.0, panes)))
             z += long + b.uniform(0, 3)
-    bodies = [Body(rest)]
+    bodies = [Body(static)]
     mirror = b.sign()
-    # low ones in front, or they would hide the others
+    # low vehicles in front, else they would hide the others
     spots = [(2.8, 4.8), (-2.8, 4.6), (0.0, 5.0), (-2.8, 11.0), (0.0, 11.5), (-5.8, 12.0)]
     for k, (across, z) in enumerate(spots[: int(b.rng.integers(4, 7))]):
         x, z = mirror * across + b.uniform(-0.2, 0.2), z + b.uniform(-0.5, 0.5)
@@ -212,8 +212,8 @@ def _corridor(b: SceneBuilder) -> Scene:
 
 def _standing(b: SceneBuilder) -> Scene:
     """camera at rest; two people walk through a room"""
-    rest = b.furniture(BACK)
-    bodies = [Body([*b.interior(), *rest])]
+    things = b.furniture(BACK)
+    bodies = [Body([*b.interior(), *things])]
     for side in b.rng.permutation([-1.0, 1.0]):
         z = b.uniform(2.1, 3.4)
         x = side * b.uniform(0.2, 0.55) * z * b.half_width

@@ -120,8 +120,8 @@ class Scene:
         for body in self.bodies:
             view = self.next_from_scene @ body.motion if frame else self.ref_from_scene
             for part in body.parts:
-                own = view @ part.motion if frame else view
-                poses.append(own @ part.scene_from_part)
+                part_view = view @ part.motion if frame else view
+                poses.append(part_view @ part.scene_from_part)
         return np.array(poses)
 
     def motions(self) -> Float:

@@ -128,7 +128,7 @@ def pulse_coverage(x: Float, duty: float, width: Float) -> Float:
 
 @dataclass(frozen=True)
 class Panels:
-    """A grid of rectangles (windows, tiles, lane marks) on a surface's own chart.
+    """A grid of rectangles (windows, tiles, lane marks) in the chart of a surface.
 
     Attributes:
         period: Size of a grid cell along both chart axes, unit of length.
@@ -150,7 +150,7 @@ class Panels:
         width = footprint[:, None] / np.asarray(self.period)
         share = pulse_coverage(grid[:, 0], self.duty[0], width[:, 0])
         share = share * pulse_coverage(grid[:, 1], self.duty[1], width[:, 1])
-        # the brightness of a rectangle is constant on it; gaps between rectangles hide the jumps
+        # each rectangle has one brightness; its jumps lie in the gaps between rectangles
         node = np.floor(grid + 0.5 * (1 - np.asarray(self.duty))).astype(np.int64) & (PERIOD - 1)
         tone = 1 + self.variation * _lattice(seed)[node[:, 0] + PERIOD * node[:, 1]]
         paint = np.asarray(self.colour, np.float32) * tone[:, None].astype(np.float32)
@@ -195,6 +195,6 @@ class Texture:
         if self.panels is not None:
             colour = self.panels.blend(colour, chart, footprint, self.seed)
         fine = fractal_noise(points, footprint, cell=self.cell, seed=self.seed)
-        # exp keeps dark parts dark and never negative; the shoulder keeps detail in bright parts
+        # exp keeps colours positive; the smooth limit at 1 keeps detail in bright parts
         colour = colour * np.exp(np.float32(self.contrast) * fine)[:, None]
         return colour / np.sqrt(np.sqrt(1 + colour**4))

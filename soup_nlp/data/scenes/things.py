@@ -1,4 +1,4 @@
-"""What rendered scenes are made of: poses, colours, textures; rooms, vehicles, trees, people."""
+"""Elements of rendered scenes: poses, colours, textures; rooms, vehicles, trees, people."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class SceneBuilder:
     """Makes the parts of one scene from one stream of random numbers.
 
     Args:
-        rng: Random numbers; the order of the calls decides which of them a part gets.
+        rng: Random numbers; those of a part depend on the order of the calls.
         half_width, half_height: Half the size of the image over the focal length.
         contrast: Factor of the contrast of all textures.
         seed: Number of the scene; some layouts choose by it.
