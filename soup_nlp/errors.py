@@ -11,12 +11,12 @@ LONGEST = 1000
 def printable(value: object, longest: int = LONGEST) -> str:
     """A text from outside on one line: control characters escaped, the end cut off.
 
-    A terminal obeys control characters, and some that order right to left, whoever wrote them.
+    Control characters, also those for right-to-left text, would change the output of a terminal.
     """
     try:
         text = str(value)
     except (ValueError, RecursionError) as error:
-        # an integer of more digits than Python prints, a list in itself
+        # an integer of more digits than Python prints, or a list that contains itself
         text = f"{type(value).__name__} ({error})"
     head = " ".join(text[: longest + 1].splitlines())
     safe = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in head)
@@ -29,8 +29,8 @@ class SoupError(Exception):
     Args:
         what: One sentence that names the problem.
         where: File, key, array or stage concerned.
-        found: What was there.
-        expected: What was needed.
+        found: The actual value.
+        expected: The accepted values.
         hint: What to try next.
     """
 
@@ -85,13 +85,13 @@ class StoppedError(SoupError):
 
 
 def expect(value: object, kinds: type | tuple[type, ...], what: str, make: str) -> None:
-    """Raise DataError unless an argument is of a kind that the function takes.
+    """Raise DataError unless an argument has an accepted type.
 
     Args:
         value: The argument.
-        kinds: As of isinstance().
-        what: Name of the argument and what it is.
-        make: How to make one.
+        kinds: Accepted types, as for isinstance().
+        what: Name and meaning of the argument.
+        make: How to make such an argument.
     """
     if not isinstance(value, kinds):
         names = kinds if isinstance(kinds, tuple) else (kinds,)

@@ -1,4 +1,4 @@
-"""Named sets of options below a problem's own keys. `preset: paper` is the method as printed.
+"""Named sets of options that a problem's keys override. `preset: paper` is the method as printed.
 
 The paper prints the factor 1 of E_arap, K of 15 to 20, 1,000 to 2,000 superpixels, 50 particles
 and 5 to 10 rounds. alpha1 to alpha3, beta, sigma and n were "tuned differently for different
@@ -78,9 +78,9 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 
 
 def with_preset(tree: Mapping[str, Any]) -> Tree:
-    """The tree of a problem over the options of the preset that it names; itself without one.
+    """The tree of a problem merged over the options of its preset; unchanged without a preset.
 
-    An unknown name is left to the check of the problem.
+    An unknown name is rejected later, by the validation of the problem.
     """
     name = tree.get("preset")
     if not isinstance(name, str) or name not in PRESETS:
@@ -89,7 +89,7 @@ def with_preset(tree: Mapping[str, Any]) -> Tree:
 
 
 def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> Tree:
-    """Both trees; where a key is in both, `above` has its value, section by section."""
+    """Both trees merged section by section; where a key is in both, `above` has the value."""
     out: Tree = copy.deepcopy(dict(below))
     for key, value in above.items():
         old = out.get(key)
@@ -100,13 +100,13 @@ def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> Tree:
     return out
 
 
-def leaves(tree: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, Any]]:
+def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted key and value of every option."""
     for key, value in tree.items():
         if isinstance(value, Mapping):
-            yield from leaves(value, f"{place}{key}.")
+            yield from leaves(value, f"{prefix}{key}.")
         else:
-            yield f"{place}{key}", value
+            yield f"{prefix}{key}", value
 
 
 def overrides_of(name: str) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
-from soup_nlp.schema.section import Place, Positive, Samples, Section, Seed, Share, explain, nearest
+from soup_nlp.schema.section import Keys, Positive, Samples, Section, Seed, Share, explain, nearest
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.start.start_options import StartOptions
 from soup_nlp.storage.files import as_path, is_file, read_text
@@ -67,7 +67,7 @@ class OutputOptions(Section):
 
 
 def title(text: object) -> str:
-    """A text as the name of a problem: characters that no name may have become underscores."""
+    """A text as the name of a problem: forbidden characters become underscores."""
     kept = (c if c.isprintable() and c not in "/\\" else "_" for c in printable(text))
     return "".join(kept)[:LONGEST_NAME] or "problem"
 
@@ -121,24 +121,24 @@ class Problem(Section):
     def path(self, name: str) -> Path:
         """A path of this problem, relative ones from its file's folder."""
         base, path = as_path(self.base, "folder of the problem"), as_path(name, "input", home=True)
-        # realpath, unlike resolve, bears a link to itself
+        # realpath, unlike resolve, accepts a link to itself
         return Path(os.path.realpath(base / path))
 
     def digest(self) -> str:
-        """Hash of everything that decides the result: not of the names, the place and the files."""
+        """Hash of all options that change the result: without names, folder and output files."""
         tree = self.model_dump(mode="json", exclude={"name", "base", "preset", "output"})
         return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
 
     @property
     def subject(self) -> str:
-        """What is solved: the kind of input and what names its frames, without any option."""
+        """Name of the frames that are solved: kind of input, files or scene, without options."""
         options = self.input.model_dump()
-        found = [options.pop("kind")]
+        words = [options.pop("kind")]
         for key in ("root", "path", "ref", "next"):
             if key in options:
-                found.append(str(self.path(options[key])))
+                words.append(str(self.path(options[key])))
         keys = ("scene", "seed", "variation", "render", "index", "frame", "step", "hash")
-        return " ".join([*found, *(f"{key} {options[key]}" for key in keys if key in options)])
+        return " ".join([*words, *(f"{key} {options[key]}" for key in keys if key in options)])
 
     def load_pair(self) -> Pair:
         """The frame pair, without its flow.
@@ -150,7 +150,7 @@ class Problem(Section):
         return replace(self.input.load(self.path), name=self.name)
 
     def input_paths(self) -> list[Path]:
-        """Files and folders that are read; what is no file (a flow's name) is harmless here.
+        """Files and folders that are read; the name of a flow method is included as a path.
 
         Raises:
             ConfigError: the pair was in memory only.
@@ -218,11 +218,11 @@ def make_problem(
     raw: Mapping[str, Any],
     overrides: Sequence[str] = (),
     where: str = "problem",
-    lines: Mapping[Place, str] | None = None,
+    lines: Mapping[Keys, str] | None = None,
 ) -> Problem:
     """Check a mapping of sections and its overrides; see `load_problem`.
 
-    What `preset` names lies below both.
+    The options of `preset` lie below both.
 
     Args:
         raw: Sections by name.
@@ -262,42 +262,42 @@ USUAL = (
 """Keys that users turn; `soup-nlp show` prints them and those that differ from their defaults."""
 
 
-def dump_problem(problem: Problem, every: bool = True) -> str:
+def dump_problem(problem: Problem, all_keys: bool = True) -> str:
     """The merged problem as YAML with a comment on every key; it can be solved again.
 
     Args:
         problem: The problem.
         every: Write all keys; otherwise those of `USUAL` and those that differ from the defaults.
     """
-    return "\n".join(_write(problem, "", "", every)) + "\n"
+    return "\n".join(_write(problem, "", "", all_keys)) + "\n"
 
 
-def _write(model: Section, pad: str, place: str, every: bool) -> Iterator[str]:
+def _write(model: Section, pad: str, prefix: str, all_keys: bool) -> Iterator[str]:
     docs = model.help()
     for key, field in type(model).model_fields.items():
         value = getattr(model, key)
         comment = f"  # {docs[key]}" if key in docs else ""
         if isinstance(value, Section):
-            lines = list(_write(value, pad + "  ", f"{place}{key}.", every))
+            lines = list(_write(value, pad + "  ", f"{prefix}{key}.", all_keys))
             yield from [f"{pad}{key}:{comment}", *lines] if lines else []
             continue
         # a required field differs from any default
         default = ... if field.is_required() else field.get_default(call_default_factory=True)
-        if every or f"{place}{key}" in USUAL or value != default:
+        if all_keys or f"{prefix}{key}" in USUAL or value != default:
             flow = None if isinstance(value, list | tuple | dict) else False
             text = yaml.dump({key: value}, Dumper=Dumper, default_flow_style=flow, width=10**6)
             yield f"{pad}{text.rstrip()}{comment}"
 
 
-def _override(tree: dict[str, Any], item: str) -> Place:
+def _override(tree: dict[str, Any], item: str) -> Keys:
     key, eq, value = item.partition("=")
-    place = tuple(key.strip().split("."))
-    if not eq or not all(place):
+    path = tuple(key.strip().split("."))
+    if not eq or not all(path):
         raise ConfigError(
             "override is not key=value", where="--set", found=item, expected="solver.max_iter=200"
         )
     node: Any = tree
-    for part in place[:-1]:
+    for part in path[:-1]:
         node = node.setdefault(part, {})
         if not isinstance(node, dict):
             raise ConfigError(
@@ -306,5 +306,5 @@ def _override(tree: dict[str, Any], item: str) -> Place:
                 found=item,
                 expected=f"{part} is a section",
             )
-    node[place[-1]] = parse(value, f"--set {item}")[0]
-    return place
+    node[path[-1]] = parse(value, f"--set {item}")[0]
+    return path

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 from soup_nlp.errors import ConfigError
-from soup_nlp.schema.section import Place
+from soup_nlp.schema.section import Keys
 from soup_nlp.storage.files import parse_yaml
 
 
@@ -42,9 +42,9 @@ _Loader.add_constructor(
 )
 
 
-def parse(text: str, source: str) -> tuple[Any, dict[Place, str]]:
+def parse(text: str, source: str) -> tuple[Any, dict[Keys, str]]:
     """The content of a YAML text, and the line of every key."""
-    lines: dict[Place, str] = {}
+    lines: dict[Keys, str] = {}
     try:
         return parse_yaml(text, _Loader, lambda node: _locate(node, (), lines, source)), lines
     except ValueError as error:
@@ -56,12 +56,12 @@ def parse(text: str, source: str) -> tuple[Any, dict[Place, str]]:
         ) from error
 
 
-def _locate(node: yaml.Node, place: Place, lines: dict[Place, str], source: str) -> None:
+def _locate(node: yaml.Node, path: Keys, lines: dict[Keys, str], source: str) -> None:
     """Fill in the line of every key; a key that is given twice is an error."""
     if not isinstance(node, yaml.MappingNode):
         return
     for key, value in node.value:
-        here = (*place, str(key.value))
+        here = (*path, str(key.value))
         line = f"line {key.start_mark.line + 1}"
         if here in lines:
             raise ConfigError("key is given twice", where=f"{source}, {line}", found=".".join(here))

@@ -1,4 +1,4 @@
-"""Limits of input sizes: larger ones are of no use and would take all memory or time."""
+"""Limits of input sizes: larger inputs are of no use and would take all memory or time."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def check_image_size(width: int, height: int, what: str, where: object) -> None:
         width: Columns, pixels.
         height: Rows, pixels.
         what: Name of the image for the message.
-        where: Its file or array.
+        where: File or array of the image.
     """
-    found = f"{width} x {height} (width x height)"
+    size = f"{width} x {height} (width x height)"
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
         raise DataError(
             f"{what} has an impossible size",
             where=where,
-            found=found,
+            found=size,
             expected=f"1 to {MAX_SIDE} on each side, at most {MAX_PIXELS} pixels",
             hint="scale the images and their intrinsics down; or the file is damaged",
         )
@@ -45,6 +45,6 @@ def check_image_size(width: int, height: int, what: str, where: object) -> None:
         raise DataError(
             f"{what} is too long for its width",
             where=where,
-            found=found,
+            found=size,
             expected=f"sides of a ratio from 1 to {MAX_ASPECT}",
         )

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from soup_nlp.errors import ConfigError, printable
 from soup_nlp.schema.limits import LEAST, MAX_ROUNDS, MAX_SAMPLES, MAX_SEED, MOST
 
-Place = tuple[str, ...]
+Keys = tuple[str, ...]
 """Keys that lead to a value, from the top."""
 _SHORT = reprlib.Repr()
 """Prints values of any size on a short line."""
@@ -28,58 +28,58 @@ def explain(
     model: type[BaseModel],
     tree: Mapping[str, Any],
     source: str,
-    lines: Mapping[Place, str],
+    lines: Mapping[Keys, str],
 ) -> ConfigError:
     """The first mistake as a ConfigError, with the number of further ones.
 
     Args:
-        error: What validation found.
+        error: Error of pydantic with all mistakes.
         model: Model of the whole problem.
-        tree: The problem as it was given, overrides included.
+        tree: The problem before validation, overrides included.
         source: Name of the file, or "command line".
-        lines: Where a key comes from, by its place: "line 7" or "--set".
+        lines: Origin of a key in the source, such as "line 7" or "--set", by its path.
     """
-    by_place: dict[Place, list[Any]] = {}
+    by_key: dict[Keys, list[Any]] = {}
     for item in error.errors():
-        by_place.setdefault(_place(item["loc"], tree, item["type"]), []).append(item)
-    place, found = next(iter(by_place.items()))
-    kind, value = found[0]["type"], found[0]["input"]
+        by_key.setdefault(_keys_of(item["loc"], tree, item["type"]), []).append(item)
+    path, mistakes = next(iter(by_key.items()))
+    kind, value = mistakes[0]["type"], mistakes[0]["input"]
     if kind.startswith("union_tag"):
-        place, value = (*place, "kind"), value.get("kind") if isinstance(value, Mapping) else value
-    key = ".".join(place) or "(top)"
-    known = (lines[place[:k]] for k in range(len(place), 0, -1) if place[:k] in lines)
-    where = ", ".join(x for x in (source, next(known, ""), f"key {key}") if x)
-    others = len(by_place) - 1
-    more = f" (and {others} more {'mistake' if others == 1 else 'mistakes'})" if others else ""
+        path, value = (*path, "kind"), value.get("kind") if isinstance(value, Mapping) else value
+    key = ".".join(path) or "(top)"
+    origins = (lines[path[:k]] for k in range(len(path), 0, -1) if path[:k] in lines)
+    where = ", ".join(x for x in (source, next(origins, ""), f"key {key}") if x)
+    others = len(by_key) - 1
+    suffix = f" (and {others} more {'mistake' if others == 1 else 'mistakes'})" if others else ""
     sections = _sections(model, tree)
     if kind == "extra_forbidden":
         keys = {p: [k for k in s.model_fields if k != "base"] for p, s in sections.items()}
-        allowed = sorted(keys.get(place[:-1], []))
-        homes = [".".join((*p, place[-1])) for p, names in keys.items() if place[-1] in names]
+        allowed = sorted(keys.get(path[:-1], []))
+        homes = [".".join((*p, path[-1])) for p, names in keys.items() if path[-1] in names]
         return ConfigError(
-            "unknown key" + more,
+            "unknown key" + suffix,
             where=where,
-            found=place[-1],
+            found=path[-1],
             expected="one of " + ", ".join(allowed),
-            hint=nearest(place[-1], allowed) or (f"did you mean {homes[0]}?" if homes else None),
+            hint=nearest(path[-1], allowed) or (f"did you mean {homes[0]}?" if homes else None),
         )
     if kind in ("missing", "union_tag_not_found"):
         hint = None if kind == "missing" else "every input has a kind; soup-nlp list names examples"
-        return ConfigError("missing key" + more, where=where, expected=key, hint=hint)
-    hint = nearest(printable(value, 60), [word for item in found for word in _words(item)])
-    ranges = _range(sections.get(place[:-1]), place[-1]) if place else ""
+        return ConfigError("missing key" + suffix, where=where, expected=key, hint=hint)
+    hint = nearest(printable(value, 60), [word for item in mistakes for word in _words(item)])
+    ranges = _range(sections.get(path[:-1]), path[-1]) if path else ""
     if kind == "string_type" and isinstance(value, int | float):
         hint = f'write it in quotes: "{value}" (YAML drops leading zeros)'
     return ConfigError(
-        "value does not fit" + more,
+        "value does not fit" + suffix,
         where=where,
         found=_SHORT.repr(value),
-        expected=", or ".join(dict.fromkeys(_expected(item, ranges) for item in found)),
+        expected=", or ".join(dict.fromkeys(_expected(item, ranges) for item in mistakes)),
         hint=hint,
     )
 
 
-def _place(loc: tuple[int | str, ...], tree: Any, kind: str) -> Place:
+def _keys_of(loc: tuple[int | str, ...], tree: Any, kind: str) -> Keys:
     """Keys of the file that a location names; names of types and tags are left out."""
     if len(loc) > 1 and loc[0] == "input":
         # the kind of input stands between its section and its key
@@ -96,9 +96,9 @@ def _place(loc: tuple[int | str, ...], tree: Any, kind: str) -> Place:
     return tuple(out)
 
 
-def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Place, type[BaseModel]]:
-    """Model of every section, by its place."""
-    out: dict[Place, type[BaseModel]] = {(): model}
+def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Keys, type[BaseModel]]:
+    """Model of every section, by its path of keys."""
+    out: dict[Keys, type[BaseModel]] = {(): model}
     for key, info in model.model_fields.items():
         section: Any = info.annotation
         below = tree.get(key)
@@ -106,7 +106,7 @@ def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Place, ty
         if info.discriminator:
             section = next((m for m in section.__args__ if below.get("kind") in _tags(m)), None)
         if isinstance(section, type) and issubclass(section, BaseModel):
-            out |= {(key, *place): found for place, found in _sections(section, below).items()}
+            out |= {(key, *path): part for path, part in _sections(section, below).items()}
     return out
 
 
@@ -121,36 +121,36 @@ def _tags(model: type[BaseModel]) -> tuple[str, ...]:
 
 
 def nearest(word: str, allowed: list[str]) -> str | None:
-    """A question that offers the nearest spelling, if one is near."""
+    """The hint "did you mean ...?" with the nearest allowed word; None if no word is similar."""
     near = difflib.get_close_matches(word.lower(), allowed, 1, 0.6)
     return f"did you mean {near[0]}?" if near else None
 
 
 def _words(item: Mapping[str, Any]) -> list[str]:
-    """Words that a choice allows."""
+    """Allowed words of a mistake in a choice of words."""
     context = item.get("ctx", {})
     text = context.get("expected", "") if item["type"] == "literal_error" else ""
     return re.findall(r"'([^']*)'", str(context.get("expected_tags", text)))
 
 
 def _range(model: type[BaseModel] | None, key: str) -> str:
-    """Smallest and largest number that a field allows; empty if it is not bounded."""
+    """Smallest and largest allowed number of a field; empty if it is not bounded."""
     info = model.model_fields.get(key) if model else None
     if info is None:
         return ""
     bounds: dict[str, Any] = {}
     choices = getattr(info.annotation, "__args__", ())
     for item in (*info.metadata, *(x for c in choices for x in getattr(c, "__metadata__", ()))):
-        # a field's own bounds, or those of the types that it names
+        # the bounds of the field, or those of its types
         for part in (item, *getattr(item, "metadata", ())):
-            found = ((name, getattr(part, name, None)) for name in ("ge", "gt", "le", "lt"))
-            bounds |= {name: value for name, value in found if value is not None}
+            limits = ((name, getattr(part, name, None)) for name in ("ge", "gt", "le", "lt"))
+            bounds |= {name: value for name, value in limits if value is not None}
     low, high = (bounds.get(a, bounds.get(b)) for a, b in (("ge", "gt"), ("le", "lt")))
     return f"{_number(low)} to {_number(high)}" if low is not None and high is not None else ""
 
 
 def _expected(item: Mapping[str, Any], ranges: str = "") -> str:
-    """What was allowed, without pydantic's `Input should be`."""
+    """The allowed values of a mistake, without pydantic's `Input should be`."""
     if words := _words(item):
         return ("one of " if len(words) > 1 else "") + ", ".join(words)
     if item["type"] in ("model_type", "model_attributes_type", "dict_type"):

@@ -224,7 +224,7 @@ def parse_yaml(
     Args:
         text: The text.
         kind: Loader.
-        see: Called with the document before its values are made.
+        see: Called with the document before its values are constructed.
 
     Raises:
         ValueError: it is not YAML (its cause is the YAML error), too long, nested too deeply, or
@@ -277,8 +277,8 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
         if isinstance(error, OSError):
-            found = error.strerror or error
-            raise DataError("file cannot be written", where=target, found=found) from error
+            reason = error.strerror or error
+            raise DataError("file cannot be written", where=target, found=reason) from error
         raise
 
 

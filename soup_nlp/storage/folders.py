@@ -40,7 +40,7 @@ def made_files(folder: Path) -> dict[str, str]:
 
 
 def subject_of(folder: Path) -> str:
-    """What a folder is the result of; nothing if its mark does not say it."""
+    """Subject of the result in a folder; empty if its mark has none."""
     return _read(folder)[1]
 
 
@@ -131,7 +131,7 @@ _open: set[Path] = set()
 
 
 def default_folder(name: str, subject: str) -> Path:
-    """`out/NAME`, or the first of `out/NAME-2`, ... that holds no result of something else."""
+    """`out/NAME`, or the first of `out/NAME-2`, ... that holds no result of another subject."""
     k = 1
     while True:
         folder = Path("out") / (name if k == 1 else f"{name}-{k}")
@@ -153,7 +153,7 @@ def claim(
         names: Files that will be written.
         overwrite: Treat existing files of these names as files of the program, and replace the
             result of another subject.
-        subject: What the files will be the result of.
+        subject: Subject of the new result, see `subject_of`.
 
     Raises:
         DataError: the folder cannot be written, holds a file of the user with one of the names, or
@@ -161,9 +161,9 @@ def claim(
     """
     with _named_errors(folder):
         target = Path(os.path.realpath(as_path(folder, "output folder")))
-        there = next(p for p in (target, *target.parents) if os.path.lexists(p))
+        existing = next(p for p in (target, *target.parents) if os.path.lexists(p))
         # fails where nothing can be written
-        with tempfile.TemporaryFile(dir=there):
+        with tempfile.TemporaryFile(dir=existing):
             recover(target)
         before = subject_of(target)
         if subject and before not in ("", subject) and not overwrite:
@@ -190,7 +190,7 @@ def staged(
         folder: The output folder.
         whole: The new files are a complete result: files of an earlier result are removed.
         overwrite: Overwrite files that the program did not make.
-        subject: What the files are the result of; empty for that of the earlier result.
+        subject: Subject of the new result; empty for that of the earlier result.
 
     Raises:
         DataError: a file cannot be written, or a file of the user has the name of a new one.
@@ -209,11 +209,11 @@ def staged(
             # name the final path instead of the temporary one
             if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
                 raise
-            place = target / error.where.relative_to(stage)
-            raise DataError(error.what, where=place, found=error.found, hint=error.hint) from error
+            final = target / error.where.relative_to(stage)
+            raise DataError(error.what, where=final, found=error.found, hint=error.hint) from error
         finally:
             with suppress(OSError):
-                # fails for a folder that holds something
+                # fails for a folder that is not empty
                 for path in fresh:
                     path.rmdir()
 
@@ -245,7 +245,7 @@ def recover(folder: Path) -> None:
 
 @contextmanager
 def _temporary(parent: Path, prefix: str) -> Iterator[Path]:
-    """A temporary folder, whose name has the number of this process; one with a mark stays."""
+    """A temporary folder with the number of this process in its name; with a mark, it is kept."""
     _sweep(parent, prefix)
     with deferred_signals():
         folder = Path(tempfile.mkdtemp(prefix=f"{prefix}{os.getpid()}-", dir=parent))
@@ -260,7 +260,7 @@ def _temporary(parent: Path, prefix: str) -> Iterator[Path]:
 
 
 def _sweep(parent: Path, prefix: str) -> None:
-    """Remove temporary folders of processes that have ended, also of one with our own number."""
+    """Remove temporary folders of ended processes, also of one that had the number of this one."""
     for path in parent.glob(f"{prefix}*"):
         number = re.match(r"(\d{1,9})-", path.name.removeprefix(prefix))
         if number is None or path in _open:

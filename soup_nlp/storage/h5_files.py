@@ -18,13 +18,13 @@ ReadTree: TypeAlias = dict[str, Any]
 """Nested dict of numpy arrays, as `read_h5` returns it."""
 
 RECORD = "record"
-"""Group of the hashes of other files; `convert` renews it, so `contents_digest` leaves it out."""
+"""Group of hashes of other files; `convert` rewrites it, so `contents_digest` leaves it out."""
 DIGEST = "contents_sha256"
 """Root attribute with the result of `contents_digest`."""
 DEEPEST = 16
 """Largest number of nested groups."""
 BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError)
-"""Exceptions of h5py for damaged files."""
+"""Exceptions that h5py raises for damaged files."""
 
 
 def read_h5(path: PathLike) -> ReadTree:
@@ -41,20 +41,20 @@ def read_h5(path: PathLike) -> ReadTree:
         out: ReadTree = {}
         for name, item in items:
             *groups, last = name.split("/")
-            place = out
+            node = out
             for group in groups:
-                place = place.setdefault(group, {})
+                node = node.setdefault(group, {})
             if isinstance(item, h5py.Group):
-                place[last] = {}
+                node[last] = {}
             elif h5py.check_string_dtype(item.dtype):
-                place[last] = np.asarray(item.asstr()[()])
+                node[last] = np.asarray(item.asstr()[()])
             else:
-                place[last] = np.asarray(item[()])
+                node[last] = np.asarray(item[()])
         return out
 
 
 def _items(
-    group: h5py.Group, place: str, seen: set[Any], path: PathLike
+    group: h5py.Group, prefix: str, seen: set[Any], path: PathLike
 ) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]:
     """Names, groups and datasets below a group.
 
@@ -62,16 +62,16 @@ def _items(
         DataError: there is a link, or an object that is neither a group nor an array.
     """
 
-    def wrong(name: str, found: object, expected: str) -> DataError:
+    def wrong(name: str, actual: object, expected: str) -> DataError:
         return DataError(
-            "result holds what no result has", where=f"{path}, {name}", found=found,
+            "result holds what no result has", where=f"{path}, {name}", found=actual,
             expected=expected,
         )  # fmt: skip
 
-    if place.count("/") > DEEPEST:
-        raise wrong(place, "groups within groups", f"at most {DEEPEST} levels")
+    if prefix.count("/") > DEEPEST:
+        raise wrong(prefix, "groups within groups", f"at most {DEEPEST} levels")
     for key in group:
-        name = f"{place}{key}"
+        name = f"{prefix}{key}"
         link = group.get(key, getlink=True)
         if not isinstance(link, h5py.HardLink):
             raise wrong(name, type(link).__name__, "an array or a group, no link")
@@ -116,8 +116,8 @@ def contents_digest(file: h5py.File) -> str:
     items = [(n, i) for n, i in _items(file, "", seen, file.filename) if n.split("/")[0] != RECORD]
     sha = hashlib.sha256()
 
-    def add(name: str, given: Any) -> None:
-        value = np.asarray(given)
+    def add(name: str, data: Any) -> None:
+        value = np.asarray(data)
         sha.update(f"{name}\0{value.dtype.str}\0{value.shape}\0".encode(errors="surrogateescape"))
         sha.update(repr(value.tolist()).encode() if value.dtype == object else value.tobytes())
 

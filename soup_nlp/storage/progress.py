@@ -62,7 +62,7 @@ class interruptible:  # noqa: N801
     """Context in which Ctrl-C sets an event instead of raising (main thread only).
 
     SIGTERM does the same. The second signal raises KeyboardInterrupt, except while `deferred` is
-    set, as during the writing of files. CasADi swallows one that is raised in its callbacks;
+    set, as during the writing of files. CasADi discards a KeyboardInterrupt from its callbacks;
     `aborted` records it.
 
     Args:
@@ -100,5 +100,5 @@ class interruptible:  # noqa: N801
 
 
 def raising() -> list[int]:
-    """Signals that would raise KeyboardInterrupt, which CasADi swallows in its callbacks."""
+    """Signals that would raise KeyboardInterrupt, which CasADi discards in its callbacks."""
     return [n for n in SIGNALS if signal.getsignal(n) is signal.default_int_handler]

@@ -32,7 +32,7 @@ ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True)
 class Job:
-    """One row to be measured.
+    """A row to be measured.
 
     Attributes:
         name: Entries that identify the row together with the code version; part of the row.
@@ -51,8 +51,8 @@ MeasureRows = Callable[[Sequence[Job], Path], list[Row]]
 
 def reason(row: Mapping[str, Any]) -> str:
     """Why a row failed, on one line: what was wrong, where, and what was found."""
-    first, *more = str(row.get("error")).splitlines() or ["no reason"]
-    details = (line.strip() for line in more)
+    first, *lines = str(row.get("error")).splitlines() or ["no reason"]
+    details = (line.strip() for line in lines)
     return ", ".join([first, *(d for d in details if d.startswith(("where: ", "found: ")))])
 
 
@@ -139,8 +139,8 @@ def measure_all(
         path: JSON-lines file.
         workers: Processes; 1 measures in this process.
         say: Called with (done, total, row) after every new row.
-        after: Called with all rows known so far, in the order of the jobs, after every new row and
-            at the end.
+        after: Called with all rows so far, in the order of the jobs, after every new row and at the
+            end.
         any_code: Also use stored rows of other code versions.
 
     Raises:
@@ -148,22 +148,22 @@ def measure_all(
     """
     code = code_version()
     names = [_identity(job.name) for job in jobs]
-    known: dict[str, Row] = {}
+    row_of: dict[str, Row] = {}
     stored = [r for r in read_rows(path) if any_code or r.get("code") == code]
     for job, name in zip(jobs, names, strict=True):
         rows = [r for r in stored if not failed(r) and _identity(r, job.name) == name]
         if rows and not job.stale:
-            known[name] = rows[-1]
-    todo = {name: job for name, job in zip(names, jobs, strict=True) if name not in known}
+            row_of[name] = rows[-1]
+    todo = {name: job for name, job in zip(names, jobs, strict=True) if name not in row_of}
 
     def so_far() -> list[Row]:
-        return [known[name] for name in names if name in known]
+        return [row_of[name] for name in names if name in row_of]
 
     for name, result in _measured(todo, workers):
-        known[name] = {**plain(todo[name].name), "code": code, **plain(result)}
-        append_row(path, known[name])
+        row_of[name] = {**plain(todo[name].name), "code": code, **plain(result)}
+        append_row(path, row_of[name])
         if say:
-            say(len(known), len(set(names)), known[name])
+            say(len(row_of), len(set(names)), row_of[name])
         if after:
             after(so_far())
     if after and not todo:

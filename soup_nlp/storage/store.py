@@ -57,8 +57,8 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
     """Write a result file, whole or not at all.
 
     Each array becomes a dataset with the attributes `units`, `description` and `shape_letters`;
-    each mapping a group. The root gets `attrs` (None is left out; what HDF5 cannot hold is stored
-    as JSON text) plus `schema`, `versions` (JSON text), `machine` and a digest of all of it.
+    each mapping a group. The root gets `attrs` (None is left out; values without a type of HDF5 are
+    stored as JSON text) plus `schema`, `versions` (JSON text), `machine` and a digest of all of it.
 
     Args:
         path: File to write; its folder must exist.
@@ -149,10 +149,10 @@ def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:
     here: Any = tree
     for key in name.split("/"):
         if not isinstance(here, Mapping) or key not in here:
-            there = sorted(here) if isinstance(here, Mapping) else "an array, not a group"
+            names = sorted(here) if isinstance(here, Mapping) else "an array, not a group"
             raise DataError(
                 f"result has no {name!r}",
-                found=there,
+                found=names,
                 expected=repr(key),
                 hint="the file may come from another version, or the run ended early",
             )

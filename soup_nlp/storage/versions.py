@@ -25,7 +25,7 @@ _OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-hea
 def code_version() -> str:
     """Version and hash of the sources of the package at the first call.
 
-    Benchmarks store it in their rows and measure again what other code has measured.
+    Benchmarks store it in their rows, and measure rows of another version again.
     """
     root, digest = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
