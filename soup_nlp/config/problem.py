@@ -267,7 +267,7 @@ def dump_problem(problem: Problem, all_keys: bool = True) -> str:
 
     Args:
         problem: The problem.
-        every: Write all keys; otherwise those of `USUAL` and those that differ from the defaults.
+        all_keys: Write all keys, not only those of `USUAL` and those that are not at a default.
     """
     return "\n".join(_write(problem, "", "", all_keys)) + "\n"
 

@@ -32,8 +32,8 @@ def png16(path: Path, values: np.ndarray) -> None:
 def load(kind: str, where: Path, **options: object):
     """The pair of an input at a folder."""
     key = "path" if kind in ("folder", "tum") else "root"
-    own = {} if kind == "motorcycle" else {key: str(where)}
-    return make_problem({"input": {"kind": kind, **own, **options}}).input.load(Path)
+    source = {} if kind == "motorcycle" else {key: str(where)}
+    return make_problem({"input": {"kind": kind, **source, **options}}).input.load(Path)
 
 
 @pytest.fixture
@@ -363,9 +363,9 @@ def test_real_pairs(shared_data: Path) -> None:
         shared_data / "kitti2012" / "training" / "disp_occ" / "000027_10.png",
         KITTI_DISPARITY,
     )
-    known = np.isfinite(disparity)
-    np.testing.assert_array_equal(np.isfinite(depth), known)
-    np.testing.assert_allclose(depth[known] * disparity[known], 718.856 * 0.53717, rtol=1e-4)
+    finite = np.isfinite(disparity)
+    np.testing.assert_array_equal(np.isfinite(depth), finite)
+    np.testing.assert_allclose(depth[finite] * disparity[finite], 718.856 * 0.53717, rtol=1e-4)
     assert 0.01 < pair.truth.occluded.mean() < 0.1
     with pytest.warns(DataWarning, match="688 pixels"):
         sintel = load("sintel", shared_data / "sintel", scene="alley_1", frame=2)

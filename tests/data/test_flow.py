@@ -97,9 +97,9 @@ def test_dis_images_of_different_size() -> None:
 
 def test_dis_is_repeatable() -> None:
     first, second = shifted(70, 90, 2, 1)
-    one, two = dis_flow(first, second), dis_flow(first, second)
-    np.testing.assert_array_equal(one.uv, two.uv)
-    np.testing.assert_array_equal(one.confidence, two.confidence)
+    first_flow, second_flow = dis_flow(first, second), dis_flow(first, second)
+    np.testing.assert_array_equal(first_flow.uv, second_flow.uv)
+    np.testing.assert_array_equal(first_flow.confidence, second_flow.confidence)
 
 
 def test_dis_confidence_drops_where_nothing_matches() -> None:
@@ -177,16 +177,16 @@ def test_flow_from_truth() -> None:
 def test_resolve_flow(tmp_path: Path) -> None:
     pair = pair_of(Truth(flow=np.zeros((60, 80, 2))))
     assert resolve_flow(pair, "truth").source == "truth"
-    found = resolve_flow(pair, "dis")
-    assert found.source == "dis"
-    assert np.median(np.abs(found.uv - [3, 1])) < 0.1
+    flow = resolve_flow(pair, "dis")
+    assert flow.source == "dis"
+    assert np.median(np.abs(flow.uv - [3, 1])) < 0.1
     write_flo(tmp_path / "mine.flo", np.full((60, 80, 2), [3.0, 1.0]))
     assert resolve_flow(pair, str(tmp_path / "mine.flo")).source == "mine.flo"
     with raises(r"unknown flow source[\s\S]*dis, truth"):
         resolve_flow(pair, "raft")
     with raises("flow file is missing"):
         resolve_flow(pair, str(tmp_path / "other.flo"))
-    assert pair.with_flow(found).flow is found
+    assert pair.with_flow(flow).flow is flow
 
 
 def zero(image_ref: np.ndarray, image_next: np.ndarray) -> Flow:
@@ -233,15 +233,16 @@ def test_dis_on_kitti(shared_data: Path) -> None:
     assert pair.truth.flow is not None
     flow = resolve_flow(pair, "dis")
     error = np.linalg.norm(flow.uv - pair.truth.flow, axis=2)
-    known = np.isfinite(error)
-    assert np.median(error[known]) < 0.4
-    assert (error[known] > 3).mean() < 0.25
-    sure = known & (flow.confidence > 0.5)
-    assert sure.sum() > 0.7 * known.sum()
+    finite = np.isfinite(error)
+    assert np.median(error[finite]) < 0.4
+    assert (error[finite] > 3).mean() < 0.25
+    sure = finite & (flow.confidence > 0.5)
+    assert sure.sum() > 0.7 * finite.sum()
     assert (error[sure] > 3).mean() < 0.05
     edges = [-1.0, 0.0, 0.25, 0.5, 0.75, 0.9, 1.0]
     bins = [
-        known & (flow.confidence > low) & (flow.confidence <= high) for low, high in pairwise(edges)
+        finite & (flow.confidence > low) & (flow.confidence <= high)
+        for low, high in pairwise(edges)
     ]
     medians = [np.median(error[bucket]) for bucket in bins]
     assert medians == sorted(medians, reverse=True)
@@ -270,9 +271,9 @@ def test_homographies_are_recovered_one_after_the_other():
     left = np.arange(WIDTH) < WIDTH // 3
     shift = np.array([[1.0, 0, 3], [0, 1, -2], [0, 0, 1]])
     flow = np.where(left[None, :, None], truth(shift), truth(ROAD)).astype(np.float32)
-    found = dominant_homographies(flow, np.ones((HEIGHT, WIDTH), np.float32), 4)
-    assert len(found) == 2
-    for H, true in zip(found, (ROAD, shift)):
+    homographies = dominant_homographies(flow, np.ones((HEIGHT, WIDTH), np.float32), 4)
+    assert len(homographies) == 2
+    for H, true in zip(homographies, (ROAD, shift)):
         np.testing.assert_allclose(H / H[2, 2], true, atol=1e-3, rtol=1e-3)
     assert dominant_homographies(flow, np.zeros((HEIGHT, WIDTH), np.float32), 4) == []
     assert len(dominant_homographies(flow, np.ones((HEIGHT, WIDTH), np.float32), 1)) == 1
@@ -283,8 +284,8 @@ def test_a_first_flow_that_is_half_wrong_is_completed():
     first, second = images(ROAD)
     true = truth(ROAD)
     ref, nxt = first[..., 0], second[..., 0]
-    known = np.arange(WIDTH)[None, :] < WIDTH // 2
-    forward = np.where(known[..., None], true, 0.0).astype(np.float32)
+    left_half = np.arange(WIDTH)[None, :] < WIDTH // 2
+    forward = np.where(left_half[..., None], true, 0.0).astype(np.float32)
     backward = np.full((HEIGHT, WIDTH, 2), 50.0, np.float32)
     back = truth(np.linalg.inv(ROAD))
     backward[:, : WIDTH // 2] = back[:, : WIDTH // 2]
@@ -297,7 +298,7 @@ def test_a_first_flow_that_is_half_wrong_is_completed():
     flow, gap = guided_flow(ref, nxt, match, forward, backward)
     at = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1) + true
     inside = ((at > 8) & (at < [WIDTH - 9, HEIGHT - 9])).all(axis=-1)
-    right = inside & ~known
+    right = inside & ~left_half
     right[:, : WIDTH // 2 + 20] = False
     assert right.sum() > 3000
     error = np.linalg.norm(flow - true, axis=-1)
@@ -306,7 +307,7 @@ def test_a_first_flow_that_is_half_wrong_is_completed():
     # pixels whose target is outside the next image are never certain
     outside = ((at < -0.5) | (at > [WIDTH - 0.5, HEIGHT - 0.5])).any(axis=-1)
     assert outside.any()
-    assert confidence_of(gap)[outside & ~known].max(initial=0.0) < 0.5
+    assert confidence_of(gap)[outside & ~left_half].max(initial=0.0) < 0.5
 
 
 @pytest.mark.parametrize(("error", "taken"), [(0.2, False), (0.8, True)])

@@ -154,17 +154,17 @@ def test_frames_of_other_focal_lengths_have_a_flow(factor: float) -> None:
     image = cv2.resize(pair.image_next, size, interpolation=cv2.INTER_AREA)
     K = scaled_camera(pair.K_next, (108, 256), size[::-1])
     # a depth prior has the size of the reference image, which may be reduced
-    given = Pair(pair.image_ref, image, pair.K_ref, K, depth_prior=np.ones((108, 256)))
-    found = FlowOptions().load(given, Path)
+    zoomed = Pair(pair.image_ref, image, pair.K_ref, K, depth_prior=np.ones((108, 256)))
+    flow = FlowOptions().load(zoomed, Path)
     equal = FlowOptions().load(pair, Path)
     assert pair.truth is not None
     at = np.stack(np.meshgrid(np.arange(256), np.arange(108)), axis=-1)
     # pixel centres are at whole numbers
     true = (at + pair.truth.flow + 0.5) * np.divide(size, (256, 108)) - 0.5 - at
-    use = found.confidence > 0
+    use = flow.confidence > 0
     assert use.mean() > 0.9 * (equal.confidence > 0).mean()
     # a third of the resolution costs a third of a pixel at most
-    assert np.median(np.linalg.norm(found.uv - true, axis=2)[use]) < 0.2
+    assert np.median(np.linalg.norm(flow.uv - true, axis=2)[use]) < 0.2
 
 
 def test_flow_of_reduced_frames_is_not_mixed_at_edges() -> None:
@@ -175,10 +175,10 @@ def test_flow_of_reduced_frames_is_not_mixed_at_edges() -> None:
     np.testing.assert_allclose(near.K_ref, near.K_next)
     uv = np.zeros((8, 10, 2))
     uv[:, 5:] = 3, -1
-    found = resized_flow(Flow(uv), near, fine)
+    flow = resized_flow(Flow(uv), near, fine)
     at = np.stack(np.meshgrid(np.arange(20), np.arange(16)), axis=-1)
     # displacement in pixels of the next image, of which a pixel has two of the reference image
-    shift = at + found.uv - ((at + 0.5) / 2 - 0.5)
+    shift = at + flow.uv - ((at + 0.5) / 2 - 0.5)
     np.testing.assert_allclose(shift[:, :10], 0, atol=1e-6)
     np.testing.assert_allclose(shift[:, 10:], np.broadcast_to((3, -1), (16, 10, 2)), atol=1e-6)
 

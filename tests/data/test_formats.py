@@ -207,9 +207,9 @@ def test_a_pfm_with_comments_is_read(comment: bytes, tmp_path: Path) -> None:
     depth = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
     write_pfm(tmp_path / "a.pfm", depth)
     content = (tmp_path / "a.pfm").read_bytes()
-    for place in (b"Pf\n", b"4 3\n"):
-        head, tail = content.split(place, 1)
-        (tmp_path / "a.pfm").write_bytes(head + place + comment + tail)
+    for line in (b"Pf\n", b"4 3\n"):
+        head, tail = content.split(line, 1)
+        (tmp_path / "a.pfm").write_bytes(head + line + comment + tail)
         np.testing.assert_array_equal(fmt.read_depth(tmp_path / "a.pfm"), depth)
 
 

@@ -48,11 +48,11 @@ def test_images_are_taken_as_arrays_files_and_pictures(tmp_path):
     grey = rgb[:, :, 0]
     path = tmp_path / "a.png"
     pil.fromarray(rgb).save(path)
-    for given in (rgb, rgb.tolist(), path, str(path), pil.fromarray(rgb)):
-        given = np.array(given, np.uint8) if isinstance(given, list) else given
-        np.testing.assert_array_equal(Pair(given, given, K).image_next, rgb)
-    for given in (grey, grey[:, :, None], pil.fromarray(grey)):
-        image = Pair(given, rgb, K).image_ref
+    for source in (rgb, rgb.tolist(), path, str(path), pil.fromarray(rgb)):
+        source = np.array(source, np.uint8) if isinstance(source, list) else source
+        np.testing.assert_array_equal(Pair(source, source, K).image_next, rgb)
+    for source in (grey, grey[:, :, None], pil.fromarray(grey)):
+        image = Pair(source, rgb, K).image_ref
         np.testing.assert_array_equal(image, np.repeat(grey[:, :, None], 3, axis=2))
     with_alpha = np.dstack([rgb, grey])
     np.testing.assert_array_equal(Pair(with_alpha, rgb, K).image_ref, rgb)
@@ -61,8 +61,8 @@ def test_images_are_taken_as_arrays_files_and_pictures(tmp_path):
 
 def test_cameras_are_taken_as_matrices_numbers_and_files(tmp_path):
     np.savetxt(tmp_path / "K.txt", K)
-    for given in (K, K.tolist(), (60, 60, 30, 20), tmp_path / "K.txt"):
-        pair = Pair(IMAGE, IMAGE, given)
+    for camera in (K, K.tolist(), (60, 60, 30, 20), tmp_path / "K.txt"):
+        pair = Pair(IMAGE, IMAGE, camera)
         np.testing.assert_array_equal(pair.K_ref, K)
         np.testing.assert_array_equal(pair.K_next, K)
 
@@ -71,15 +71,15 @@ def test_flows_are_taken_in_both_layouts_and_from_files(tmp_path):
     uv = np.random.default_rng(0).normal(size=(40, 60, 2)).astype(np.float32)
     uv[3, 4] = np.nan
     np.save(tmp_path / "uv.npy", uv)
-    known = np.ones((40, 60))
-    known[3, 4] = 0
-    filled = np.where(known[..., None] > 0, uv, 0)
+    valid = np.ones((40, 60))
+    valid[3, 4] = 0
+    filled = np.where(valid[..., None] > 0, uv, 0)
     np.save(tmp_path / "turned.npy", np.moveaxis(uv, 2, 0))
     files = tmp_path / "uv.npy", str(tmp_path / "uv.npy"), tmp_path / "turned.npy"
-    for given in (uv, np.moveaxis(uv, 2, 0), *files):
-        for flow in (Flow(given), Pair(IMAGE, IMAGE, K, flow=given).flow):
+    for source in (uv, np.moveaxis(uv, 2, 0), *files):
+        for flow in (Flow(source), Pair(IMAGE, IMAGE, K, flow=source).flow):
             np.testing.assert_array_equal(flow.uv, filled)
-            np.testing.assert_array_equal(flow.confidence, known)
+            np.testing.assert_array_equal(flow.confidence, valid)
     assert Flow(tmp_path / "uv.npy").source == str(tmp_path / "uv.npy")
     assert Flow(np.zeros((4, 5, 2), int), np.ones((4, 5), bool)).uv.dtype == np.float32
     # two rows: the last axis decides

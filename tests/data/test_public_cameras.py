@@ -62,7 +62,7 @@ def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "outside", "cause", "fits"),
+    ("camera", "outside", "cause", "fits"),
     [
         ((240, 240, 143.5, 95.5), True, "an image of 288 x 192", "80,80,47.5,31.5"),
         ((40, 40, 23.5, 15.5), False, "an image of 48 x 32", "80,80,47.5,31.5"),
@@ -77,17 +77,17 @@ def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
     ],
 )
 def test_implausible_intrinsics_name_their_cause(
-    given: tuple[float, ...], outside: bool, cause: str, fits: str, folder: Path
+    camera: tuple[float, ...], outside: bool, cause: str, fits: str, folder: Path
 ) -> None:
     if outside:
         with pytest.raises(DataError, match="principal point is outside") as caught:
-            load(folder, intrinsics=[*given])
+            load(folder, intrinsics=[*camera])
         text = str(caught.value)
-        _, other = said(folder, intrinsics=[*given], cropped=True)
+        _, other = said(folder, intrinsics=[*camera], cropped=True)
         assert "middle" not in other
     else:
-        pair, text = said(folder, intrinsics=[*given])
-        np.testing.assert_array_equal(pair.K_ref[:2, 2], given[2:])
+        pair, text = said(folder, intrinsics=[*camera])
+        np.testing.assert_array_equal(pair.K_ref[:2, 2], camera[2:])
     assert cause in text
     assert f"{fits} would fit" in text
 

@@ -146,9 +146,9 @@ def test_16_bits_are_stretched_to_their_values(low: int, high: int, tmp_path: Pa
     # half of the value, up to the outermost per cent and rounding
     usual = (ramp > 0.1) & (ramp < 0.9)
     np.testing.assert_allclose(second[..., 0][usual], first[..., 0][usual] / 2, atol=3)
-    given = read_image(tmp_path / "a.png", white=high)
-    assert given[-1, -1, 0] == 255
-    assert given[0, 0, 0] == round(255 * low / high)
+    stretched = read_image(tmp_path / "a.png", white=high)
+    assert stretched[-1, -1, 0] == 255
+    assert stretched[0, 0, 0] == round(255 * low / high)
 
 
 @pytest.mark.skipif(not features.check("avif"), reason="this Pillow writes no AVIF")

@@ -97,9 +97,9 @@ def test_labels_name_components_that_can_be_seen():
 def test_motions_are_rigid_and_nan_only_for_what_bends():
     for name in SCENES:
         M = pair(name).truth.motions
-        known = np.isfinite(M).all(axis=(1, 2))
-        assert known.tolist() == [True] + [name not in RIGID] * (len(M) - 1)
-        R = M[known, :3, :3]
+        rigid = np.isfinite(M).all(axis=(1, 2))
+        assert rigid.tolist() == [True] + [name not in RIGID] * (len(M) - 1)
+        R = M[rigid, :3, :3]
         np.testing.assert_allclose(
             R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-12
         )

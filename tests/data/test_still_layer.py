@@ -53,15 +53,15 @@ def test_what_stands_still_leaves_the_images():
     layer, other = (np.dstack([texture(60, 80, seed)] * 3) for seed in (0, 1))
     for image in without_still_layer(layer, layer):
         assert image.std() == 0
-    for image, given in zip(without_still_layer(layer, other), (layer, other)):
+    for image, original in zip(without_still_layer(layer, other), (layer, other)):
         # a random derivative shares its sign with another half of the time
-        assert 0.5 * given.std() < image.std() < given.std()
+        assert 0.5 * original.std() < image.std() < original.std()
 
 
 @pytest.mark.slow
 def test_the_road_moves_behind_a_reflection(reflecting: Pair):
-    given = with_flow(reflecting, still=True)
-    seen = see_through(given)
+    reflected = with_flow(reflecting, still=True)
+    seen = see_through(reflected)
     assert seen is not None
     assert seen.flow is not None
     assert seen.flow.source == "dis"
@@ -75,7 +75,7 @@ def test_the_road_moves_behind_a_reflection(reflecting: Pair):
     assert np.mean(sure[moved]) > 0.25
     # what moves is left alone where the next frame shows it
     above = np.s_[20:90, 100:400]
-    assert np.mean((seen.flow.uv == given.flow.uv)[above]) > 0.95
+    assert np.mean((seen.flow.uv == reflected.flow.uv)[above]) > 0.95
 
 
 @pytest.mark.slow
@@ -88,7 +88,7 @@ def test_true_flow_is_believed(reflecting: Pair):
     """The correction applies to computed flow only, and an option disables it."""
     small = {"input": {"kind": "memory", "hash": "0"}, "segmentation": {"superpixels": 60}}
     for source, flow in (("truth", {}), ("dis", {"see_through": False})):
-        given = with_flow(reflecting, still=True, source=source)
-        case = prepare(make_problem({**small, "flow": flow}), pair=given)
+        reflected = with_flow(reflecting, still=True, source=source)
+        case = prepare(make_problem({**small, "flow": flow}), pair=reflected)
         assert case.seen is case.pair
         assert (case.pair.flow.uv[BEHIND] == 0).all()

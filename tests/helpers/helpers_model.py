@@ -125,16 +125,17 @@ class Tiny:
         self.data: EnergyData = build_energy_data(
             self.seg, self.flow, K_REF, K_NEXT, samples, seed, arap_at_anchors=at_anchors
         )
-        # E_prior lets every third edge have a relief for nothing
+        # E_prior allows a relief of 0.3 at every third edge without cost
         relief = np.where(np.arange(len(self.data.edges)) % 3, 0.0, 0.3)
-        # and a depth prior knows two of three
-        change, known = np.log(rng.uniform(0.7, 1.4, len(relief))), rng.random(len(relief)) < 0.7
-        given = {"depth_weight": 0.4 * known, "depth_change": change}
-        # occlusion tells the order of two of three pairs
+        # a depth prior determines about two of three edges
+        change = np.log(rng.uniform(0.7, 1.4, len(relief)))
+        has_depth = rng.random(len(relief)) < 0.7
+        prior = {"depth_weight": 0.4 * has_depth, "depth_change": change}
+        # occlusion determines the order of about two of three pairs
         pairs = len(self.data.pairs)
-        given["order_weight"] = rng.choice([-0.7, 0.0, 1.0], pairs)
-        given["order_step"] = rng.uniform(0.0, 0.4, pairs)
-        self.data = replace(self.data, prior_relief=relief, **given)
+        prior["order_weight"] = rng.choice([-0.7, 0.0, 1.0], pairs)
+        prior["order_step"] = rng.uniform(0.0, 0.4, pairs)
+        self.data = replace(self.data, prior_relief=relief, **prior)
         if units == "pixels":
             self.data = in_pixels(self.data, self.soup, self.seg)
 
@@ -182,16 +183,20 @@ def exact_terms(
         view = tangent_nlp._views(layout.chart)
     out = {}
     for name, element in elements(data, weights, layout).items():
-        own = ca.SX.sym("x", layout.stride * element.arity)
+        variables = ca.SX.sym("x", layout.stride * element.arity)
         row = {k: ca.SX.sym(k, count) for k, count in element.fields.items()}
-        views = [view(part, row, a) for a, part in enumerate(ca.vertsplit(own, layout.stride))]
+        views = [
+            view(part, row, a) for a, part in enumerate(ca.vertsplit(variables, layout.stride))
+        ]
         total = ca.SX(0)
         for n in element.norms(views, row, ca.SX(0), ca.SX(0)):
             square = ca.dot(n.vector, n.vector)
             y = square / 2 if n.kind == "half_square" else ca.sqrt(square)
             cut = y if n.sigma is None else ca.fmin(y, n.sigma)
             total += n.weight * ((1 - n.leak) * cut + n.leak * y)
-        f = ca.Function("f", [own, ca.vertcat(*row.values())], [total]).map(len(element.index))
+        f = ca.Function("f", [variables, ca.vertcat(*row.values())], [total]).map(
+            len(element.index)
+        )
         table = np.column_stack([c.reshape(len(c), -1) for c in element.columns.values()])
         out[name] = float(np.asarray(f(x[element.index].T, table.T)).sum())
     return out
@@ -232,10 +237,10 @@ def with_true_flow(pair: Pair) -> Pair:
     truth = pair.truth
     assert truth is not None
     assert truth.flow is not None
-    known = np.isfinite(truth.flow).all(-1)
-    uv = np.where(known[..., None], truth.flow, 0.0)
+    valid = np.isfinite(truth.flow).all(-1)
+    uv = np.where(valid[..., None], truth.flow, 0.0)
     # float64 on purpose: float32 rounding (1e-6 px) would hide an inexact formula
-    return pair.with_flow(Flow(uv, known.astype(float), "truth"))
+    return pair.with_flow(Flow(uv, valid.astype(float), "truth"))
 
 
 def plane_soup(pose: Float, move: Float, count: int) -> Soup:

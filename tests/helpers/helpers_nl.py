@@ -77,9 +77,9 @@ class ReadBack:
         return ca.Function("h", self._inputs, [H])
 
 
-def close(found: object, expected: object) -> None:
+def close(actual: object, expected: object) -> None:
     """Equal to 1e-12 of the largest number."""
-    a = np.asarray(found, float)
+    a = np.asarray(actual, float)
     b = np.asarray(expected, float).reshape(a.shape)
     assert np.isfinite(a).all()
     assert np.abs(a - b).max(initial=0.0) <= 1e-12 * max(1.0, np.abs(b).max(initial=0.0))

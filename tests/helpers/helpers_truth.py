@@ -29,8 +29,8 @@ def cropped(pair: Pair, left: int, top: int, right: int, bottom: int) -> Pair:
     flow, truth = pair.flow, pair.truth
     if flow is not None:
         flow = replace(flow, uv=cut(flow.uv), confidence=cut(flow.confidence))
-    known = {name: getattr(truth, name) for name in IMAGES}
-    truth = replace(truth, **{k: cut(v) for k, v in known.items() if v is not None})
+    maps = {name: getattr(truth, name) for name in IMAGES}
+    truth = replace(truth, **{k: cut(v) for k, v in maps.items() if v is not None})
     cameras = {"K_ref": pair.K_ref.copy(), "K_next": pair.K_next.copy()}
     for K in cameras.values():
         K[:2, 2] -= [left, top]

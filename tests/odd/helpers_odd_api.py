@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from helpers_odd_options import depth_png
-from helpers_odd_run import Case, every
+from helpers_odd_run import Case, cases
 from helpers_odd_world import SIZE, World
 
 import soup_nlp
@@ -61,8 +61,8 @@ def pair(w: World, **changes: Any) -> Any:
 
 def flow(**changes: Any) -> Any:
     """A flow with other arguments."""
-    uv, one = np.zeros((*SIZE, 2), np.float32), np.ones(SIZE, np.float32)
-    return soup_nlp.Flow(**({"uv": uv, "confidence": one} | changes))
+    uv, ones = np.zeros((*SIZE, 2), np.float32), np.ones(SIZE, np.float32)
+    return soup_nlp.Flow(**({"uv": uv, "confidence": ones} | changes))
 
 
 Call = Callable[[World, Path, Any], Any]
@@ -155,7 +155,7 @@ LEFT_OUT = {
     # right names of files, in the working folder
     "run ipopt_log": "None, text",
     "save folder": "text",
-    # what the caller's own function raises is the caller's
+    # an exception of the caller's function is not an error of the package
     **{f"run {name}": "None, type, function" for name in ("listener", "log", "on_stage")},
 }
 
@@ -166,11 +166,11 @@ def _called(do: Call) -> Any:
 
 
 def api_cases() -> Iterator[Case]:
-    """All of these."""
+    """Calls of the Python API with every kind of argument."""
     for name, call in CALLS.items():
         fine, left = (table.get(name, "").split(", ") for table in (FINE, LEFT_OUT))
         for quiet in (False, True):
             things = {k: v for k, v in THINGS.items() if k not in left and (k in fine) is quiet}
-            yield from every(API, f"api {name} {{}}", _called(call), things, quiet=quiet)
+            yield from cases(API, f"api {name} {{}}", _called(call), things, quiet=quiet)
     huge = {"truth that overflows": np.full(SIZE, 1e300)}
-    yield from every(API, "{}", _called(lambda w, o, x: soup_nlp.Truth(depth_ref=x)), huge)
+    yield from cases(API, "{}", _called(lambda w, o, x: soup_nlp.Truth(depth_ref=x)), huge)

@@ -9,7 +9,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-from helpers_odd_run import ANY, DOORS, Case, changed, every, words, write, written
+from helpers_odd_run import ANY, DOORS, Case, cases, changed, words, write, written
 from helpers_odd_world import NO_FOLDER, ODD, World
 
 from soup_nlp.cli.main import main
@@ -107,19 +107,19 @@ def path_cases() -> Iterator[Case]:
     for door, line in READ.items():
         # an empty folder lists no problem, which is no mistake
         other = {"folder": (0,)} if door == "list" else None
-        yield from every(DOORS, f"{door} {{}}", line, KINDS, other=other)
+        yield from cases(DOORS, f"{door} {{}}", line, KINDS, other=other)
     for name, text in DATASETS.items():
         make = _dataset(name, text)
-        yield from every(DOORS, f"dataset {name} {{}}", "solve {x} -o {out}", KINDS, make=make)
+        yield from cases(DOORS, f"dataset {name} {{}}", "solve {x} -o {out}", KINDS, make=make)
     for door, line in WRITE.items():
-        yield from every(DOORS, f"{door} -o {{}}", line, NO_FOLDER)
-    yield from every(DOORS, "list of {}", "list {x}", KINDS, (0, 2), make=_listed)
+        yield from cases(DOORS, f"{door} -o {{}}", line, NO_FOLDER)
+    yield from cases(DOORS, "list of {}", "list {x}", KINDS, (0, 2), make=_listed)
     for name in ("depth_ref.png", "points_next.ply", "overview.png", "result.h5", "summary.json"):
         codes = (2,) if name in ("result.h5", "summary.json") else (1,)
         make = changed("result", name, _instead)
-        yield from every("3 check", f"check {name} {{}}", "check {x}", INSTEAD, codes, make=make)
+        yield from cases("3 check", f"check {name} {{}}", "check {x}", INSTEAD, codes, make=make)
     page = changed("result", "report.html", _instead)
-    yield from every(DOORS, "view page {}", "view {x} --no-open", INSTEAD, (0, 2), make=page)
+    yield from cases(DOORS, "view page {}", "view {x} --no-open", INSTEAD, (0, 2), make=page)
 
 
 # --- texts ---------------------------------------------------------------------------------------
@@ -156,7 +156,7 @@ TEXTS: dict[str, str | bytes] = {
     "set": "!!set {a, b}",
 }
 FEW = ("deep JSON", "very huge integer", "binary", "control characters", "nul bytes")
-"""What is tried where a case takes a second: the others are left to count_odd.py."""
+"""Texts that are tried where a case takes a second; count_odd.py tries the others."""
 USES: dict[str, tuple[str, Any, tuple[int, ...]]] = {
     "summary": ("check {x}", changed("result", "summary.json"), (2,)),
     "config": ("check {x}", changed("result", "config.yaml"), (1, 2)),
@@ -198,21 +198,21 @@ def text_cases() -> Iterator[Case]:
     for use, (line, make, codes) in USES.items():
         solves = TEXTS.keys() - FEW if use in ("config", "over manifest") else False
         title = f"text {use} {{}}"
-        yield from every(DOORS, title, line, TEXTS, codes, make=make, solves=solves)
+        yield from cases(DOORS, title, line, TEXTS, codes, make=make, solves=solves)
     spoken = {
         name: text if isinstance(text, str) else text.decode("utf-8", "surrogateescape")
         for name, text in TEXTS.items()
     }
     spoken = {k: v for k, v in spoken.items() if "\0" not in v and len(v) < 100_000}
-    yield from every(DOORS, "text --set {}", "show {p} --set name={x}", spoken, (0, 2))
+    yield from cases(DOORS, "text --set {}", "show {p} --set name={x}", spoken, (0, 2))
     # no such limit of time is enough for a run: the rows are read before
     for verb, file, line in (
         ("compare", "runs.jsonl", "compare {p} --solvers no_such_solver -o {o}"),
         ("speed", "table.jsonl", f"{SMALL_SPEED} --set segmentation.superpixels=x -o {{o}}"),
     ):
-        yield from every(DOORS, f"rows {verb} {{}}", line, ROWS, ANY, make=written(file))
-    yield from every(DOORS, "rows read {}", _rows, ROWS, make=written("r.jsonl"), quiet=True)
-    yield from every(DOORS, "rows read file {}", _odd_rows, KINDS, quiet=True)
+        yield from cases(DOORS, f"rows {verb} {{}}", line, ROWS, ANY, make=written(file))
+    yield from cases(DOORS, "rows read {}", _rows, ROWS, make=written("r.jsonl"), quiet=True)
+    yield from cases(DOORS, "rows read file {}", _odd_rows, KINDS, quiet=True)
 
 
 UNTRUSTED = {
@@ -244,10 +244,10 @@ def _manifest(path: Path, text: str) -> None:
 
 
 def _status(path: Path, text: str) -> None:
-    own = json.loads(path.read_text())
-    own["status"] = own["metrics"]["solution"]["scale_rule"] = text
-    own["metrics"][text] = own["metrics"]["solution"]
-    path.write_text(json.dumps(own))
+    summary = json.loads(path.read_text())
+    summary["status"] = summary["metrics"]["solution"]["scale_rule"] = text
+    summary["metrics"][text] = summary["metrics"]["solution"]
+    path.write_text(json.dumps(summary))
 
 
 UNTRUSTING: dict[str, tuple[str, Any, tuple[int, ...]]] = {
@@ -286,6 +286,6 @@ def _tags(w: World, o: Path, name: str) -> None:
 
 def untrusted_cases() -> Iterator[Case]:
     for use, (line, make, codes) in UNTRUSTING.items():
-        yield from every("6 untrusted", f"{use} {{}}", line, UNTRUSTED, codes, make=make)
+        yield from cases("6 untrusted", f"{use} {{}}", line, UNTRUSTED, codes, make=make)
     tags = {"of tags": "a</script><img src=x onerror=alert(1)>"}
-    yield from every("6 untrusted", "name {}", _tags, tags, quiet=True, solves=True)
+    yield from cases("6 untrusted", "name {}", _tags, tags, quiet=True, solves=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from helpers_odd_run import ANY, DOORS, Case, every, written
+from helpers_odd_run import ANY, DOORS, Case, cases, written
 from helpers_odd_world import SIZE, World, encoded_noise, png
 from PIL import ExifTags, Image
 
@@ -91,7 +91,7 @@ def _saved(channels: int) -> Any:
 def array_cases() -> Iterator[Case]:
     for door in ("flow", "depth"):
         line = f"{{solve}} --{door} {{x}}"
-        yield from every(DOORS, f"npy {door} {{}}", line, LIES, make=written("x.npy"))
+        yield from cases(DOORS, f"npy {door} {{}}", line, LIES, make=written("x.npy"))
     for option, channels, good in (
         ("confidence", 1, ("of truth values", "zero")),
         (
@@ -103,10 +103,10 @@ def array_cases() -> Iterator[Case]:
         other, make = dict.fromkeys(good, ANY), _saved(channels)
         line = f"{{solve}} --flow-{option} {{x}}"
         title = f"{option} {{}}"
-        yield from every(DOORS, title, line, MAPS, make=make, other=other, solves=good)
+        yield from cases(DOORS, title, line, MAPS, make=make, other=other, solves=good)
         line = f"{{solve}} --flow dis --flow-{option} {{d}}"
-        yield from every(DOORS, f"flow_{option} {{}}", line, ["without a flow"])
-    yield from every(DOORS, "json of {}", "{solve} --json --ref no.png", ["an error"])
+        yield from cases(DOORS, f"flow_{option} {{}}", line, ["without a flow"])
+    yield from cases(DOORS, "json of {}", "{solve} --json --ref no.png", ["an error"])
 
 
 # --- images --------------------------------------------------------------------------------------
@@ -166,13 +166,13 @@ EXIF: dict[str, dict[int, Any] | bytes] = {
 def _photos(w: World, o: Path, exif: dict[int, Any] | bytes) -> None:
     for word in "ab":
         with Image.open(w.good(f"{word}.png")) as image:
-            own: Any = exif
+            tags: Any = exif
             if isinstance(exif, dict):
-                own = image.getexif()
-                own.update({k: v for k, v in exif.items() if k == SHOWN})
+                tags = image.getexif()
+                tags.update({k: v for k, v in exif.items() if k == SHOWN})
                 inner = {k: v for k, v in exif.items() if k != SHOWN}
-                own.get_ifd(ExifTags.IFD.Exif).update(inner)
-            image.save(o / f"{word}.jpg", exif=own)
+                tags.get_ifd(ExifTags.IFD.Exif).update(inner)
+            image.save(o / f"{word}.jpg", exif=tags)
 
 
 def image_cases() -> Iterator[Case]:
@@ -183,10 +183,10 @@ def image_cases() -> Iterator[Case]:
         "ref and next": "{solve} --flow dis --ref {x} --next {x}",
     }.items():
         title, make = f"image {{}} as {doors}", written("x.png")
-        yield from every("4 endless", title, line, IMAGES, make=make, other=tiffs)
+        yield from cases("4 endless", title, line, IMAGES, make=make, other=tiffs)
     # pictures that are read, and a flow that is not there
     line = "solve {o}/a.jpg {o}/b.jpg --flow nothing.flo -q -o {out}"
-    yield from every(DOORS, "exif {}", line, EXIF, make=_photos)
+    yield from cases(DOORS, "exif {}", line, EXIF, make=_photos)
 
 
 # --- networks ------------------------------------------------------------------------------------
@@ -213,15 +213,15 @@ def network(path: Path, kind: str) -> None:
         "whole numbers": [("Cast", ["two"], "o", {"to": TensorProto.INT32})],
     }.get(kind, [])
     nodes = [helper.make_node("Slice", ["in", "s", "e", "x"], ["two"])]
-    nodes += [helper.make_node(op, given, [to], **more) for op, given, to, more in steps]
+    nodes += [helper.make_node(op, names, [to], **options) for op, names, to, options in steps]
     constants = [whole("s", 0), whole("e", end), whole("x", axis)]
     constants += [
         helper.make_tensor(name, TensorProto.FLOAT, [1], [value])
         for name, value in (("minus", -1.0), ("null", 0.0))
     ]
-    given = helper.make_tensor_value_info("in", TensorProto.FLOAT, shape)
-    found = helper.make_tensor_value_info("o" if steps else "two", element, out)
-    graph = helper.make_graph(nodes, "g", [given], [found], constants)
+    images = helper.make_tensor_value_info("in", TensorProto.FLOAT, shape)
+    flow = helper.make_tensor_value_info("o" if steps else "two", element, out)
+    graph = helper.make_graph(nodes, "g", [images], [flow], constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     if kind == "unknown range":
         model.metadata_props.add(key="input_range", value="\x1b[31m" * 2000)
@@ -249,7 +249,7 @@ def _network(w: World, o: Path, kind: str) -> str:
 
 def network_cases() -> Iterator[Case]:
     free = ("NaN", "infinite", "whole numbers")
-    yield from every(
+    yield from cases(
         DOORS, "network {}", "{solve} --flow {x}", NETWORKS, make=_network, solves=free,
         other=dict.fromkeys(free, ANY),
     )  # fmt: skip

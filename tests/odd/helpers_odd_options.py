@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from helpers_odd_run import ANY, DOORS, Case, every, words, write
+from helpers_odd_run import ANY, DOORS, Case, cases, words, write
 from helpers_odd_world import SIZE, World
 
 from soup_nlp.cli.main import BENCH, COMMANDS, _load, main
@@ -15,18 +15,18 @@ from soup_nlp.config.problem import Problem
 from soup_nlp.schema.section import Section
 
 
-def numeric_fields(model: type[Section], place: str = "") -> Iterator[tuple[str, bool]]:
+def numeric_fields(model: type[Section], prefix: str = "") -> Iterator[tuple[str, bool]]:
     """Names of options that are numbers, and whether they are whole."""
     for key, info in model.model_fields.items():
         kind = info.annotation
-        if place == "" and key == "input":
+        if prefix == "" and key == "input":
             continue
         if isinstance(kind, type) and issubclass(kind, Section):
-            yield from numeric_fields(kind, f"{place}{key}.")
+            yield from numeric_fields(kind, f"{prefix}{key}.")
         elif "float" in str(kind):
-            yield f"{place}{key}", False
+            yield f"{prefix}{key}", False
         elif "int" in str(kind):
-            yield f"{place}{key}", True
+            yield f"{prefix}{key}", True
 
 
 WITH = {
@@ -34,7 +34,7 @@ WITH = {
     "refine": "--set refine.enabled=true --set refine.from_start=true --set refine.rounds=1"
     " --set refine.particles=4",
 }
-"""What has to be set so that an option counts, by the beginning of its name."""
+"""Settings without which an option has no effect, by the beginning of its name."""
 LARGE = "1" + "0" * 30
 NUMBERS = {
     "intrinsics 0 {}": "{solve} --intrinsics={x},60,32,24",
@@ -50,44 +50,44 @@ SCENE = (
 
 
 def _scene(w: World, o: Path, text: str) -> str:
-    own = {"width": "64", "height": "48", "seed": "0"} | dict([text.split("=")])
-    inside = ", ".join(f"{k}: {v}" for k, v in own.items())
+    options = {"width": "64", "height": "48", "seed": "0"} | dict([text.split("=")])
+    inside = ", ".join(f"{k}: {v}" for k, v in options.items())
     write(o / "p.yaml", f"input: {{kind: scene, scene: street, {inside}}}\n")
     return str(o / "p.yaml")
 
 
 def number_cases() -> Iterator[Case]:
     for name, whole in numeric_fields(Problem):
-        more = next((text for begin, text in WITH.items() if name.startswith(begin)), "")
+        settings = next((text for begin, text in WITH.items() if name.startswith(begin)), "")
         values = (LARGE, "1000000000", "-1") if whole else ("1e300", "1e9", "1e-300", "-1", ".nan")
         form = {"solver.presolve_eps": "[{}]", "solver.ipopt": "{{tol: {}}}"}.get(name, "{}")
         free = {form.format(v) for v in ("1e9", "1e-300")}
         texts = [form.format(v) for v in values]
         solves = texts if "sigma" in name or name == "solver.ipopt" else free
-        line = f"{{solve}} {more} --set {name}={{x}}"
-        yield from every("2 numbers", f"number {name}={{}}", line, texts, ANY, solves=solves)
+        line = f"{{solve}} {settings} --set {name}={{x}}"
+        yield from cases("2 numbers", f"number {name}={{}}", line, texts, ANY, solves=solves)
     scenes = [
         *(f"width={v}" for v in ("63", LARGE, "1000000", "-5")),
         *(f"height={v}" for v in ("47", LARGE, "1000000")),
         *(f"seed={v}" for v in (LARGE, "-1", "5000000000")),
     ]
-    yield from every(DOORS, "scene {}", SCENE, scenes, ANY, make=_scene)
+    yield from cases(DOORS, "scene {}", SCENE, scenes, ANY, make=_scene)
     free = ("1e9", "1e5", "0", "-60", "1e-300")
     for title, line in NUMBERS.items():
         numbers = ("nan", "inf", "1e300", *free)
-        yield from every("2 numbers", title, line, numbers, ANY, solves=free)
+        yield from cases("2 numbers", title, line, numbers, ANY, solves=free)
     for option in ("--depth-scale", "--cap"):
         line = f"evaluate {{result}} --depth {{o}}/d.png {option}={{x}}"
         numbers = ("nan", "inf", "1e300", "1e-300", "-1", "0")
         make = lambda w, o, x: depth_png(o) and x  # noqa: E731
-        yield from every("2 numbers", f"evaluate {option}={{}}", line, numbers, (0, 2), make=make)
+        yield from cases("2 numbers", f"evaluate {option}={{}}", line, numbers, (0, 2), make=make)
     for option in ("--seconds", "--iterations"):
         line = f"compare {{p}} --solvers no_such_solver {option}={{x}} -o {{out}}"
         numbers = ("nan", "inf", "1e300", "0", "-1", "x")
-        yield from every("2 numbers", f"compare {option}={{}}", line, numbers)
+        yield from cases("2 numbers", f"compare {option}={{}}", line, numbers)
     shown = ("-0.1", "1.1", ".nan", "word", "[]", "null")
     line = "show {p} --set output.min_confidence={x}"
-    yield from every("2 numbers", "min_confidence {}", line, shown)
+    yield from cases("2 numbers", "min_confidence {}", line, shown)
 
 
 def depth_png(o: Path) -> Path:
@@ -133,7 +133,7 @@ def _checked(w: World, o: Path, argv: list[str]) -> list[str]:
     assert code in (0, 1), code
     if code == 0:
         return ["check", str(o / "out")]
-    # what is not claimed need not hold, but the check ends well all the same
+    # a result that did not converge may fail the check, but the check must end without error
     assert main(["check", str(o / "out")]) in (0, 1)
     return words("show {p}", w, o)
 
@@ -157,7 +157,7 @@ def solve_cases() -> Iterator[Case]:
         ("solve focal {}", focal, ("1e5", "1e7", "1e9")),
         ("solve depth_scale {}", _scaled, ("1e-300", "1e300", "1e-30")),
     ):
-        yield from every("2 results", title, do, values, (0, 2), solves=True)
+        yield from cases("2 results", title, do, values, (0, 2), solves=True)
 
 
 # --- options -------------------------------------------------------------------------------------
@@ -179,7 +179,7 @@ BASES = {
     "export": "export {p} -q -o {out}",
     "import": "import {exported} {sol} -o {out}",
     "compare": "compare {p} --solvers no_such_solver -o {out}",
-    # those that would run for minutes: their target is a file, which they must refuse first
+    # commands that would run for minutes: their target is a file, which they must reject first
     "family": "family {odd} --sizes=100 --scenes=orbit",
     "bench accuracy": "bench accuracy --suite=rendered --only=orbit --width=64 {tiny} -q -o {odd}",
     "bench search": "bench search --suite=rendered --only=orbit --width=64 -q -o {odd}",
@@ -214,10 +214,10 @@ def _option_case(command: str, word: str, name: str, value: str) -> Case:
     line = BASES.get(command, f"{command} -q -o {{odd}}")
 
     def run(w: World, o: Path) -> list[str]:
-        own = value
+        argument = value
         if word == "--out" and value.strip() and not value.startswith(("/", "~", "\0")):
-            own = str(o / value)
-        return [*words(line, w, o, "garbage"), f"{word}={own}" if word else own]
+            argument = str(o / value)
+        return [*words(line, w, o, "garbage"), f"{word}={argument}" if word else argument]
 
     text = value if len(value) < 12 else f"{value[:6]}... of {len(value)}"
     title = f"option {command} {word or name.upper()} {text!r}"
@@ -228,6 +228,6 @@ PRESETS = ("", "Paper", "../paper", "paper,paper", "[paper]", "{a: 1}", "\x1b[31
 
 
 def preset_cases() -> Iterator[Case]:
-    yield from every(DOORS, "preset {}", "show {p} --preset={x}", PRESETS, other={"~": (0,)})
+    yield from cases(DOORS, "preset {}", "show {p} --preset={x}", PRESETS, other={"~": (0,)})
     fine = {"~": (0,), "": (0,)}
-    yield from every(DOORS, "preset of a file {}", "show {p} --set preset={x}", PRESETS, other=fine)
+    yield from cases(DOORS, "preset of a file {}", "show {p} --set preset={x}", PRESETS, other=fine)

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import h5py
 import numpy as np
-from helpers_odd_run import ANY, DOORS, Case, changed, every, h5_damage, words, write
+from helpers_odd_run import ANY, DOORS, Case, cases, changed, h5_damage, words, write
 from helpers_odd_world import SIZE, World, encoded_noise
 
 
@@ -151,24 +151,24 @@ def result_cases() -> Iterator[Case]:
     unsure = [*UNSEEN, "attribute broken JSON", "attribute deep JSON"]
     unsure += [name for name in STRUCTURE if name.startswith("attribute")]
     linked = {k: v for k, v in STRUCTURE.items() if "cycle" in k or "link" in k}
-    rest = {k: v for k, v in STRUCTURE.items() if k not in linked}
+    unlinked = {k: v for k, v in STRUCTURE.items() if k not in linked}
     for verb, line, codes, other in (
         ("check", "check {x}", (2, 1), dict.fromkeys(unsure, ANY) | certain),
         ("evaluate", "evaluate {x} --depth {d}", ANY, certain),
     ):
         title = f"h5 {verb} {{}}"
-        yield from every("4 endless", title, line, linked, codes, make=broken, other=other)
-        yield from every(DOORS, title, line, rest, codes, make=broken, other=other)
+        yield from cases("4 endless", title, line, linked, codes, make=broken, other=other)
+        yield from cases(DOORS, title, line, unlinked, codes, make=broken, other=other)
         flip = changed("result", "result.h5", _flip)
         ends = ("start", "middle", "end")
-        yield from every(DOORS, f"h5 {verb} flipped {{}}", line, ends, ANY, make=flip)
+        yield from cases(DOORS, f"h5 {verb} flipped {{}}", line, ends, ANY, make=flip)
     formats = "ply,glb,colmap,npy,pfm,png,rrd,motions"
     for line in (f"convert {{x}} --to {formats}", "view {x} --renew --no-open"):
         title = f"{line.split()[0]} h5 {{}}"
-        yield from every(DOORS, title, line, CONTENTS, (0, 2), make=broken)
-    yield from every(DOORS, "convert {}", "convert {exported} --to npy -o {out}", ["an export"])
-    yield from every(DOORS, "convert {}", "convert {result} --to npy,npy -o {o}", ["twice"], (0,))
-    yield from every(DOORS, "view {}", "view {exported} --no-open", ["an export"])
+        yield from cases(DOORS, title, line, CONTENTS, (0, 2), make=broken)
+    yield from cases(DOORS, "convert {}", "convert {exported} --to npy -o {out}", ["an export"])
+    yield from cases(DOORS, "convert {}", "convert {result} --to npy,npy -o {o}", ["twice"], (0,))
+    yield from cases(DOORS, "view {}", "view {exported} --no-open", ["an export"])
 
 
 def mine(*names: str) -> Any:
@@ -186,27 +186,27 @@ def lost_cases() -> Iterator[Case]:
     """Files of the user that a command would replace."""
     line = "family {o} --sizes=100 --scenes=orbit --starts=hard"
     names = ("notes.txt", "index.json", ".hidden")
-    yield from every(DOORS, "family over {}", line, names, make=mine())
+    yield from cases(DOORS, "family over {}", line, names, make=mine())
     over = {"mesh_ref.glb": "glb", "colmap/notes.txt": "colmap"}
     for name, to in over.items():
         line, codes = f"convert {{result}} --to {to} -o {{o}}", (0, 2) if to == "colmap" else (2,)
-        yield from every("1 lost", "convert over {}", line, [name], codes, make=mine(name))
+        yield from cases("1 lost", "convert over {}", line, [name], codes, make=mine(name))
     for name, to in {"depth_ref.npy": "npy", "points_ref.ply": "ply"}.items():
         copy = changed("result", name, lambda path, value: write(path, "mine"))
-        yield from every("1 lost", "convert over {}", f"convert {{x}} --to {to}", [name], make=copy)
+        yield from cases("1 lost", "convert over {}", f"convert {{x}} --to {to}", [name], make=copy)
 
 
 # --- sequences -----------------------------------------------------------------------------------
 
 
-def clip(*names: str, sizes: tuple[tuple[int, int], ...] = (SIZE,), more: str = "") -> Any:
+def clip(*names: str, sizes: tuple[tuple[int, int], ...] = (SIZE,), options: str = "") -> Any:
     """`chain` of a folder of images of noise, of one size or of one each."""
 
     def do(w: World, o: Path, _: object = None) -> list[str]:
         (o / "clip").mkdir(exist_ok=True)
         for k, name in enumerate(names or ("frame_0.png", "frame_1.png")):
             (o / "clip" / name).write_bytes(encoded_noise(sizes[k % len(sizes)]))
-        return words(f"chain {{o}}/clip {{tiny}} {more} -q -o {{out}}", w, o)
+        return words(f"chain {{o}}/clip {{tiny}} {options} -q -o {{out}}", w, o)
 
     return do
 
@@ -222,7 +222,7 @@ def beside(name: str, make: Callable[[Path], object]) -> Any:
     return do
 
 
-def video(frames: int, size: tuple[int, int] = SIZE, more: str = "", own: str = "") -> Any:
+def video(frames: int, size: tuple[int, int] = SIZE, options: str = "", user_file: str = "") -> Any:
     """`chain` of a video of noise, into a folder that holds a file of the user."""
 
     def do(w: World, o: Path, _: object) -> list[str]:
@@ -230,9 +230,9 @@ def video(frames: int, size: tuple[int, int] = SIZE, more: str = "", own: str = 
         for _ in range(frames):
             coder.write(cv2.imdecode(np.frombuffer(encoded_noise(size), np.uint8), 1))
         coder.release()
-        if own:
-            mine(own)(w, o, None)
-        return words(f"chain {{o}}/c.avi {more} -q -o {{out}}", w, o)
+        if user_file:
+            mine(user_file)(w, o, None)
+        return words(f"chain {{o}}/c.avi {options} -q -o {{out}}", w, o)
 
     return do
 
@@ -259,9 +259,9 @@ def _no_result(w: World, o: Path, _: object) -> list[str]:
 
 CHAINS: dict[str, Any] = {
     "stride of 5001 digits": f"{CHAIN} --stride=1{'0' * 5000}",
-    "auto of two frames alike": clip("1.png", "2.png", more="--stride=auto"),
+    "auto of two frames alike": clip("1.png", "2.png", options="--stride=auto"),
     "one image": "chain {a} {tiny} -q -o {out}",
-    "one frame of a folder": clip(more="--stride=3"),
+    "one frame of a folder": clip(options="--stride=3"),
     "two cameras": f"{CHAIN} --intrinsics={{camera}} --fov=50",
     "other input": f"{CHAIN} --set input.kind=scene",
     "memory": f"{CHAIN} --set input.kind=memory --set input.hash=x",
@@ -272,8 +272,8 @@ CHAINS: dict[str, Any] = {
     "scene over two": "chain scene:orbit --two-frame -q -o {out}",
     "images of two sizes": clip(sizes=(SIZE, (48, 80))),
     "images too small": clip(sizes=((8, 8),)),
-    "superscripts": clip("1²3.png", "1²4.png", more="--fov=400"),
-    "digits of other scripts": clip("\u0661.png", "\u0662.png", more="--fov=400"),
+    "superscripts": clip("1²3.png", "1²4.png", options="--fov=400"),
+    "digits of other scripts": clip("\u0661.png", "\u0662.png", options="--fov=400"),
     "images that are folders": beside("frame_1.png", lambda p: (p.unlink(), p.mkdir())),
     "camera is a folder": beside("K.txt", Path.mkdir),
     "camera is a pipe": beside("K.txt", os.mkfifo),
@@ -285,8 +285,8 @@ CHAINS: dict[str, Any] = {
     "text among frames": beside("frame_2.png", lambda p: p.write_text("no picture")),
     "video of one frame": video(1),
     "video of tiny frames": video(3, (16, 16)),
-    "video over frames of the user": video(3, own="out/frames/0000.png"),
-    "video with a stride beyond": video(3, more="--stride=9"),
+    "video over frames of the user": video(3, user_file="out/frames/0000.png"),
+    "video with a stride beyond": video(3, options="--stride=9"),
     "page of the user": into("chain.html", b"mine"),
     "clouds of the user": into("points/0000.ply", b"mine"),
     "pairs is a file": into("pairs", b"mine"),
@@ -304,10 +304,10 @@ SOURCES = (
 
 
 def chain_cases() -> Iterator[Case]:
-    # two sizes of images are fine, and what nothing is read with is not looked at
+    # two sizes of images are allowed; the other two chains may end in either way
     fine = ("digits of other scripts", "auto of two frames alike", "images of two sizes")
-    yield from every(DOORS, "chain {}", None, CHAINS, other=dict.fromkeys(fine, ANY))
-    yield from every(DOORS, "chain source {}", "chain {x} -q -o {out}", SOURCES)
+    yield from cases(DOORS, "chain {}", None, CHAINS, other=dict.fromkeys(fine, ANY))
+    yield from cases(DOORS, "chain source {}", "chain {x} -q -o {out}", SOURCES)
     empty = lambda w, o, _: (o / "clip").mkdir()  # noqa: E731
     line = "chain {o}/clip -q -o {out}"
-    yield from every(DOORS, "chain {}", line, ["no images"], make=empty)
+    yield from cases(DOORS, "chain {}", line, ["no images"], make=empty)

@@ -34,7 +34,7 @@ class Case:
 
     Attributes:
         group: Class of failure that it is an example of.
-        name: Of the case, unique.
+        name: Unique name of the case.
         do: Prepares the input and returns the words of a command line, or calls the Python API
             and returns None.
         codes: Exit codes that are right for a command line.
@@ -55,7 +55,7 @@ Make = Callable[[World, Path, Any], object]
 value in the command line."""
 
 
-def every(
+def cases(
     group: str,
     title: str,
     do: str | Callable[[World, Path, Any], list[str] | None] | None,
@@ -71,13 +71,13 @@ def every(
 
     Args:
         group: Class of the cases.
-        title: Their names; {} stands for that of the value.
-        do: Command line (see `words`) or function; None if the values are such.
+        title: Name of a case; {} stands for the name of its value.
+        do: Command line (see `words`) or function; None if the values are lines or functions.
         values: Values by name, or values whose names are their texts.
         codes: Exit codes that are right.
         make: Prepares the input.
-        other: Exit codes of single values.
-        solves: Whether they may solve, or the names of those that may.
+        other: Exit codes of single values, by name.
+        solves: Whether the cases may solve, or the names of the values that may.
         quiet: Whether the API may accept the value.
     """
     named = values if isinstance(values, Mapping) else {str(v): v for v in values}
@@ -87,9 +87,9 @@ def every(
             x = value if make is None else make(w, o, value)
             return words(do, w, o, str(x)) if isinstance(do, str) else do(w, o, x)
 
-        found = (other or {}).get(name, codes)
+        right = (other or {}).get(name, codes)
         yield Case(
-            group, title.format(name), run, found, quiet, solves is True or name in (solves or ())
+            group, title.format(name), run, right, quiet, solves is True or name in (solves or ())
         )
 
 
@@ -178,7 +178,7 @@ def fault(case: Case, world: World, folder: Path, seconds: int = 60) -> str | No
     """
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", "strict", write_through=True) for _ in "12")
     err.reconfigure(errors="backslashreplace")
-    # what a case makes, it makes once: not timed, and not judged
+    # the time limit includes the preparation of the case
     before = signal.signal(signal.SIGALRM, _alarm)
     signal.alarm(seconds)
     try:
@@ -194,8 +194,8 @@ def fault(case: Case, world: World, folder: Path, seconds: int = 60) -> str | No
         return "memory"
     except BaseException as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
-        place = f"{Path(where.filename).name}:{where.lineno}"
-        return f"traceback: {type(error).__name__}: {str(error)[:100]!r} at {place}"
+        origin = f"{Path(where.filename).name}:{where.lineno}"
+        return f"traceback: {type(error).__name__}: {str(error)[:100]!r} at {origin}"
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)

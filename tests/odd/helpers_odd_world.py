@@ -95,12 +95,12 @@ class World:
 
     @cached_property
     def run(self) -> Run:
-        """What Python gets of the tiny pair."""
+        """The record of a solve of the tiny pair."""
         return run(load_problem(self.good("p.yaml")))
 
     @cached_property
     def exported(self) -> Path:
-        """An exported folder with an answer, soup.sol, that claims nothing."""
+        """An exported folder with a solver's answer, soup.sol, that is not optimal."""
         out = self.root / "exported"
         assert main(["export", str(self.good("p.yaml")), "-o", str(out), "-q"]) == 0
         rows, columns = (len((out / f"soup.{s}").read_text().split()) for s in ("row", "col"))

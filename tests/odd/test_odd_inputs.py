@@ -1,4 +1,4 @@
-"""Bad and odd inputs: every one ends in an error that helps, or in a result that holds.
+"""Bad and odd inputs: each ends in a helpful error or in a valid result.
 
 `tests/tools/count_odd.py` counts them by class, each in a process of its own with little memory;
 it has the cases that solve as well.
@@ -35,7 +35,7 @@ def table_of(case: Case) -> str:
 
 
 TABLES: dict[str, list[Case]] = {}
-# every fourth one: the others are as much alike, and the suite has a limit of time
+# every fourth case: the others are similar, and the suite has a limit of time
 for _case in [case for case in CASES if not case.solves][::4]:
     TABLES.setdefault(table_of(_case), []).append(_case)
 
@@ -54,10 +54,10 @@ def test_the_collection_is_large_and_its_names_are_unique():
 def test_odd_inputs_are_answered(table, world, tmp_path, monkeypatch):
     # some cases write a relative path
     monkeypatch.chdir(tmp_path)
-    found = {}
+    faults = {}
     for number, case in enumerate(TABLES[table]):
         folder = tmp_path / str(number)
         folder.mkdir()
         if problem := fault(case, world, folder):
-            found[case.name] = problem
-    assert not found
+            faults[case.name] = problem
+    assert not faults

@@ -20,9 +20,9 @@ from soup_nlp.storage.store import Array, write_h5, write_json
 @pytest.fixture
 def small_disk(tmp_path) -> Iterator[Path]:
     """A file system of 1 MB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(place)]
+    mount_point = tmp_path / "disk"
+    mount_point.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(mount_point)]
     try:
         done = subprocess.run(words, capture_output=True, check=False)
     except OSError:
@@ -30,9 +30,9 @@ def small_disk(tmp_path) -> Iterator[Path]:
     if done.returncode:
         pytest.skip("file systems cannot be mounted here")
     try:
-        yield place
+        yield mount_point
     finally:
-        subprocess.run(["umount", str(place)], check=True)
+        subprocess.run(["umount", str(mount_point)], check=True)
 
 
 def write(folder: Path, size: int) -> None:

@@ -309,10 +309,10 @@ def test_a_move_that_fails_is_finished_later(tmp_path, monkeypatch):
     target, replace = tmp_path / "out", os.replace
     write(target, a="1", b="1")
 
-    def failing(source, place):
-        if Path(place) == target / "c":
+    def failing(source, destination):
+        if Path(destination) == target / "c":
             raise OSError(5, "Input/output error")
-        replace(source, place)
+        replace(source, destination)
 
     with monkeypatch.context() as m:
         m.setattr(os, "replace", failing)

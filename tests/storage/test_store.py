@@ -149,16 +149,16 @@ def test_h5_unreadable(tmp_path):
 
 
 def test_require_lists_what_is_there():
-    there = {"soup": {"R": np.eye(3), "t": np.zeros(3)}}
-    np.testing.assert_array_equal(require(there, "soup/R"), np.eye(3))
+    tree = {"soup": {"R": np.eye(3), "t": np.zeros(3)}}
+    np.testing.assert_array_equal(require(tree, "soup/R"), np.eye(3))
     with pytest.raises(DataError, match=r"\['R', 't'\]"):
-        require(there, "soup/lambda")
+        require(tree, "soup/lambda")
     with pytest.raises(DataError, match=r"\['soup'\]"):
-        require(there, "graph/edges")
+        require(tree, "graph/edges")
     with pytest.raises(DataError, match="is a group"):
-        require(there, "soup")
+        require(tree, "soup")
     with pytest.raises(DataError, match="an array"):
-        require(there, "soup/R/x")
+        require(tree, "soup/R/x")
 
 
 # --- JSON -----------------------------------------------------------------------------------
