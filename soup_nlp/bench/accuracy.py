@@ -121,7 +121,7 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
 
 
 def _sigma(result: Run) -> Row:
-    """ "within" and "sparsification" of sigma, of the true pixels after a median scale."""
+    """ "within" and "sparsification" of sigma at true pixels, after a median scale."""
     truth, sigma = result.pair.truth, result.reconstruction.sigma_ref
     if truth is None or not has_depth(truth) or sigma is None:
         return {"within": None}
@@ -131,11 +131,14 @@ def _sigma(result: Run) -> Row:
         return {"within": None}
     z, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
     uncertain = at_truth(truth, sigma)[0][true]
-    found = sparsification(np.abs(z - gt) / gt, uncertain)
-    curve = [[round(float(v), 5) for v in line] for line in (found.kept, found.error, found.oracle)]
+    measured = sparsification(np.abs(z - gt) / gt, uncertain)
+    curve = [
+        [round(float(v), 5) for v in line]
+        for line in (measured.kept, measured.error, measured.oracle)
+    ]
     return {
         "within": coverage(np.abs(np.log(z / gt)), uncertain),
-        "sparsification": {"ause": found.ause, "curve": curve},
+        "sparsification": {"ause": measured.ause, "curve": curve},
     }
 
 
@@ -170,7 +173,7 @@ def _metrics(
 
 
 def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
-    """Errors of independently moving pixels and of the others, under one common scale.
+    """Errors of independently moving pixels and of all other pixels, under one common scale.
 
     Args:
         pair: Its truth must have components (0 is the static scene) and dense depth.
@@ -187,11 +190,11 @@ def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
     gt, label = truth.depth_ref, truth.components
     moving_part = (label > 0) & moves_by_itself(truth)[label]
     counts = convention.mask(gt) & np.isfinite(gt) & (gt > 0)
-    moves, rest = counts & moving_part, counts & (label >= 0) & ~moving_part
-    if not moves.any() or not rest.any():
+    moves, static = counts & moving_part, counts & (label >= 0) & ~moving_part
+    if not moves.any() or not static.any():
         return None
     z = depth * convention.score(depth, gt).scale
-    masks = {"mre": moves, "rest": rest}
+    masks = {"mre": moves, "rest": static}
     return {k: depth_metrics(z, gt, scale="none", mask=m).mre for k, m in masks.items()}
 
 
@@ -243,7 +246,7 @@ def unorganised(soup: Soup) -> Soup:
 def depth_maps(run: Run) -> dict[str, Float]:
     """(H, W) depths of the reference frame by method, for a run whose pair has a truth of depth.
 
-    "nlp" is present if the NLP was refined, the rigid ones if a motion fits, and "constant" if
+    "nlp" is present if the NLP was refined, the rigid depths if a motion fits, and "constant" if
     there is a truth.
     """
     pair, seg = run.pair, run.segmentation
@@ -255,8 +258,8 @@ def depth_maps(run: Run) -> dict[str, Float]:
     alone = reconstruct(unorganised(run.start.soup), labels, pair.K_ref, pair.K_next)
     out["unorganised"] = alone.depth_ref
     if run.rigid is not None:
-        there = np.isfinite(run.rigid)
-        out["solution_rigid"] = np.where(there, run.reconstruction.depth_ref, np.nan)
+        valid = np.isfinite(run.rigid)
+        out["solution_rigid"] = np.where(valid, run.reconstruction.depth_ref, np.nan)
         out["rigid"] = run.rigid
         if np.isfinite(run.rigid).any():
             out["rigid_filled"] = fill_nearest(run.rigid)

@@ -34,25 +34,25 @@ def write_suite(page: Path, frame: pd.DataFrame, note: str = "") -> None:
 def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = False) -> str:
     """The page of the rows of one suite, with or without its picture."""
     good = frame[frame["ok"].eq(True)].copy()
-    known = good[good["mre"].notna()]
+    scored = good[good["mre"].notna()]
     settings = ", ".join(sorted(frame["settings"].astype(str).unique()))
-    lines = [f"# Accuracy on {name}", "", note, "", _verdict(good, known, len(frame)), ""]
+    lines = [f"# Accuracy on {name}", "", note, "", _verdict(good, scored, len(frame)), ""]
     lines += [f"{provenance(frame)}; settings {settings} (one a flow source).", ""]
-    for convention in dict.fromkeys(p for presets in known["presets"] for p in presets):
-        lines += _convention(convention, known)
-    lines += [*_families(known), *_better_baselines(known)]
-    for convention, group in known.groupby("main", sort=False):
+    for convention in dict.fromkeys(p for presets in scored["presets"] for p in presets):
+        lines += _convention(convention, scored)
+    lines += [*_families(scored), *_better_baselines(scored)]
+    for convention, group in scored.groupby("main", sort=False):
         lines += _details(str(convention), group)
     if picture:
         lines += ["## Sigma", "", f"![Sparsification by sigma, by family]({name}.png)", ""]
     return page_text([*lines[:-1], *failures(frame)])
 
 
-def _verdict(good: pd.DataFrame, known: pd.DataFrame, total: int) -> str:
-    beaten = beating(known)["title"].nunique()
+def _verdict(good: pd.DataFrame, scored: pd.DataFrame, total: int) -> str:
+    beaten = beating(scored)["title"].nunique()
     return (
-        f"{len(good)} of {total} pairs measured, {int(good.get('good', known['ok']).sum())}"
-        f" converged. The solution beats every baseline on {len(known) - beaten} of {len(known)}"
+        f"{len(good)} of {total} pairs measured, {int(good.get('good', scored['ok']).sum())}"
+        f" converged. The solution beats every baseline on {len(scored) - beaten} of {len(scored)}"
         " (MRE, each pair's own convention)."
     )
 
@@ -74,10 +74,10 @@ def beating(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _better_baselines(frame: pd.DataFrame) -> list[str]:
-    found = beating(frame)
-    if found.empty:
+    better = beating(frame)
+    if better.empty:
         return []
-    found["difference"] = found["theirs"] - found["mre"]
+    better["difference"] = better["theirs"] - better["mre"]
     columns = {
         "main": ("convention", ""),
         "baseline": ("baseline", ""),
@@ -87,7 +87,7 @@ def _better_baselines(frame: pd.DataFrame) -> list[str]:
         "difference": ("difference", "+.4f"),
     }
     text = "The solution's MRE is on the pixels that the baseline has a depth for."
-    lines = titled(found.set_axis(pd.Index(found["title"], name="pair, flow")), columns)
+    lines = titled(better.set_axis(pd.Index(better["title"], name="pair, flow")), columns)
     return ["## Baselines that are better", "", text, "", *lines, ""]
 
 
@@ -95,16 +95,16 @@ def _convention(name: str, frame: pd.DataFrame) -> list[str]:
     """Tables of the MRE of every method under one convention, by pair, sequence and dataset."""
     columns = {f"metrics.{name}.{m}.mre": m for m in METHODS}
     columns |= {f"metrics.{name}.solution.{k}": k for k in ("skill", "coverage")}
-    known = frame[frame[f"metrics.{name}.solution.mre"].notna()]
+    scored = frame[frame[f"metrics.{name}.solution.mre"].notna()]
     keys = ["suite", "sequence", "flow", "title"]
-    numbers = known[[c for c in columns if c in known]].astype(float).rename(columns=columns)
+    numbers = scored[[c for c in columns if c in scored]].astype(float).rename(columns=columns)
     numbers = numbers.dropna(axis=1, how="all")
     text = preset(name).text
     lines = [f"## MRE, {preset(name)}", "", f"{text[0].upper()}{text[1:]}.", ""]
-    lines += markdown(numbers.set_axis(pd.Index(known["title"], name="pair, flow")))
+    lines += markdown(numbers.set_axis(pd.Index(scored["title"], name="pair, flow")))
     for level, by in (("sequence", keys[:3]), ("dataset", ["suite", "flow"])):
-        groups = pd.concat([known[keys], numbers], axis=1).groupby(by, sort=False)
-        if 0 < groups.ngroups < len(known):
+        groups = pd.concat([scored[keys], numbers], axis=1).groupby(by, sort=False)
+        if 0 < groups.ngroups < len(scored):
             means = groups[list(numbers.columns)].mean()
             means.insert(0, "pairs", groups.size())
             lines += ["", f"Mean per {level}:", "", *markdown(means, _forms(means))]

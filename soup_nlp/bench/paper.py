@@ -78,8 +78,8 @@ def make_plan(
     datasets = {name: _dataset(name, data, limit) for name in DATASETS}
     studied = _families(STUDIED, datasets, data)
     compared = [(name, item) for name, items in datasets.items() for item in items]
-    known = {item.key for _, item in compared}
-    compared += [("", item) for item in studied if item.key not in known]
+    compared_keys = {item.key for _, item in compared}
+    compared += [("", item) for item in studied if item.key not in compared_keys]
     lines: list[dict[str, Any]] = []
 
     def add(section: str, items: Iterable[tuple[str, Item]], n: int = analysis) -> None:
@@ -89,12 +89,12 @@ def make_plan(
                     count = int(change) if section == "superpixels" else n
                     size = f"segmentation.superpixels={count}"
                     printed = _scaled(PRINTED if base else (), count)
-                    every = (*base, size, *printed, *overrides, *_scaled(changes, count))
+                    all_overrides = (*base, size, *printed, *overrides, *_scaled(changes, count))
                     maps = None
                     if section == "comparison":
                         name = f"{item.key}-{method}".replace(": ", "_")
                         maps = folder / "maps" / f"{name.replace('/', '-').replace(' ', '_')}.npz"
-                    cell = Cell(item, every, ", ".join(every), maps)
+                    cell = Cell(item, all_overrides, ", ".join(all_overrides), maps)
                     key = cell.identity()["key"]
                     line = section, method, change, dataset, item.name, cell, key
                     lines.append(dict(zip(COLUMNS, line, strict=True)))
@@ -183,8 +183,8 @@ def measure_paper(cell: Cell) -> Row:
     """The row of `measure_pair` with energies on the way; small depth maps go to `cell.keep`.
 
     "curve" has "names" and "values", the smoothed energy by stage and iteration, "exact", the exact
-    energies of start and NLP, and "rounds", the objective of the refinement before its rounds and
-    after each.
+    energies of start and NLP, and "rounds", the objective of the refinement before the first round
+    and after each round.
 
     Raises:
         SoupError: the pair cannot be solved or scored.

@@ -55,8 +55,8 @@ def write_paper(
     departures = sections.pop("departures", none)
     lines = [*_head(frame, command, note), *_comparison(folder, compared)]
     lines += _pictures(folder, compared)
-    for name, own in sections.items():
-        lines += _study(folder, str(name), own)
+    for name, section_rows in sections.items():
+        lines += _study(folder, str(name), section_rows)
     lines += [*_convergence(folder, compared), *_time(compared), *_departures(folder, departures)]
     lines += [*_missing(set(plan["dataset"])), *failures(frame)]
     page.write_text(page_text(lines), encoding="utf-8")
@@ -260,11 +260,11 @@ def _departures(folder: Path, rows: pd.DataFrame) -> list[str]:
     return [*lines, "", *_figure("departures", text)]
 
 
-def _missing(given: set[str]) -> list[str]:
-    """Table of the data of the paper without rows, `given` being the datasets that have some."""
+def _missing(present: set[str]) -> list[str]:
+    """Table of the paper's data without rows; `present` names the datasets that have rows."""
     reasons = {}
     for name, (title, suites, _) in DATASETS.items():
-        if name not in given:
+        if name not in present:
             suite = SUITES[suites[0]]
             reasons[title] = f"no pair was given; from {suite.source}, as {suite.layout}"
     table = pd.Series(reasons | WITHOUT_TRUTH, name="why, and where from").rename_axis("data")

@@ -145,8 +145,8 @@ def _child(
     except BaseException as error:
         memory_gone = "bad_alloc" in str(error)
         answer = ("killed: memory", None) if memory_gone else ("raised", _reason(error))
-    both = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
-    peak = max(resource.getrusage(who).ru_maxrss for who in both)
+    scopes = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+    peak = max(resource.getrusage(scope).ru_maxrss for scope in scopes)
     part = target.with_suffix(".part")
     part.write_bytes(pickle.dumps((*answer, peak * 1024)))
     part.rename(target)
@@ -155,8 +155,8 @@ def _child(
 def _reason(error: BaseException) -> str:
     """An exception in one line."""
     if isinstance(error, SoupError):
-        found = "" if error.found is None else f", found {error.found}"
-        return f"{type(error).__name__}: {error.what}{found}"
+        detail = "" if error.found is None else f", found {error.found}"
+        return f"{type(error).__name__}: {error.what}{detail}"
     # the last line of a library's message has the cause
     text = "".join(traceback.format_exception_only(error)).strip().splitlines()
     return text[-1] if text else type(error).__name__

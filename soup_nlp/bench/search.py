@@ -75,8 +75,8 @@ def parse_space(texts: Sequence[str]) -> Space:
     out: dict[str, BaseDistribution] = {}
     for text in texts:
         try:
-            key, _, rest = text.partition("=")
-            kind, low, high = rest.split(":")
+            key, _, spec = text.partition("=")
+            kind, low, high = spec.split(":")
             out[key] = makers[kind](low, high)
             if not key or not float(low) < float(high):
                 raise ValueError(text)
@@ -97,7 +97,7 @@ def as_yaml(value: float) -> str:
 
 
 def pair_loss(frame: pd.DataFrame) -> pd.Series:
-    """ln(MRE / MRE of a constant depth) of every row, at most FAILED_LOSS, that of a failed pair.
+    """ln(MRE / MRE of a constant depth) of every row, at most FAILED_LOSS, the loss of a failure.
 
     With the logarithm, halving the error counts the same on easy and on hard pairs.
     """
@@ -126,7 +126,7 @@ def search(
         overrides: Overrides of every problem; those of a trial come after them.
 
     Returns:
-        The frame of all rows: "variant" is the trial, "loss" that of the pair, "settings" the
+        The frame of all rows: "variant" is the trial, "loss" is the pair's loss, "settings" the
         overrides of the trial as text.
 
     Raises:
@@ -158,8 +158,8 @@ def leave_one_family_out(frame: pd.DataFrame) -> pd.DataFrame:
     """Hold out every family (sequence) in turn; empty if there is only one.
 
     Returns:
-        By family: "trial", the best one on all other families, and "change", that of the geometric
-        mean of the MRE over the held-out family, relative to the default.
+        By family: "trial", the best trial on all other families, and "change", the relative change
+        of the geometric mean MRE over the held-out family against the default.
     """
     losses = frame.groupby(["variant", "sequence"])["loss"].agg(["sum", "size"])
     sums, sizes = losses["sum"].unstack(), losses["size"].unstack()

@@ -197,7 +197,7 @@ def schedule(options: SolverOptions) -> tuple[float, ...]:
 
 def _reference(case: Case) -> Row:
     """Result of Levenberg-Marquardt from the same start on the same energy."""
-    found = levenberg_marquardt(
+    reference = levenberg_marquardt(
         case.soup,
         case.data,
         case.weights,
@@ -207,13 +207,13 @@ def _reference(case: Case) -> Row:
         seconds=case.options.max_seconds,
     )
     pair = case.pair
-    dense = reconstruct(found.soup, case.segmentation.labels, pair.K_ref, pair.K_next)
+    dense = reconstruct(reference.soup, case.segmentation.labels, pair.K_ref, pair.K_next)
     scores = score_depths(pair.truth, {"lm": dense.depth_ref})
     return {
-        "status": found.status,
-        "energy": dict(found.energy),
-        "iterations": found.iterations,
-        "cpu_seconds": found.cpu_seconds,
+        "status": reference.status,
+        "energy": dict(reference.energy),
+        "iterations": reference.iterations,
+        "cpu_seconds": reference.cpu_seconds,
         "mre": scores["lm"].mre if scores else None,
     }
 

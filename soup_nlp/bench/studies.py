@@ -141,8 +141,8 @@ def _overrides(values: Mapping[str, Any]) -> Overrides:
 _WEIGHTS = tuple(f"energy.weights.{w}" for w in ("arap", "proj", "cont", "orient", "sigma_cont"))
 _ADDED = ("prior", "sigma_arap", "leak_arap")
 _PIXELS = {key: default(key) for key in ("energy.units", *_WEIGHTS)}
-_HELD = {f"energy.weights.{w}": default(f"energy.weights.{w}") for w in _ADDED}
-_MORE = {"energy.pixel_samples": 64, "segmentation.boundary_samples": 12}
+_ADDED_WEIGHTS = {f"energy.weights.{w}": default(f"energy.weights.{w}") for w in _ADDED}
+_DENSE_SAMPLES = {"energy.pixel_samples": 64, "segmentation.boundary_samples": 12}
 _SMALL = {"max_size": 0.05}
 _SHARED = {"start.method": "shared"}
 
@@ -179,7 +179,7 @@ DEPARTURES = (
     Departure(
         "another energy where surfaces bend",
         ("start.bending",),
-        with_on={**_SHARED, **_PIXELS, **_HELD},
+        with_on={**_SHARED, **_PIXELS, **_ADDED_WEIGHTS},
         needs="on: with the start that finds them, pixel units and all weights",
     ),
     Departure("prior on relief", ("energy.weights.prior",)),
@@ -204,8 +204,8 @@ DEPARTURES = (
     ),
     Departure(
         "samples of pixels and boundaries",
-        with_off=_MORE,
-        with_on=_MORE,
+        with_off=_DENSE_SAMPLES,
+        with_on=_DENSE_SAMPLES,
         needs="off in both: 64 pixels a superpixel, 12 points a boundary (default 16 and 3)",
     ),
     Departure("gauge: d constant", ("formulation.gauge",)),

@@ -242,7 +242,7 @@ def page_text(lines: Sequence[str]) -> str:
 
 
 def figure(width: float, height: float) -> Figure:
-    """A figure of some inches with constrained layout, which needs no display."""
+    """A figure, size in inches, with constrained layout; it needs no display."""
     # the import takes half a second, which commands without pictures do not need
     from matplotlib.figure import Figure
 
@@ -250,7 +250,7 @@ def figure(width: float, height: float) -> Figure:
 
 
 def panels(count: int, across: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of `count` panels of some inches, at most `across` in a row, and its panels."""
+    """A figure of `count` panels, each width by height inches, at most `across` in a row."""
     columns = min(across, max(1, count))
     rows = max(1, -(-count // columns))
     out = figure(width * columns, height * rows + 0.4)

@@ -59,10 +59,10 @@ Items = Iterator[Item]
 
 
 def _item(
-    sequence: str, name: str, raw: Mapping[str, Any], needs: Sequence[Path] = (), **more: Any
+    sequence: str, name: str, raw: Mapping[str, Any], needs: Sequence[Path] = (), **fields: Any
 ) -> Item:
     """A pair whose suite, flow and, unless given, conventions are added by its suite."""
-    return Item("", sequence, name, "", raw, **({"presets": ()} | more), needs=tuple(needs))
+    return Item("", sequence, name, "", raw, **({"presets": ()} | fields), needs=tuple(needs))
 
 
 def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: Options) -> Items:
@@ -74,12 +74,12 @@ def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: O
             yield _item(scene, f"{scene}-s{seed}-{width}x{height}", raw)
 
 
-def _folder(path: Path, family: str = "", kind: str = "folder", **more: Any) -> Item:
+def _folder(path: Path, family: str = "", kind: str = "folder", **entries: Any) -> Item:
     """A pair in a folder with frame_0.png, named by its family and folder."""
     name = " ".join(dict.fromkeys([family, path.name.removeprefix("pair_")]))
     presets = KITTI_SHARED if family == "kitti2015" else ()
     true_flow = family in ("kitti2015", "driving_synthetic")
-    raw = {"kind": kind, "path": str(path), **more}
+    raw = {"kind": kind, "path": str(path), **entries}
     needs = [path / "frame_0.png"]
     return _item(family, name, raw, needs, true_flow=true_flow, presets=presets)
 
@@ -97,8 +97,8 @@ def _shared(root: Path, o: Options) -> Items:
     raw = {"kind": "sintel", "root": str(root / "sintel"), "scene": "alley_1"}
     image = root / "sintel" / "training" / "clean" / "alley_1" / "frame_0020.png"
     alley = {**raw, "frame": 20, "step": 5}
-    apart = {"true_flow": False, "presets": SINTEL}
-    yield _item("sintel", "sintel alley_1-0020+5", alley, [image], **apart)
+    fields = {"true_flow": False, "presets": SINTEL}
+    yield _item("sintel", "sintel alley_1-0020+5", alley, [image], **fields)
     yield _folder(root / "tum_fr1", "tum_fr1", kind="tum")
     for path in sorted((root / "kitti2015").glob("pair_*")):
         yield _folder(path, "kitti2015")
@@ -191,12 +191,12 @@ class Suite:
         """Every wanted pair with every flow, whether its files exist or not."""
         for pair in self.pairs(root, o):
             presets, sequence = pair.presets or self.presets, pair.sequence or self.name
-            own = replace(pair, suite=self.name, sequence=sequence, presets=presets)
+            member = replace(pair, suite=self.name, sequence=sequence, presets=presets)
             if o.only and not any(word in pair.name for word in o.only):
                 continue
             for flow in o.flows or self.flows:
                 if pair.true_flow or not flow.startswith("truth"):
-                    yield replace(own, flow=flow)
+                    yield replace(member, flow=flow)
 
 
 _ALL = (

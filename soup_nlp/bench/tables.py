@@ -81,15 +81,15 @@ def measure_chain(cell: Cell, frames: int = 10) -> Row:
         which = [(k, k + 1) for k in range(len(source) - 1)]
         chain = make_chain(solve_pairs(source, which, folder, cell.overrides))
         seconds = {row["key"]: row["cpu_seconds"] for row in read_rows(folder / ROWS)}
-    found = score(chain)
-    if found is None:
+    scores = score(chain)
+    if scores is None:
         raise DataError("sequence has no truth", where=item.name)
-    errors = [abs(np.log(k["estimated"] / k["true"])) for k in found["links"]]
+    errors = [abs(np.log(k["estimated"] / k["true"])) for k in scores["links"]]
     return {
         "frames": len(source),
-        **{key: found[key] for key in ("mre_own_scale", "mre_one_scale", "cost")},
+        **{key: scores[key] for key in ("mre_own_scale", "mre_one_scale", "cost")},
         "worst_link": float(np.expm1(max(errors))),
-        "path": None if found["path"] is None else found["path"]["share"],
+        "path": None if scores["path"] is None else scores["path"]["share"],
         "flagged": sum(k.flagged for k in chain.links),
         "pair_seconds": sum(seconds.values()) / len(seconds),
     }

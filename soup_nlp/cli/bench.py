@@ -101,13 +101,13 @@ def _wanted(flow: list[str] | None, width: int, seeds: str, only: list[str] | No
     return Options(tuple(flow or ()), width, chosen, tuple(only or ()))
 
 
-def _command(name: str, data: Path | None, given: Mapping[str, Any]) -> str:
+def _command(name: str, data: Path | None, options: Mapping[str, Any]) -> str:
     """A command as text, without the place of its data; an option may have several values."""
-    said = ["--data DIR"] * (data is not None)
-    for key, value in given.items():
+    words = ["--data DIR"] * (data is not None)
+    for key, value in options.items():
         values = value if isinstance(value, list) else [] if value is None else [value]
-        said += [f"--{key} {shlex.quote(str(item))}" for item in values]
-    return f"soup-nlp bench {name} {' '.join(said)}"
+        words += [f"--{key} {shlex.quote(str(item))}" for item in values]
+    return f"soup-nlp bench {name} {' '.join(words)}"
 
 
 def accuracy(
@@ -132,21 +132,28 @@ def accuracy(
     if name and len(suite) > 1:
         raise ConfigError("one name for several suites", where="--name", found=", ".join(suite))
     wanted, changes = _wanted(flow, width, seeds, only), tuple(overrides or ())
-    cells = {own: [Cell(i, changes) for i in list_suite(own, data, wanted)] for own in suite}
+    cells = {
+        suite_name: [Cell(i, changes) for i in list_suite(suite_name, data, wanted)]
+        for suite_name in suite
+    }
     # check all names before the first suite is measured
-    claim(out, [f"{name or own}.{kind}" for own in cells for kind in ("md", "png")], overwrite)
+    claim(
+        out,
+        [f"{name or suite_name}.{kind}" for suite_name in cells for kind in ("md", "png")],
+        overwrite,
+    )
     codes = []
-    for own in cells:
-        note = f"Suite `{own}`: {SUITES[own].text}. Overrides of every pair: "
+    for suite_name in cells:
+        note = f"Suite `{suite_name}`: {SUITES[suite_name].text}. Overrides of every pair: "
         note += f"{', '.join(f'`{o}`' for o in changes) or 'none'}."
         codes.append(
             _study(
-                out / f"{name or own}.md",
-                partial(measure_cells, cells[own], measure_pair),
+                out / f"{name or suite_name}.md",
+                partial(measure_cells, cells[suite_name], measure_pair),
                 partial(write_suite, note=note),
                 quiet,
                 overwrite,
-                [f"{name or own}.png"],
+                [f"{name or suite_name}.png"],
                 workers=workers,
                 any_code=any_code,
             )
@@ -177,8 +184,8 @@ def search(
     suites, texts = suite or ["rendered"], params or searching.DEFAULT_SPACE
     wanted, space = _wanted(flow, width, seeds, only), searching.parse_space(texts)
     items = [i for name in suites for i in list_suite(name, data, wanted)]
-    given = {"suite": suites, "trials": trials, "seeds": seeds, "width": width, "flow": flow}
-    command = _command("search", data, {**given, "only": only, "set": overrides})
+    settings = {"suite": suites, "trials": trials, "seeds": seeds, "width": width, "flow": flow}
+    command = _command("search", data, {**settings, "only": only, "set": overrides})
     changes = tuple(overrides or ())
     code = _study(
         out / "search.md",
@@ -210,14 +217,14 @@ def paper(
     changes = tuple(overrides or ())
     claim(out, FILES, overwrite)
     plan = make_plan(data, out, superpixels, analysis, limit, changes)
-    given = {"superpixels": superpixels, "analysis": analysis, "limit": limit, "set": overrides}
+    settings = {"superpixels": superpixels, "analysis": analysis, "limit": limit, "set": overrides}
     note = f"Superpixels wanted: {superpixels} in the comparison, {analysis} elsewhere."
     if changes:
         note += f" Overrides of every row: {', '.join(f'`{o}`' for o in changes)}."
     code = _study(
         out / FILES[0],
         partial(measure_cells, list(plan.drop_duplicates("key")["cell"]), measure_paper),
-        partial(write_paper, plan=plan, command=_command("paper", data, given), note=note),
+        partial(write_paper, plan=plan, command=_command("paper", data, settings), note=note),
         quiet,
         overwrite,
         FILES[1:],
@@ -247,10 +254,10 @@ def speed(
     quiet: Quiet = False,
 ) -> None:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
-    chosen, known = listed(scenes), [*RENDERED, MOTORCYCLE.name]
-    if not chosen or set(chosen) - set(known):
+    chosen, known_scenes = listed(scenes), [*RENDERED, MOTORCYCLE.name]
+    if not chosen or set(chosen) - set(known_scenes):
         raise ConfigError(
-            "unknown scene", where="--scenes", found=scenes, expected=", ".join(known)
+            "unknown scene", where="--scenes", found=scenes, expected=", ".join(known_scenes)
         )
     items = timing.timed_pairs(chosen, numbers(seeds, "--seeds"), width, listed(pairs), data)
     n = numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS)
@@ -278,10 +285,10 @@ def chain(
     quiet: Quiet = False,
 ) -> None:
     """What one scale costs on rendered sequences, and on kitti_tracking in the --data folder."""
-    known = sequences(data)
-    chosen = [i for i in known if not only or any(word in i.name for word in only)]
+    all_sequences = sequences(data)
+    chosen = [i for i in all_sequences if not only or any(word in i.name for word in only)]
     if not chosen:
-        names = ", ".join(i.name for i in known)
+        names = ", ".join(i.name for i in all_sequences)
         raise ConfigError("no sequence is left", where="--only", expected=names)
     cells = [Cell(item, tuple(overrides or ())) for item in chosen]
     measured = partial(measure_cells, cells, measure_chain, own_process=True)

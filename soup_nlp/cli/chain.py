@@ -58,12 +58,12 @@ def chain(
     name, subject = named(frames_of)
     out = out or default_folder(f"chain-{name}", subject)
 
-    def begin(found: Frames, pairs: int) -> None:
-        count = len(found)
-        names = ", ".join(Path(one).name for one in found.names)
-        apart = f", far enough apart: {names}" if stride == AUTO else ""
+    def begin(sequence: Frames, pairs: int) -> None:
+        count = len(sequence)
+        names = ", ".join(Path(one).name for one in sequence.names)
+        spacing = f", far enough apart: {names}" if stride == AUTO else ""
         if not quiet:
-            print(f"{count} frames{apart}; {pairs} pairs to solve", file=sys.stderr)
+            print(f"{count} frames{spacing}; {pairs} pairs to solve", file=sys.stderr)
 
     short = {
         "segmentation.superpixels": superpixels,

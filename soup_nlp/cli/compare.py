@@ -93,18 +93,18 @@ def compare(
     before: list[Row] = []
     rows: list[Row] = []
 
-    def keep(more: list[Row]) -> None:
-        """The page after every run: a run may take minutes, and a command may be killed."""
-        rows[:] = [*before, *more]
+    def keep(new_rows: list[Row]) -> None:
+        """Write the page after every run: a run may take minutes, a command may be killed."""
+        rows[:] = [*before, *new_rows]
         with staged(folder, subject=subject) as new:
             write_text(new / "README.md", page(frame_of_runs(rows)))
 
     kept = resumable("the runs that were finished are kept, with a page of them", folder)
     try:
         with kept, scratch() as temporary:
-            for own in tasks():
+            for tasks_of_problem in tasks():
                 runs = folder / "runs.jsonl"
-                before += run_all(own, names, limits, runs, temporary, print, keep)
+                before += run_all(tasks_of_problem, names, limits, runs, temporary, print, keep)
     finally:
         # write the page of the finished runs even after an error
         if rows:

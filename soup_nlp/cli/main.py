@@ -45,8 +45,8 @@ SYSTEM = (
 def print_warning(
     message: Warning | str, category: type[Warning], *_: object, **__: object
 ) -> None:
-    """Print a warning about the input on one line; those of libraries are not printed."""
-    # loaded by whoever warns, so that --help is fast
+    """Print a warning about the input on one line; warnings of libraries are not printed."""
+    # imported here, so that --help is fast
     from soup_nlp.data.formats.images import DataWarning
 
     if issubclass(category, DataWarning):
@@ -55,7 +55,7 @@ def print_warning(
 
 def refusal(error: Exception) -> DataError | None:
     """DataError for a lack of memory, files or disk space; None for other errors."""
-    # of Python and NumPy, of native code, of OpenCV
+    # messages of native code and of OpenCV; Python and NumPy raise MemoryError
     words = ("bad_alloc", "Insufficient memory")
     if isinstance(error, MemoryError) or any(word in str(error) for word in words):
         return DataError(
@@ -75,15 +75,15 @@ def report_bug(error: BaseException) -> int:
     lines = traceback.format_exception(error)
     facts = [f"command: {sys.argv!r}", *(f"{k}: {v}" for k, v in versions().items()), ""]
     text = "\n".join(facts) + "".join(lines)
-    place = "no file could be written"
+    path = "no file could be written"
     with suppress(OSError):
-        handle, place = tempfile.mkstemp(prefix="soup_nlp_bug_", suffix=".txt")
+        handle, path = tempfile.mkstemp(prefix="soup_nlp_bug_", suffix=".txt")
         with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
             file.write(text)
     said = printable(f"{type(error).__name__}: {error}", 200)
     print(
         f"error: this is a bug of soup-nlp, please report it with the file below\n"
-        f"  found: {said}\n  where: {place}",
+        f"  found: {said}\n  where: {path}",
         file=sys.stderr,
     )
     return BUG
@@ -93,7 +93,7 @@ def refuse_odd(words: Sequence[str]) -> None:
     """Reject empty arguments, which unset shell variables cause, and control characters.
 
     Raises:
-        ConfigError: there is one.
+        ConfigError: an argument is empty or holds a control character.
     """
     for word in words:
         if not word.strip() or re.fullmatch(r"--[a-z-]+=\s*", word):
@@ -141,7 +141,7 @@ COMMANDS: Mapping[str, str] = {
 BENCH: Mapping[str, str] = {
     name: f"bench:{name}" for name in ("accuracy", "speed", "cost", "search", "paper", "chain")
 }
-"""The same for the commands of `soup-nlp bench`."""
+"""Module and function of the commands of `soup-nlp bench`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -182,10 +182,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _explained(error: Exception) -> int:
-    """Print what an exception says to the user; the exit code."""
+    """Print the message of an exception for the user; returns the exit code."""
     said: object = error if isinstance(error, SoupError) else refusal(error)
     if said is None and hasattr(error, "format_message"):
-        # a usage error; it says nothing for a bare command, whose help is printed
+        # a usage error; its message is empty for a bare command, whose help is printed
         said = printable(error.format_message())
     if said is None:
         return report_bug(error)
@@ -200,11 +200,11 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Name, imported command and remaining arguments."""
-        name, command, rest = super().resolve_command(ctx, args)
+        name, command, remaining = super().resolve_command(ctx, args)
         homes = BENCH if self.name == "bench" else COMMANDS
         if name is not None and name in homes:
             command = _load(name, homes[name])
-        return name, command, rest
+        return name, command, remaining
 
 
 @cache
@@ -232,7 +232,7 @@ def _functions(module: str) -> dict[str, str]:
 
 
 def first_line(home: str) -> str:
-    """What a command says of itself, for the help; `home` as in `COMMANDS`."""
+    """Line that describes a command in the help; `home` as in `COMMANDS`."""
     module, _, function = home.partition(":")
     return _functions(module)[function]
 
@@ -266,7 +266,7 @@ app.add_typer(_group("Measure over many runs; tables, plots and gates.", BENCH),
 
 
 @app.callback()
-def every(
+def program(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,

@@ -102,8 +102,8 @@ def changed(
 
     The preset is first, so that `--set preset=null` can undo it.
     """
-    given = [f"{key}={value}" for key, value in (short or {}).items() if value is not None]
-    return [*([] if preset is None else [f"preset={preset}"]), *(overrides or []), *given]
+    from_options = [f"{key}={value}" for key, value in (short or {}).items() if value is not None]
+    return [*([] if preset is None else [f"preset={preset}"]), *(overrides or []), *from_options]
 
 
 def located(name: str | None, what: str) -> str | None:
@@ -118,17 +118,17 @@ def numbers(text: str, option: str, least: int = 0, most: int = MAX_SEED) -> lis
         ConfigError: a word is no whole number from `least` to `most`.
     """
     try:
-        found = list(dict.fromkeys(int(word) for word in text.split(",")))
+        values = list(dict.fromkeys(int(word) for word in text.split(",")))
     except ValueError:
-        found = []
-    if not found or min(found) < least or max(found) > most:
+        values = []
+    if not values or min(values) < least or max(values) > most:
         raise ConfigError(
             "not a list of whole numbers",
             where=option,
             found=text,
             expected=f"whole numbers from {least} to {most}, comma separated",
         )
-    return found
+    return values
 
 
 def listed(text: str) -> list[str]:

@@ -45,7 +45,7 @@ def show(
     problem: Annotated[Path | None, typer.Argument(help=PROBLEM)] = None,
     overrides: Set = None,
     preset: PresetName = None,
-    every: Annotated[
+    all_options: Annotated[
         bool, typer.Option("--all", help="Every option, also the unusual ones.")
     ] = False,
 ) -> None:
@@ -61,8 +61,8 @@ def show(
         print(dump_preset(preset), end="")
         return
     chosen = load_problem(problem, changed(preset, overrides))
-    more = "" if every else "# all other options have their defaults: soup-nlp show --all\n"
-    print(f"{dump_problem(chosen, every)}{more}# hash {chosen.digest()}")
+    footer = "" if all_options else "# all other options have their defaults: soup-nlp show --all\n"
+    print(f"{dump_problem(chosen, all_options)}{footer}# hash {chosen.digest()}")
 
 
 def list_(
@@ -166,8 +166,8 @@ TABLES = (
 """Files of a set beside its instances."""
 
 
-def _list(known: tuple[object, ...]) -> str:
-    return ",".join(map(str, known))
+def _list(values: tuple[object, ...]) -> str:
+    return ",".join(map(str, values))
 
 
 def family(
@@ -195,7 +195,7 @@ def family(
     with staged(out, whole=True, overwrite=overwrite) as new:
         entries = write_family(new, chosen)
     print(f"{len(entries)} instances; {', '.join(TABLES)} in {out}/")
-    changed = [e["name"] for e in entries if e["published"] is False]
-    if changed:
-        print(f"{len(changed)} are not the published bytes: please report processor and versions")
-    raise typer.Exit(1 if changed else 0)
+    differing = [e["name"] for e in entries if e["published"] is False]
+    if differing:
+        print(f"{len(differing)} are not the published bytes: please report processor and versions")
+    raise typer.Exit(1 if differing else 0)

@@ -66,8 +66,8 @@ def check(
         print(table_text(rows))
         print(foreign_verdict(imported))
         good, claim = all(r.ok for r in rows), "constraint"
-    said = f"every {claim} holds" if good else f"a {claim} does not hold"
-    print(f"exit code   {int(not good)}: {said}")
+    conclusion = f"every {claim} holds" if good else f"a {claim} does not hold"
+    print(f"exit code   {int(not good)}: {conclusion}")
     raise typer.Exit(int(not good))
 
 
@@ -138,9 +138,9 @@ def foreign_verdict(imported: Imported) -> str:
     s, sol = imported.run.solution, imported.sol
     word = "verified" if s.converged else "not verified" if sol.solved else "no success claimed"
     start = imported.manifest["exact_energy_at_start"]["total"]
-    said = sol.headline or "no message"
+    headline = sol.headline or "no message"
     lines = [
-        f"solver      {said} ({sol.status}, code {sol.code}): {word}",
+        f"solver      {headline} ({sol.status}, code {sol.code}): {word}",
         # start of the solver, which after a presolve is not the proposal
         f"energy      start {start:.6g}  solution {s.energy['total']:.6g}",
         "residuals   " + "  ".join(f"{k} {v:.1e}" for k, v in s.residuals.items()),
@@ -164,13 +164,13 @@ def view(
 ) -> None:
     """Open the page of a result in a browser, or serve it."""
     page, renewed = (CHAIN_PAGE, renew_chain_page) if is_chain(folder) else (PAGE, renew_page)
-    place = folder / page
-    if renew or not place.is_file():
-        place = renewed(folder)
+    file = folder / page
+    if renew or not file.is_file():
+        file = renewed(folder)
     if serve is None:
-        address = place.resolve().as_uri()
+        address = file.resolve().as_uri()
         opened = not no_open and webbrowser.open(address)
-        print(f"opened      {place}" if opened else f"open        {address}")
+        print(f"opened      {file}" if opened else f"open        {address}")
         return
     handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
     try:

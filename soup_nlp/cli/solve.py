@@ -119,7 +119,7 @@ def solve(
         "depth_prior.kind": depth_prior_kind,
     }
     changes = changed(preset, overrides, keys)
-    given = {
+    pair_options = {
         "ref": ref,
         "next": next_,
         "intrinsics": camera(intrinsics, "--intrinsics"),
@@ -128,7 +128,7 @@ def solve(
         "depth": depth,
         "undistort": undistort or None,
     }
-    pair = {key: value for key, value in given.items() if value is not None}
+    pair = {key: value for key, value in pair_options.items() if value is not None}
     words = source or []
     if len(words) == 1 and words[0].suffix.lower() not in IMAGES:
         chosen = _from_file(words[0], pair, changes)
@@ -144,10 +144,10 @@ def solve(
 def _from_file(problem: Path, pair: Mapping[str, Any], changes: Sequence[str]) -> Problem:
     """The problem of a file, which must come without options of a pair."""
     if pair:
-        said = ", ".join(f"--{key.replace('_', '-')}" for key in pair)
+        options_text = ", ".join(f"--{key.replace('_', '-')}" for key in pair)
         raise ConfigError(
             "a problem file names its own pair",
-            found=f"{problem} and {said}",
+            found=f"{problem} and {options_text}",
             expected="a problem file, or the options of a pair",
             hint="--set input.KEY=VALUE changes the input of a problem file",
         )
@@ -161,10 +161,10 @@ def _from_images(words: Sequence[Path], pair: Mapping[str, Any], changes: Sequen
     if len(images) == len(words) == 2 and not named:
         named = {"ref": str(words[0]), "next": str(words[1])}
     elif words or len(named) == 1:
-        found = [*map(str, words), *(f"--{key} {image}" for key, image in named.items())]
+        words_found = [*map(str, words), *(f"--{key} {image}" for key, image in named.items())]
         raise ConfigError(
             "a pair is two images",
-            found=", ".join(found),
+            found=", ".join(words_found),
             expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
             hint="soup-nlp chain solves more than two frames" if len(words) > 2 else None,
         )
@@ -175,8 +175,8 @@ def _from_images(words: Sequence[Path], pair: Mapping[str, Any], changes: Sequen
             expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
             hint="soup-nlp demo, or soup-nlp solve motorcycle --out out/motorcycle",
         )
-    place = as_path(named["ref"], "reference image", home=True).absolute()
-    name = "-".join([place.parent.name, place.stem, Path(named["next"]).stem]).lstrip("-")
+    reference = as_path(named["ref"], "reference image", home=True).absolute()
+    name = "-".join([reference.parent.name, reference.stem, Path(named["next"]).stem]).lstrip("-")
     raw = {
         "name": title(name),
         "input": {"kind": "files", **pair, **named},
