@@ -172,8 +172,8 @@ def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
     """Read a problem file.
 
     Args:
-        path: YAML file, or the bare name of one that comes with the package, such as "street";
-            relative paths of the latter start from the working folder.
+        path: YAML file, or the bare name of a problem of the package, such as "street", whose
+            relative paths start from the working folder.
         overrides: `a.b=value` with the value in YAML.
 
     Raises:

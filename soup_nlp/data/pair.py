@@ -219,7 +219,7 @@ class Pair:
         flow: The flow from reference to next, or None if it is not estimated yet.
         truth: The truth, or None.
         name: Name for titles and folders.
-        depth_prior: (H, W) depth of the reference frame from elsewhere, or an inverse depth or an
+        depth_prior: (H, W) depth of the reference frame from another method, or inverse depth or
             order (`data.inputs.PriorOptions`); NaN where unknown. An array or the name of a file.
         focal_sigma: Standard deviation of the log focal length; 0 for a known focal length. From
             0.4, that of a guess, the flow corrects the focal length.

@@ -198,7 +198,7 @@ class Section(BaseModel):
 
     @classmethod
     def make(cls, values: Mapping[str, Any]) -> Self:
-        """A record of the values, the others at their defaults.
+        """A record with these values and defaults for the other fields.
 
         Raises:
             ConfigError: a name is unknown, or a value is of the wrong type or out of range.

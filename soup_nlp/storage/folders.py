@@ -2,11 +2,11 @@
 
 A command first checks the names that it will write (`claim`). Later it writes its files into a
 hidden folder in the target (`staged`). One rename gives that folder its mark; its files are then
-renamed to their places, and a later call finishes what a kill interrupts (`recover`).
+renamed to their places. After a kill, a later call finishes the renaming (`recover`).
 
 The hidden file MARK lists the files in a folder that the program made, with their SHA-256. A file
-that is not listed, or that was changed, belongs to the user. The mark also says what the folder is
-the result of.
+that is not listed, or that was changed, belongs to the user. The mark also has the subject of the
+result, such as the frames that were solved.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MARK = ".soup_nlp"
 """Hidden file of a folder with results: JSON, SHA-256 by name of every file that was made."""
 
 SUBJECT = "of"
-"""Key of the mark: what the folder is the result of."""
+"""Key of the mark for the subject of the result."""
 
 
 def made_files(folder: Path) -> dict[str, str]:
@@ -88,7 +88,7 @@ def release(folder: Path, names: Iterable[str], overwrite: bool) -> None:
 
     Raises:
         DataError: the folder holds files of the user with these names and `overwrite` is not set,
-            or a folder with one of them.
+            or a folder of one of these names.
     """
     foreign = [name for name in names if is_foreign(folder, name)]
     if not foreign:

@@ -129,7 +129,7 @@ def measure_all(
     after: Callable[[list[Row]], None] | None = None,
     any_code: bool = False,
 ) -> list[Row]:
-    """The row of every job; jobs whose row the file does not hold yet are measured.
+    """The row of every job, from the file or else measured.
 
     A stored row is used for a job of the same name and code version unless the row failed. Every
     new row is appended as soon as it is measured, so that an interrupted run can be continued.

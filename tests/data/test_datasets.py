@@ -256,7 +256,7 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert pair.K_ref[0, 0] == 688
     for number in (1, 2):
         picture(base / "final" / "alley_1" / f"frame_{number:04d}.png", number)
-    # of this scene the camera is known, and yet it is not that of a file
+    # the default camera is that of alley_1, but the warning still says that no file gives it
     with pytest.warns(
         DataWarning, match=r"camdata_left.*assumed: the focal length of alley_1, 688 pixels$"
     ):

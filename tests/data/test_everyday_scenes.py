@@ -1,4 +1,4 @@
-"""Rendered everyday scenes: exact truth, the parallax and the movers that each kind stands for."""
+"""Rendered everyday scenes: exact truth, and the parallax and moving bodies of each kind."""
 
 from functools import cache
 
@@ -17,7 +17,7 @@ ALL = list(LAYOUTS)
 PARALLAX = {"swing": (1, 7), "jam": (0.05, 2), "facade": (1.5, 7), "corridor": (4, 14)}
 """Bounds of the background's median parallax, px at 640 columns."""
 MOVES = {"handheld": (0.03, 0.2), "swing": (0.1, 0.32), "jam": (0.3, 0.65), "standing": (0.05, 0.3)}
-"""Bounds of the share of the image that moves; only `pan` with odd seeds moves too."""
+"""Bounds of the moving share of the image; of the other kinds, only `pan` at odd seeds has one."""
 
 
 @cache

@@ -252,7 +252,7 @@ def test_dis_on_kitti(shared_data: Path) -> None:
 
 
 HEIGHT, WIDTH = 200, 360
-# the road of a driving camera: what is far down comes nearer fast
+# the road of a driving camera: displacements grow towards the bottom of the image
 ROAD = np.array([[1.0, 0.12, -20.0], [0.0, 1.28, -10.0], [0.0, 1.4e-3, 1.0]])
 
 
@@ -312,7 +312,7 @@ def test_a_first_flow_that_is_half_wrong_is_completed():
 
 @pytest.mark.parametrize(("error", "taken"), [(0.2, False), (0.8, True)])
 def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
-    """Images without contrast: only the round trip counts, and that of the new flow is exact."""
+    """Images without contrast: only the round trip counts, and it is exact for the new flow."""
     shape = (60, 80)
     grey = np.full(shape, 128, np.uint8)
 

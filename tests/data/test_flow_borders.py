@@ -83,7 +83,7 @@ def test_pixels_without_confidence_stay():
 
 def test_a_superpixel_without_flow_attracts_nothing():
     before, flow = grid(), two_motions(0.0)
-    # what an unknown fit would say: flow 0, exactly what the pixels around have
+    # the coefficients of a superpixel without flow are 0, like the flow of the pixels around it
     flow.uv[:] = 0
     hole = before == before[20, 20]
     flow.confidence[hole] = 0
@@ -104,7 +104,7 @@ def test_flow_without_sense_still_leaves_a_partition():
 
 
 def test_where_all_pixels_scatter_none_of_them_is_suspected():
-    """The spread of a superpixel is the scale if it exceeds the given one."""
+    """The spread of a superpixel is the scale of its weights if it exceeds `SCALE_PX`."""
     v, u = np.mgrid[0:40, 0:80].astype(float)
     labels = (u >= 40).astype(np.int32)
     uv = np.stack([0.1 * u, 0.05 * v], axis=-1)

@@ -44,7 +44,7 @@ def test_what_the_way_back_confirms_is_trusted():
     confidence = confidence_of(round_trip_error(forward, backward))
     assert confidence[10:30, 5:20].min() == pytest.approx(1.0)
     assert confidence[:, 40:].max() == 0.0
-    # what leaves the image has no confidence
+    # pixels whose flow leaves the image have no confidence
     assert confidence_of(round_trip_error(forward, -forward))[:, 58:].max() == 0.0
 
 
@@ -117,7 +117,7 @@ def test_onnx_network(onnx, tmp_path, stacked, size):
     scale = np.array([1.0, 1.0]) if size[0] is None else np.array([130 / 64, 90 / 48])
     np.testing.assert_allclose(flow.uv[20, 20], 2.0 * scale, rtol=1e-4)
     assert flow.uv.shape == (90, 130, 2)
-    # the way back has the opposite sign: all but the edge is consistent
+    # the backward flow has the opposite sign: all pixels but those at the edge are consistent
     assert flow.confidence[:72, :112].min() > 0.99
     assert flow.source == "tiny.onnx"
 
@@ -177,7 +177,7 @@ def test_flow_of_reduced_frames_is_not_mixed_at_edges() -> None:
     uv[:, 5:] = 3, -1
     flow = resized_flow(Flow(uv), near, fine)
     at = np.stack(np.meshgrid(np.arange(20), np.arange(16)), axis=-1)
-    # displacement in pixels of the next image, of which a pixel has two of the reference image
+    # displacement in pixels of the next image, which are twice as wide as those of the reference
     shift = at + flow.uv - ((at + 0.5) / 2 - 0.5)
     np.testing.assert_allclose(shift[:, :10], 0, atol=1e-6)
     np.testing.assert_allclose(shift[:, 10:], np.broadcast_to((3, -1), (16, 10, 2)), atol=1e-6)

@@ -43,7 +43,7 @@ def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
         "turned.jpg": (26 / 36 * 96, *MIDDLE[::-1]),
         "tele.jpg": (77 / 36 * 96, *MIDDLE),
         "small.jpg": (26 / 36 * 48, 23.5, 15.5),
-        # without EXIF the lens is the other frame's
+        # a frame without EXIF gets the focal length of the other frame
         "plain.png": (26 / 36 * 48, 23.5, 15.5),
     }
     for name, numbers in expected.items():
@@ -110,7 +110,7 @@ def test_intrinsics_of_arrays_are_checked_too() -> None:
 def test_plausible_intrinsics_are_taken_without_a_word(folder: Path) -> None:
     for four in ((80, 80, 47.5, 31.5), (80, 90, 40, 38), (500, 500, 55, 31)):
         assert said(folder, intrinsics=[*four])[1] == ""
-    # the middle of the next frame is another one
+    # the principal point of the next frame is checked against its own middle
     with pytest.warns(DataWarning, match=r"b\.png.*far from the middle"):
         load(folder, intrinsics=[80, 80, 47.5, 31.5], intrinsics_next=[80, 80, 20, 31.5])
 
@@ -142,14 +142,14 @@ def test_distortion_is_named_or_removed(text: str, folder: Path) -> None:
     with pytest.raises(DataError, match=r"distortion[\s\S]*k1 0\.3[\s\S]*--undistort"):
         load(folder, intrinsics="camera.txt")
     pair = load(folder, intrinsics="camera.txt", undistort=True)
-    # a pixel shows what the distorted image has where OpenCV projects its ray
+    # a pixel has the colour of the distorted image at OpenCV's projection of its ray
     u, v = 60, 20
     ray = np.linalg.inv(pair.K_ref) @ [u, v, 1.0]
     at, _ = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), K, np.array(LENS))
     x, y = (np.full((1, 1), c, np.float32) for c in at.ravel())
     image = read_image(folder / "a.png")
     seen = cv2.remap(image, x, y, cv2.INTER_LINEAR)[0, 0]
-    # OpenCV rounds places to 1/32 pixel
+    # OpenCV rounds positions to 1/32 pixel
     np.testing.assert_allclose(pair.image_ref[v, u], seen, atol=4)
 
 
@@ -175,7 +175,7 @@ def test_lenses_that_are_not_distorted_or_of_another_model(folder: Path) -> None
         read_intrinsics(folder / "K.txt")
 
 
-# --- layouts beside the one ----------------------------------------------------------------------
+# --- layouts of other TUM sensors ----------------------------------------------------------------
 
 
 def tum(folder: Path, **options):
@@ -195,7 +195,7 @@ def test_tum_format_of_other_sensors(name: str | None, tmp_path: Path) -> None:
         return
     (tmp_path / name).write_text("# fx fy cx cy\n542.8 542.6 315.6 237.8\n")
     assert tum(tmp_path).K_next[0, 0] == 542.8
-    # the scale of depth is said too
+    # the assumed scale of depth is in a warning, too
     cv2.imwrite(str(tmp_path / "d.png"), np.full((480, 640), 1000, np.uint16))
     (tmp_path / "depth.txt").write_text("0.0 d.png\n")
     with pytest.warns(DataWarning, match="depth is not given; assumed: 5000 values"):

@@ -85,13 +85,13 @@ SENSOR = {"FocalPlaneXResolution": 4438.36, "FocalPlaneResolutionUnit": 2}
 @pytest.mark.parametrize(
     ("tags", "focal", "word"),
     [
-        # 135 mm of a picture that was reduced to 96 pixels: its sensor would measure 0.5 mm
+        # 135 mm for a picture that was reduced to 96 pixels: the sensor would be 0.5 mm wide
         ({"FocalLength": 135.0, **SENSOR, "ExifImageWidth": 96}, 1.2, "times the longer side"),
         # the same at 640 pixels with a lens that small sensors do not have
         ({"FocalLength": 18.0, **SENSOR, "ExifImageWidth": 640}, 1.2, "times the longer side"),
-        # of the whole sensor: 22.25 mm
+        # a picture of the whole sensor, 22.25 mm
         ({"FocalLength": 18.0, **SENSOR, "ExifImageWidth": 3888}, 18 / 22.25, "from EXIF"),
-        # of a crop: it has other sides
+        # a cropped picture has other sides than EXIF
         (
             {"FocalLength": 18.0, **SENSOR, "ExifImageWidth": 3888, "ExifImageHeight": 1000},
             1.2,
@@ -99,7 +99,7 @@ SENSOR = {"FocalPlaneXResolution": 4438.36, "FocalPlaneResolutionUnit": 2}
         ),
         ({"FocalLengthIn35mmFilm": 9000}, 1.2, "0.2 degrees of view.* is implausible"),
         ({"FocalLengthIn35mmFilm": 1}, 1.2, "is implausible"),
-        # 5 mm of a sensor of 8 mm, stored ten times as large, resolution in centimetres
+        # 5 mm before a sensor of 8 mm, EXIF of a picture ten times as large, resolution per cm
         (
             {
                 "FocalLength": 5.0,
@@ -110,7 +110,7 @@ SENSOR = {"FocalPlaneXResolution": 4438.36, "FocalPlaneResolutionUnit": 2}
             5 / 8,
             "from EXIF",
         ),
-        # millimetres alone say nothing
+        # millimetres without the width of the sensor determine nothing
         ({"FocalLength": 5.0}, 1.2, "1.2 times the longer side.*--fov"),
     ],
 )
@@ -134,7 +134,7 @@ def test_a_plausible_focal_length_of_exif_is_taken(
 @pytest.mark.parametrize(("low", "high"), [(28000, 30040), (0, 4095), (100, 60000), (16000, 65535)])
 def test_16_bits_are_stretched_to_their_values(low: int, high: int, tmp_path: Path) -> None:
     ramp = np.linspace(0, 1, 96 * 64).reshape(64, 96)
-    # both frames have one stretch, which a broken pixel does not change
+    # both frames are stretched alike; a broken pixel does not change the stretch
     for name, values in (("a", ramp), ("b", 0.5 * ramp)):
         image = np.rint(low + (high - low) * values).astype(np.uint16)
         image[5, 5] = 65535
@@ -143,7 +143,7 @@ def test_16_bits_are_stretched_to_their_values(low: int, high: int, tmp_path: Pa
         first, second = read_images([tmp_path / "a.png", tmp_path / "b.png"])
     assert first.min() == 0
     assert (first == 255).mean() == pytest.approx(0.01, abs=0.003)
-    # half of the value, up to the outermost per cent and rounding
+    # half of the value, up to the outer percentiles and rounding
     usual = (ramp > 0.1) & (ramp < 0.9)
     np.testing.assert_allclose(second[..., 0][usual], first[..., 0][usual] / 2, atol=3)
     stretched = read_image(tmp_path / "a.png", white=high)

@@ -18,9 +18,9 @@ from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera, rotation
 
 ALL = [name for name in SCENES if name not in LAYOUTS]
-"""`test_everyday_scenes.py` has what the others stand for."""
+"""Scenes of the catalogue alone; `test_everyday_scenes.py` tests the others."""
 RIGID = {"sheet": (0.01, 0.5), "banner": (0.5, 0.9), "handheld": (0.8, 1), "standing": (0.7, 1)}
-"""Bounds of the share of pixels that move rigidly, of the scenes that bend."""
+"""Bounds of the share of rigid pixels in scenes with bending bodies."""
 WIDTH, HEIGHT = 240, 102
 GREY = Texture(((0.5, 0.5, 0.5), (0.4, 0.4, 0.4)), cell=0.3)
 
@@ -64,7 +64,7 @@ def test_next_depth_sees_the_moved_points(name):
     target = (camera.pixel_grid(*p.size) + T.flow)[seen]
     z = (points(p) + T.scene_flow)[seen][:, 2]
     got = 1 / sample(1 / T.depth_next, target)  # inverse depth is linear on a plane
-    # the rest straddles an edge, where interpolation mixes two surfaces
+    # the other pixels straddle an edge, where interpolation mixes two surfaces
     assert np.mean(abs(got - z) < 2e-3 * z) > 0.95
     assert target.min() >= -1e-6
     assert (target <= np.array([WIDTH, HEIGHT]) - 1 + 1e-6).all()
@@ -140,7 +140,7 @@ def test_still_background_does_not_move():
     assert np.linalg.norm(T.flow[T.components == 1], axis=-1).mean() > 1
     same = (T.components == 0) & (T.depth_ref == T.depth_next)
     change = np.abs(p.image_ref.astype(int) - p.image_next).max(axis=-1)
-    assert np.mean(change[same] == 0) > 0.95  # the rest are edge pixels of the mover
+    assert np.mean(change[same] == 0) > 0.95  # the others are edge pixels of the moving body
 
 
 # --- images carry the truth -------------------------------------------------------------------
@@ -325,7 +325,7 @@ def test_a_scene_goes_on_where_its_first_pair_ends():
     np.testing.assert_allclose(first.truth.depth_next, second.truth.depth_ref, rtol=1e-9)
     # the same motion again
     np.testing.assert_allclose(first.truth.motions[0], second.truth.motions[0], atol=1e-12)
-    # shading is that of the pair's first frame
+    # a body is shaded as in the first frame of its pair
     gap = np.abs(first.image_next.astype(float) - second.image_ref)
     assert gap.mean() < 1
     for name in ("sheet", "banner"):

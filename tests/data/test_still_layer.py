@@ -70,10 +70,10 @@ def test_the_road_moves_behind_a_reflection(reflecting: Pair):
     moved = np.linalg.norm(true, axis=2) > 4
     sure = seen.flow.confidence[BEHIND] > 0.3
     assert np.mean(moved) > 0.5
-    # before, all of them were wrong by more than 4 pixels at full confidence
+    # without the correction, all of these pixels are wrong by more than 4 at full confidence
     assert np.mean(error[moved & sure] < 2.0) > 0.8
     assert np.mean(sure[moved]) > 0.25
-    # what moves is left alone where the next frame shows it
+    # moving pixels outside the static layer keep their flow
     above = np.s_[20:90, 100:400]
     assert np.mean((seen.flow.uv == reflected.flow.uv)[above]) > 0.95
 

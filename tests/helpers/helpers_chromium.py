@@ -112,7 +112,7 @@ class Chromium:
 
     def screenshot(self, whole: bool = False) -> np.ndarray:
         """(H, W, 3) uint8 RGB of the window, or of the whole page."""
-        # two frames later everything that was asked for is drawn
+        # two frames later, all requested changes are drawn
         self.value("new Promise(d => requestAnimationFrame(() => requestAnimationFrame(d)))")
         data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
         raw = np.frombuffer(base64.b64decode(data["data"]), np.uint8)

@@ -14,7 +14,7 @@ from soup_nlp.errors import DataError
 
 
 def write_flo(path: Path, flow: np.ndarray) -> None:
-    """A Middlebury .flo file; what is not finite becomes 1e10, the mark of an unknown flow."""
+    """A Middlebury .flo file; unknown flow (not finite) becomes 1e10."""
     values = np.where(np.isfinite(flow).all(axis=2, keepdims=True), flow, 1e10)
     path.write_bytes(pieh(values.astype("<f4")))
 
@@ -42,7 +42,7 @@ def write_pfm(path: Path, values: np.ndarray, scale: str = "-1.0") -> None:
 
 
 def write_kitti_flow(path: Path, flow: np.ndarray) -> None:
-    """A KITTI flow PNG; what is not finite is invalid."""
+    """A KITTI flow PNG; pixels that are not finite are marked invalid."""
     valid = np.isfinite(flow).all(axis=2)
     code = np.rint(np.where(valid[..., None], flow, 0.0) * 64.0 + 2.0**15) * valid[..., None]
     bgr = np.dstack([valid, code[..., 1], code[..., 0]]).astype(np.uint16)
@@ -74,5 +74,5 @@ def put(path: Path, content: bytes) -> Path:
 
 
 def raises(match: str):
-    """That a file or an array is refused, with a message that matches."""
+    """Expect a DataError with a message that matches."""
     return pytest.raises(DataError, match=match)

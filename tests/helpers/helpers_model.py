@@ -60,7 +60,7 @@ GREY = Texture(((0.5, 0.5, 0.5), (0.3, 0.4, 0.6)), cell=0.2)
 
 
 def weights_for(units: str, truncated: bool = True) -> Weights:
-    """Weights whose truncations cut some elements and spare others."""
+    """Weights whose truncations are exceeded by some elements but not by all."""
     w = TRUNCATED if truncated else PAPER
     if units == "pixels":
         w = w.replace(sigma_cont=6.0)

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def fake_row(scene: str, dies: bool = False) -> dict[str, Any]:
-    """A row without a solve; that of the sheet fails, and the process of the room may die."""
+    """A row without a solve; the row of the sheet fails, and the process of the room may die."""
     if scene == "room" and dies:
         os._exit(3)
     ok = scene != "sheet"
@@ -15,7 +15,7 @@ def fake_row(scene: str, dies: bool = False) -> dict[str, Any]:
 
 
 def square(number: int, breaks: bool = False) -> dict[str, Any]:
-    """A row that another process makes."""
+    """A row that another process measures."""
     if breaks:
         raise ValueError("out of numbers")
     return {"square": number**2, "process": os.getpid()}

@@ -1,4 +1,4 @@
-"""Arguments of the Python API that are of another kind."""
+"""Arguments of wrong types for the Python API."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ FINE = {
     "with_flow": "None",
     "camera": "vector, image",
 }
-"""Arguments that are right, or of no use but harmless."""
+"""Arguments that are valid, or useless but harmless."""
 LEFT_OUT = {
     # these solve
     "solve_pair segmentation": "dict",
@@ -152,7 +152,7 @@ LEFT_OUT = {
     "solve_pair preset": "None",
     "solve_pair flow": "None, dict",
     "run stop": "None",
-    # right names of files, in the working folder
+    # valid names of files, in the working folder
     "run ipopt_log": "None, text",
     "save folder": "text",
     # an exception of the caller's function is not an error of the package

@@ -1,4 +1,4 @@
-"""Odd files and texts at every door of the command line."""
+"""Odd files and texts as inputs of all commands."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ WRITE = {
 }
 KINDS = tuple(ODD)
 INSTEAD = ("pipe", "zero", "null", "random", "socket", "folder", "dangling", "loop", "empty")
-"""Kinds of which a file of a result is replaced."""
+"""Kinds of odd files that replace a file of a result."""
 
 
 def _instead(path: Path, kind: str) -> None:
@@ -166,7 +166,7 @@ USES: dict[str, tuple[str, Any, tuple[int, ...]]] = {
     "show": ("show {x}", written("p.yaml"), (2,)),
     "list": ("list {o}", written("p.yaml"), (0, 2)),
 }
-"""Commands that read a text, by what it stands for."""
+"""Commands that read a text, by the file or argument that has it."""
 
 ROWS: dict[str, bytes] = {
     "binary": bytes(range(256)) * 8,
@@ -205,7 +205,7 @@ def text_cases() -> Iterator[Case]:
     }
     spoken = {k: v for k, v in spoken.items() if "\0" not in v and len(v) < 100_000}
     yield from cases(DOORS, "text --set {}", "show {p} --set name={x}", spoken, (0, 2))
-    # no such limit of time is enough for a run: the rows are read before
+    # the commands end with an error after they have read the rows
     for verb, file, line in (
         ("compare", "runs.jsonl", "compare {p} --solvers no_such_solver -o {o}"),
         ("speed", "table.jsonl", f"{SMALL_SPEED} --set segmentation.superpixels=x -o {{o}}"),
@@ -271,7 +271,7 @@ UNTRUSTING: dict[str, tuple[str, Any, tuple[int, ...]]] = {
     "flow": ("{solve} --flow {x}", None, (2,)),
     "summary": ("check {x}", changed("result", "summary.json", _status), (1, 2)),
 }  # fmt: skip
-"""Commands that are given a text that nobody should trust."""
+"""Commands with an untrusted text in a file or argument."""
 
 
 def _tags(w: World, o: Path, name: str) -> None:

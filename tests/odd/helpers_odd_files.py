@@ -1,4 +1,4 @@
-"""Arrays, images and networks that hold something else than they say."""
+"""Arrays, images and networks whose contents contradict their headers."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ LIES: dict[str, bytes] = {
     "pickle": b"\x80\x04\x95\x0b\0\0\0\0\0\0\0\x8c\x07builtin.",
     "zip": b"PK\x03\x04" + b"\0" * 60,
 }  # fmt: skip
-"""Contents of .npy files that say something else than they hold."""
+"""Contents of .npy files with wrong headers."""
 
 half = np.full(SIZE, 0.5, np.float32)
 MAPS: dict[str, Any] = {
@@ -184,7 +184,7 @@ def image_cases() -> Iterator[Case]:
     }.items():
         title, make = f"image {{}} as {doors}", written("x.png")
         yield from cases("4 endless", title, line, IMAGES, make=make, other=tiffs)
-    # pictures that are read, and a flow that is not there
+    # the pictures are read first, then the missing flow ends the command
     line = "solve {o}/a.jpg {o}/b.jpg --flow nothing.flo -q -o {out}"
     yield from cases(DOORS, "exif {}", line, EXIF, make=_photos)
 
@@ -203,7 +203,7 @@ def network(path: Path, kind: str) -> None:
     shape = {"five channels": [1, 5, "h", "w"], "three axes": [1, 6, "n"]}.get(
         kind, [1, 6, "h", "w"]
     )
-    # a slice of the stack of images: two channels, or what is no flow
+    # a slice of the stack of images: two channels, or a shape that is no flow
     axis, end = {"one channel": (1, 1), "no pixel": (2, 0)}.get(kind, (1, 2))
     out = {"one channel": [1, 1, "h", "w"], "no pixel": None}.get(kind, [1, 2, "h", "w"])
     element = TensorProto.INT32 if kind == "whole numbers" else TensorProto.FLOAT

@@ -1,4 +1,4 @@
-"""Numbers beyond any use, solves at the edge of what is allowed, and odd values of every option."""
+"""Useless numbers, solves at the limits of options, and odd values of every option."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ SOLVES = {
     "wrong ipopt value": "solver.ipopt={max_iter:word}",
     "paper units": "energy.units=paper solver.presolve=true",
 }
-"""Settings of solves; what ends with 0 or 1 is checked afterwards."""
+"""Settings of solves; a result with exit code 0 or 1 is checked afterwards."""
 
 
 def _checked(w: World, o: Path, argv: list[str]) -> list[str]:
@@ -201,7 +201,7 @@ def option_cases(values: tuple[str, ...] = ODD_VALUES) -> Iterator[Case]:
                     continue
                 option = parameter.param_type_name == "option"
                 word = max(parameter.opts, key=len) if option else ""
-                # a good folder would have them run to their end
+                # with a valid folder these commands would run to their end
                 ends = head + name in ENDS or word != "--out"
                 for value in values if ends else ("", "\x1b[31m", "/dev/full", "x" * 10_000):
                     # --serve 0 takes any free port, and serves until it is stopped

@@ -200,7 +200,7 @@ def lost_cases() -> Iterator[Case]:
 
 
 def clip(*names: str, sizes: tuple[tuple[int, int], ...] = (SIZE,), options: str = "") -> Any:
-    """`chain` of a folder of images of noise, of one size or of one each."""
+    """`chain` of a folder of noise images; `sizes` repeat over the images."""
 
     def do(w: World, o: Path, _: object = None) -> list[str]:
         (o / "clip").mkdir(exist_ok=True)
@@ -252,7 +252,7 @@ def into(name: str, data: bytes | None = None) -> Any:
 
 
 def _no_result(w: World, o: Path, _: object) -> list[str]:
-    """Rows of a pair whose result is none."""
+    """Rows of a pair whose result is no HDF5 file."""
     into("pairs/000_001/result.h5", b"no HDF5")(w, o, None)
     return into("pairs.jsonl", b'{"key": "000_001", "ok": true}\n')(w, o, None)
 

@@ -1,4 +1,4 @@
-"""Odd inputs: one generator of cases from tables, and the judgement of the program's answer."""
+"""Odd inputs: a generator of cases from tables, and the check of the program's answer."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from soup_nlp.errors import SoupError
 LONGEST = 6000
 """Characters that an error message may have."""
 DOORS = "5 doors"
-"""Class of most cases: whatever enters is checked where it enters."""
+"""Class of most cases: an input is checked where it enters the program."""
 ANY = (0, 1, 2)
-"""Exit codes of inputs that may be good, or may be refused."""
+"""Exit codes of inputs that may be accepted or rejected."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _alarm(*_: object) -> None:
 
 
 def fault(case: Case, world: World, folder: Path, seconds: int = 60) -> str | None:
-    """What is wrong with the program's answer to an odd input; None where it is as promised.
+    """The fault of the program's answer to an odd input; None for a correct answer.
 
     Args:
         case: The input.

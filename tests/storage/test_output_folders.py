@@ -122,7 +122,7 @@ def test_the_result_of_something_else_is_kept(tmp_path, monkeypatch):
         DataError, match=r"(?s)something else.*found: frames 0 and 1\n.*--overwrite"
     ):
         claim(target, ["x"], subject="frames 1 and 2")
-    # what other files say about the folder does not change it
+    # files without a subject do not change the subject of the folder
     write(target, whole=False, y="2")
     assert folders.default_folder("a", "frames 0 and 1") == target
     assert folders.default_folder("a", "frames 1 and 2") == Path("out/a-2")

@@ -56,7 +56,7 @@ def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
     assert tables == [3, 4]
     measure_all(jobs(), path)
     assert seen[4:] == ["sheet"]
-    # another name is another row; one whose folder is gone is measured again
+    # another name is another row; a stale job is measured again
     measure_all(jobs(1)[:1], path)
     assert seen[5:] == ["orbit"]
     measure_all([replace(jobs(1)[0], stale=True)], path)
@@ -72,7 +72,7 @@ def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
     assert len(read_rows(path)) == 1
     rows = measure_all(fake_jobs()[:2], path, any_code=True)
     assert [r["code"] for r in rows] == ["older", code_version()]
-    # nothing was glued to the line that was cut off
+    # the new row was not appended to the truncated line
     assert len(read_rows(path)) == 2
     rows = measure_all(fake_jobs()[:2], path)
     assert [r["code"] for r in rows] == [code_version()] * 2
@@ -92,6 +92,6 @@ def test_parallel_processes_and_one_that_dies(tmp_path):
     assert rows[2]["error"] == "no"
     assert "process died" in rows[3]["error"]
     assert len(read_rows(path)) == 4
-    # without the job that dies nothing has to run again
+    # without the job that dies, no job runs twice
     rows = measure_all(fake_jobs(1)[:2], path, workers=2)
     assert [r["ok"] for r in rows] == [True, True]

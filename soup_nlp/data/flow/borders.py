@@ -142,7 +142,7 @@ def fit_affine(
     Args:
         flow: Flow, whose confidence multiplies the weights.
         labels: (H, W) superpixel labels 0..N-1.
-        only: (N,) superpixels to fit, the others being unknown; None for all.
+        only: (N,) True for superpixels to fit; None for all.
 
     Returns:
         The fits, and the last weights (P,) of the pixels with positive confidence.

@@ -99,7 +99,7 @@ def corrected(
         ref: (H, W) grey reference image without the layer (`without_still_layer`).
         nxt: (H', W') grey next image without the layer.
         flow: Flow of the original images.
-        R: (3, 3) rotation of the motion of the other pixels.
+        R: (3, 3) rotation of the rigid motion of the pixels that do not follow the layer.
         t: (3,) unit translation of that motion.
         K_ref: (3, 3) intrinsics of the reference frame.
         K_next: (3, 3) intrinsics of the next frame.

@@ -38,7 +38,7 @@ def estimated_cameras(
     length of another picture, relative to the longer side.
 
     Args:
-        paths: The files, whose EXIF is read; None for a picture of no file.
+        paths: The files, for their EXIF; None for a picture without a file.
         images: The pictures, (H, W, 3), rotated by their EXIF orientation.
         fov: Horizontal field of view of the first picture, degrees; None for the focal length of
             EXIF, or else `GUESS` times the longer side.
@@ -63,7 +63,7 @@ def estimated_cameras(
             raise ConfigError(
                 "field of view is out of range", found=f"{fov:g}", expected="0 to 180 degrees"
             )
-        # the ratio of two lenses is that of EXIF
+        # the ratio of the two focal lengths is that in EXIF
         first = sizes[0][0] / (2 * math.tan(math.radians(fov) / 2)) / max(sizes[0])
         relative = [first * focal / relative[0] for focal in relative]
     out: list[Float] = []
@@ -204,7 +204,7 @@ def _off_middle(x: float, y: float, size: Size) -> float:
 
 
 def _problems(K: Float, size: Size, cropped: bool) -> list[str]:
-    """What is implausible about intrinsics."""
+    """Descriptions of implausible intrinsics; empty for plausible ones."""
     (fx, fy), (cx, cy) = K[[0, 1], [0, 1]], K[:2, 2]
     off, exchanged = _off_middle(cx, cy, size), _off_middle(cy, cx, size)
     across, down = (2 * cx + 1) / size[1], (2 * cy + 1) / size[0]
@@ -227,7 +227,7 @@ def _explanation(K: Float, size: Size) -> tuple[str, Float]:
         "the order is fx cx fy cy": intrinsics(fx, cx, fy, cy),
         "cx and cy are exchanged": intrinsics(fx, fy, cy, cx),
     }
-    # scale to this image from the image whose middle the principal point is
+    # scale from the image that has its middle at the principal point to this image
     across, down = width / max(2 * cx + 1, 1e-9), height / max(2 * cy + 1, 1e-9)
     # sizes keep their proportions, or the focal lengths show that they do not
     if _ratio(across, down) < ALIKE or _ratio(fx * across, fy * down) < ALIKE:

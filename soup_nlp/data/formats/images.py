@@ -30,7 +30,7 @@ class DataWarning(UserWarning):
 
 
 def assumed(where: object, missing: str, taken: str) -> None:
-    """Warn of values that no input gives: what is missing, and what is taken instead."""
+    """Warn that a value is missing in the input, and name the value that is assumed."""
     warnings.warn(f"{where}: {missing}; assumed: {taken}", DataWarning, stacklevel=3)
 
 

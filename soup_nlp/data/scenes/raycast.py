@@ -51,7 +51,7 @@ class Part:
         scene_from_part: (4, 4) rigid pose at the reference time.
         texture: Colours by material coordinates.
         glow: Share of the colour that does not depend on the light; 1 for no shading (sky).
-        motion: (4, 4) motion of its own in scene coordinates, before that of its body (a limb).
+        motion: (4, 4) motion in scene coordinates before that of the body, such as of a limb.
     """
 
     shape: Shape
@@ -84,7 +84,7 @@ class Body:
 
     @property
     def bends(self) -> bool:
-        """Whether it has no rigid motion: a part bends, or its parts move differently."""
+        """Whether the body has no rigid motion: a part bends, or parts move differently."""
         return any(not p.shape.rigid or (p.motion != np.eye(4)).any() for p in self.parts)
 
 
@@ -93,7 +93,7 @@ class Scene:
     """Bodies and a camera at two times, in any right-handed scene coordinates.
 
     Attributes:
-        bodies: Their order gives the component labels 0, 1, ...
+        bodies: The bodies; the component label of a body is its index.
         ref_from_scene: (4, 4) camera pose at the reference time.
         next_from_scene: (4, 4) camera pose at the next time.
     """
@@ -156,7 +156,7 @@ class Scene:
 
 
 def advanced(scene: Scene, steps: int) -> Scene:
-    """The scene some frames later; camera and bodies repeat their motion between the first frames.
+    """The scene `steps` frames later; camera and bodies repeat their motion from frame 0 to 1.
 
     Raises:
         DataError: a body bends; bending is defined for the first two frames only.

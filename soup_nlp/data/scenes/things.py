@@ -128,7 +128,7 @@ class SceneBuilder:
         way = self.rng.standard_normal(3) * np.asarray(spread)
         return np.asarray(size * way / np.linalg.norm(way))
 
-    # --- textures, each with a noise of its own ---------------------------------------------------
+    # --- textures, each with another seed ---------------------------------------------------------
 
     def plain(
         self,
@@ -137,17 +137,17 @@ class SceneBuilder:
         panels: Panels | None = None,
         contrast: float = 0.45,
     ) -> Texture:
-        """A given pair of colours."""
+        """A texture of two colours."""
         seed = int(self.rng.integers(2**31))
         return Texture(colours, cell, self.contrast * contrast, seed, panels)
 
     def paint(self, cell: float, panels: Panels | None = None) -> Texture:
-        """The next colour of the palette."""
+        """A texture of the next colour of the palette."""
         self.paints.append(self.paints.pop(0))
         return self.plain(self.paints[-1], cell, panels, contrast=0.5)
 
     def wall(self, cell: float, panels: Panels | None = None) -> Texture:
-        """One of the wall colours."""
+        """A texture of a random wall colour."""
         return self.plain(WALLS[self.rng.integers(len(WALLS))], cell, panels)
 
     # --- surroundings -----------------------------------------------------------------------------
