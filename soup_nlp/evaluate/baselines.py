@@ -11,7 +11,7 @@ from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.start import epipolar
 
 MIN_CORRESPONDENCES = 8
-"""Fewest pixels with flow for which a motion is looked for."""
+"""Fewest pixels with flow for which a motion is estimated."""
 
 SAMPLES = 8000
 """Largest number of pixels for the motion."""
@@ -20,7 +20,7 @@ INLIER = 1.0
 """Largest Sampson distance of an inlier, pixels of the geometric mean focal length."""
 
 TIGHT = 0.1
-"""The motion is also looked for with this fraction of the inlier distance."""
+"""The motion is also estimated with this fraction of the inlier distance."""
 
 FAR = 100.0
 """Depths beyond this multiple of the median depth count as unknown: there is no parallax left.
@@ -32,7 +32,7 @@ def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
 
     The essential matrix comes from a subsample drawn with probability proportional to confidence
     (RANSAC, then a robust refinement of the Sampson distance), with each frame's own camera. It is
-    looked for at the inlier distance and at a tenth of it, and the motion with the smaller Cauchy
+    estimated at the inlier distance and at a tenth of it, and the motion with the smaller Cauchy
     cost is kept: in small images a moving component can lie within one pixel of a wrong motion.
     Each pixel with confidence is then triangulated by itself without smoothing, so far points with
     little parallax can have wild depths; only those beyond `FAR` times the median are dropped.

@@ -38,15 +38,15 @@ SIGMA_PRIOR = 1.0
 (outdoors)."""
 GUESSED = 2.0
 """Added in squares, of log depth, where no flow determines depth: 0.89 with the information of the
-prior, which keeps the order of what the other terms say."""
+prior, which keeps the order given by the other terms."""
 PRIOR_SHARE = 0.001
 """Factor of E_prior in the information: it is no evidence, but keeps variances finite where there
 is none."""
 FLOW_SHARE = 0.01
 """Factor of E_proj in the information without the flow; with 0 motions would be free."""
 CONTACT = 0.2
-"""Standard deviation of the log scale of a component by what it stands on or touches, beside that
-of the marginals: what moves need not touch what is below it in the image."""
+"""Standard deviation of the log scale of a component by contact, added to that of the marginals: a
+moving object need not touch the surface below it in the image."""
 COVERING = 0.5
 """Standard deviation of the log scale of a component that occlusion places in front of what it
 covers (`start.occlusion`)."""
@@ -63,8 +63,8 @@ from the surface's own stretching and not from parallax."""
 LEAST_SPREAD = 0.1
 """Added in squares to spreads where surfaces bend: errors hardly follow smaller ones."""
 MOST_MISFIT, BENDING_MISFIT = 5.0, 100.0
-"""Largest misfit of a pixel, pixels: beyond it the size says nothing. The second where surfaces
-bend: each superpixel has a motion of its own there, and a flow that it cannot follow is far off."""
+"""Largest misfit of a pixel, pixels: larger values carry no information. The second holds where
+surfaces bend: each superpixel has a motion of its own there and misses only a wrong flow."""
 OUTLINE, OUTLINE_REACH = 0.5, 0.005
 """Share of a step of log depth that is the standard deviation beside it, and the distance from the
 step up to which it counts, relative to the longer side of the image."""
@@ -74,7 +74,7 @@ MARGIN, LEAST_SEEN = 0.01, 0.3
 """Distance from the border of the next image, relative to its width, below which a pixel leaves it,
 and the least share of a superpixel's pixels that stay."""
 LARGEST = 1e6
-"""Largest standard deviation before the prior is added; beyond it nothing is known in any case."""
+"""Largest standard deviation before the prior is added, which dominates larger ones anyway."""
 NO_CONFIDENCE = 0.5
 """Sigma from which the confidence, 1 - sigma / `NO_CONFIDENCE`, is 0."""
 MIN_CONFIDENCE = 0.5
@@ -89,13 +89,13 @@ class Confidence:
 
     Attributes:
         sigma: (H, W) calibrated standard deviation of log depth, the global scale left out.
-        spread: (H, W) standard deviation of log depth by what the flow adds to the terms on shape,
-            not calibrated.
+        spread: (H, W) standard deviation of log depth by the flow's information beside the terms
+            on shape, not calibrated.
         marginals: Marginal variances of the planes and of the components' scales.
         noise: Noise of the flow, pixels.
         component_sigma: (C,) standard deviation of the components' log scale.
-        misfit: (N,) mean distance of the flow from the one that the answer induces, pixels.
-        evidence: What the flow says of the depth of every component.
+        misfit: (N,) mean distance between the flow and the answer's induced flow, pixels.
+        evidence: Evidence of the flow for the depth of every component.
         scale: (N,) standard deviation of log depth by the scales of components, see
             `scale_by_contact`.
     """
@@ -116,12 +116,12 @@ class Confidence:
 
 
 def flow_misfit(rec: Reconstruction, flow: Flow, most: Float | float = MOST_MISFIT) -> Float:
-    """(N,) mean distance of a flow from the one that a reconstruction induces, pixels.
+    """(N,) mean distance between a flow and the flow that a reconstruction induces, pixels.
 
     Args:
         rec: The answer.
-        flow: The flow that it was solved with.
-        most: Larger distances, and those of what is not induced, count as this; (H, W) or one.
+        flow: The flow of the solve.
+        most: Limit of the distances, also where no flow is induced; (H, W) or one number.
     """
     distance = np.linalg.norm(rec.flow - flow.uv, axis=-1)
     limited = np.where(np.isfinite(distance), np.minimum(distance, most), most)
@@ -138,7 +138,7 @@ def at_outlines(depth: Float) -> Float:
     Args:
         depth: (H, W) depth.
     """
-    # an answer of a foreign solver may have no depth at all
+    # the answer of a foreign solver may have no depth
     log_depth = np.log(np.clip(np.nan_to_num(depth), 1e-30, 1e30))
     reach = max(1, round(OUTLINE_REACH * max(depth.shape)))
 
@@ -189,18 +189,18 @@ def calibrated(
     Args:
         spread: Standard deviation of log depth by the marginals.
         noise: Noise of the flow, pixels.
-        misfit: Of the same superpixel, pixels; where it is larger than the noise, their geometric
-            mean is the noise.
+        misfit: Misfit of the superpixel, pixels; where it is larger than the noise, the geometric
+            mean of both replaces the noise.
         prior: Standard deviation without the flow; its information is added.
         bends: Where regions bend; of the same shape, or one for all.
-        added: Standard deviation of log depth that does not depend on the flow's random noise:
-            of scales by contact, and of what motions leave open; added in squares.
+        added: Standard deviation of log depth that does not depend on the flow's random noise, by
+            scales from contact and undetermined motions; added in squares.
     """
-    # no limits where regions bend: what is below them keeps its order
-    known = np.sqrt(np.hypot(LEAST_SPREAD, spread))
-    bent = BENDING_FACTOR * np.hypot(LEAST_NOISE, misfit) * known
+    # where regions bend small values have no hard limit, so that they keep their order
+    root = np.sqrt(np.hypot(LEAST_SPREAD, spread))
+    bending = BENDING_FACTOR * np.hypot(LEAST_NOISE, misfit) * root
     rigid = FACTOR * (np.sqrt(noise * np.maximum(noise, misfit)) * spread) ** POWER
-    sigma = np.where(bends, bent, rigid)
+    sigma = np.where(bends, bending, rigid)
     return with_prior(np.hypot(sigma, added), prior)
 
 
@@ -211,7 +211,7 @@ def with_prior(sigma: Float, prior: Float | float = SIGMA_PRIOR) -> Float:
 
 
 def scale_by_contact(
-    own: Marginals, start: Start, sizes: Int, far: Float, given: Given | None = None
+    variances: Marginals, start: Start, sizes: Int, far: Float, given_depth: Given | None = None
 ) -> Float:
     """(N,) standard deviation of log depth by the scales of components.
 
@@ -224,23 +224,23 @@ def scale_by_contact(
     count for the mean.
 
     Args:
-        own: Marginal variances of the components' scales.
-        start: Components, and what gives each its scale.
+        variances: Marginal variances of the components' scales.
+        start: Components and the origin of each scale.
         sizes: (N,) pixels of every superpixel.
         far: (N,) displacement relative to the camera (`start.components.displacement`).
-        given: A depth prior.
+        given_depth: A depth prior.
     """
     placed = start.tie == TIES.index("occlusion")
     contact = (start.tie != TIES.index("reference")) & (start.tie != FIXED) & ~placed
-    scale = np.where(contact, np.hypot(np.sqrt(own.component)[start.component], CONTACT), 0.0)
-    if given is not None:
-        by_prior = (start.tie == TIES.index("given depth")) & np.isfinite(given.sigma)
-        scale = np.where(by_prior, given.sigma, scale)
+    scale = np.where(contact, np.hypot(np.sqrt(variances.component)[start.component], CONTACT), 0.0)
+    if given_depth is not None:
+        by_prior = (start.tie == TIES.index("given depth")) & np.isfinite(given_depth.sigma)
+        scale = np.where(by_prior, given_depth.sigma, scale)
     mean = float(np.sum(sizes * np.minimum(scale, SIGMA_PRIOR)) / np.sum(sizes))
     pace = log_pace(far, start.component)[start.component]
-    free = (contact | placed) & (pace > USUAL) & (start.tie != TIES.index("given depth"))
-    own_place = np.maximum(np.where(free, pace, 0.0), np.where(placed, COVERING, 0.0))
-    return np.hypot(np.hypot(scale, mean), own_place)
+    fast = (contact | placed) & (pace > USUAL) & (start.tie != TIES.index("given depth"))
+    open_scale = np.maximum(np.where(fast, pace, 0.0), np.where(placed, COVERING, 0.0))
+    return np.hypot(np.hypot(scale, mean), open_scale)
 
 
 def confidence(
@@ -250,18 +250,18 @@ def confidence(
     data: EnergyData,
     weights: Weights,
     form: FormulationOptions,
-    given: Given | None = None,
+    given_depth: Given | None = None,
 ) -> Confidence:
     """The uncertainty of the depth of an answer.
 
     Args:
         rec: The answer.
-        pair: Intrinsics, and the flow that it was solved with.
+        pair: Intrinsics, and the flow of the solve.
         start: Rigid components and the flow's noise.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
         form: Visibility and whether kernels are compiled.
-        given: A depth prior, a measurement with an error of its own.
+        given_depth: A depth prior, a measurement with its own error.
     """
     assert pair.flow is not None
     sizes = np.bincount(rec.labels.ravel())
@@ -269,17 +269,19 @@ def confidence(
     blind = weak.replace(proj=FLOW_SHARE * weights.proj)
     try:
         infos = [information(rec.soup, data, w, form) for w in (weak, blind)]
-        own, without = (marginals(info, sizes, start.component) for info in infos)
-        seen, guessed = (
+        with_flow, without_flow = (marginals(info, sizes, start.component) for info in infos)
+        spread_with, spread_without = (
             spread_in_image(info, m.plane, rec.labels, pair.K_ref)
-            for info, m in zip(infos, (own, without), strict=True)
+            for info, m in zip(infos, (with_flow, without_flow), strict=True)
         )
-        spread = np.sqrt(learned(seen**2, guessed**2))
-        own = replace(own, component=learned(own.component, without.component))
+        spread = np.sqrt(learned(spread_with**2, spread_without**2))
+        with_flow = replace(
+            with_flow, component=learned(with_flow.component, without_flow.component)
+        )
     except (ModelError, ArithmeticError) as error:
-        # numbers that no answer has, as a foreign solver may return: nothing is known
+        # a foreign solver may return an answer without finite information
         log.warning("no uncertainty can be computed, all depth counts as a guess: %s", error)
-        own = Marginals(
+        with_flow = Marginals(
             np.full((len(rec.soup), 3, 3), np.inf),
             np.full(int(start.component.max()) + 1, np.inf),
         )
@@ -287,20 +289,21 @@ def confidence(
     bends = start.bends[rec.labels]
     most = np.where(bends, BENDING_MISFIT, MOST_MISFIT)
     noise, misfit = start.noise, flow_misfit(rec, pair.flow, most)
-    found = evidence(rec.soup, data, start.component, noise, pair.focal_sigma)
+    flow_evidence = evidence(rec.soup, data, start.component, noise, pair.focal_sigma)
     far = displacement(rec.soup, data.anchor_ray, start.component)
-    scale = scale_by_contact(own, start, sizes, far, given)
-    rigid = np.hypot(scale, found.sigma)
+    scale = scale_by_contact(with_flow, start, sizes, far, given_depth)
+    rigid = np.hypot(scale, flow_evidence.sigma)
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
-    guess = found.guess[start.component] | start.at_rest | (start.tie == FIXED)
+    guess = flow_evidence.guess[start.component] | start.at_rest | (start.tie == FIXED)
     added = np.hypot(added, np.where(guess, GUESSED, 0.0))
     before = np.full(len(added), SIGMA_PRIOR)
-    if given is not None:
-        # a depth that is taken from a prior which no flow confirms is no evidence of the flow
-        added[np.isfinite(given.sigma) & (given.sigma > MOST_SIGMA)] = LARGEST
-        before = 1 / np.hypot(1 / SIGMA_PRIOR, 1 / given.sigma)
+    if given_depth is not None:
+        # where the depth is that of a prior which no flow confirms, the flow is no evidence
+        added[np.isfinite(given_depth.sigma) & (given_depth.sigma > MOST_SIGMA)] = LARGEST
+        before = 1 / np.hypot(1 / SIGMA_PRIOR, 1 / given_depth.sigma)
     added = np.hypot(added, of_mixed_flow(pair.flow, rec.labels, pair.image_next.shape[:2]))
     in_image = np.hypot(added[rec.labels], at_outlines(rec.depth_ref))
     sigma = calibrated(spread, noise, misfit[rec.labels], before[rec.labels], bends, in_image)
-    component_sigma = with_prior(np.sqrt(own.component))
-    return Confidence(sigma, spread, own, noise, component_sigma, misfit, found, scale)
+    component_sigma = with_prior(np.sqrt(with_flow.component))
+    errors = noise, component_sigma, misfit, flow_evidence, scale
+    return Confidence(sigma, spread, with_flow, *errors)

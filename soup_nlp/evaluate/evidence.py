@@ -1,4 +1,4 @@
-"""What two views say of depth: parallax beyond any rotation, relief, what motion leaves open.
+"""Evidence of two views for depth: parallax beyond any rotation, relief, undetermined motion.
 
 See docs/confidence.md. Curvature at the answer is conditional on the motions of the components. A
 small turn and a small translation move an image almost alike, so that a flow with a small
@@ -22,10 +22,10 @@ from soup_nlp.start.bending import fit_robustly, turned
 from soup_nlp.start.settle import RELIEF
 
 LEAST_GAP_PX, LEAST_GAP = 0.5, 3.0
-"""Error, in pixels and in units of the flow's noise, by which depth must explain the flow of a
-component better than a turn alone or a constant depth does; below either depth is a guess."""
+"""Least gain of depth over a turn alone or a constant depth in explaining the flow of a component,
+in pixels and in units of the flow's noise; below either, depth is a guess."""
 OPEN = 0.5
-"""Systematic error of the flow that leaves motions open, in units of its noise."""
+"""Systematic error of the flow that leaves motions undetermined, in units of its noise."""
 CLIP_PX = 3.0
 """Limit of a superpixel's error where explanations are compared, pixels."""
 FEWEST = 3
@@ -34,7 +34,7 @@ FEWEST = 3
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the flow says of the depth of C components; errors are in pixels.
+    """Evidence of the flow for the depth of C components; errors are in pixels.
 
     Attributes:
         turn: (C,) mean error of the best rotation alone, the focal length free.
@@ -62,26 +62,26 @@ class Evidence:
 
     def rows(self) -> list[dict[str, float | bool | None]]:
         """A row for every component: errors in pixels, the gap in units of the noise, whether its
-        depth is a guess; None where no flow is known."""
+        depth is a guess; None where the flow is unknown."""
         names = ("turn", "constant", "solution", "gap")
         return [
             {
-                **{f"{k}_px": _known(getattr(self, k)[c]) for k in names},
-                "gap_in_noise": _known(self.gap[c] / self.noise),
+                **{f"{k}_px": _finite_or_none(getattr(self, k)[c]) for k in names},
+                "gap_in_noise": _finite_or_none(self.gap[c] / self.noise),
                 "guess": bool(self.guess[c]),
             }
             for c in range(len(self.turn))
         ]
 
 
-def _known(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
 def evidence(
     soup: Soup, data: EnergyData, component: Int, noise: float, focal_sigma: float = 0.0
 ) -> Evidence:
-    """What the flow says of the depth of every component.
+    """Evidence of the flow for the depth of every component.
 
     Args:
         soup: The answer.
@@ -90,19 +90,21 @@ def evidence(
         noise: Noise of the flow, pixels.
         focal_sigma: Standard deviation of the log focal length, 0 where it is given.
     """
-    seen = data.pixel_weight.sum(axis=1) > 0.25
+    valid = data.pixel_weight.sum(axis=1) > 0.25
     moved = soup.moved(soup.points(data.pixel_ray))
-    own = _error(project(data.K_next, moved), data)
+    misfit = _error(project(data.K_next, moved), data)
     count = int(component.max()) + 1
     errors = np.full((3, count), np.nan)
     sigma = np.full(len(soup), np.inf)
     for c in range(count):
-        at = np.flatnonzero((component == c) & seen)
+        at = np.flatnonzero((component == c) & valid)
         if len(at) < FEWEST:
             continue
-        errors[:, c] = *_without_depth(data, at), _mean(own[at])
-        every = np.flatnonzero(component == c)
-        sigma[every] = _open_motion(soup, data, every, seen[every], OPEN * noise, focal_sigma)
+        errors[:, c] = *_without_depth(data, at), _mean(misfit[at])
+        members = np.flatnonzero(component == c)
+        sigma[members] = _open_motion(
+            soup, data, members, valid[members], OPEN * noise, focal_sigma
+        )
     return Evidence(errors[0], errors[1], errors[2], noise, sigma)
 
 
@@ -115,7 +117,7 @@ def _error(pixel: Float, data: EnergyData, at: Int | slice = slice(None)) -> Flo
 
 
 def _mean(error: Float) -> float:
-    """Mean error without the tenth with the largest: what a component took along by mistake."""
+    """Mean error without the largest tenth, which a component may include by mistake."""
     return float(np.mean(np.sort(error)[: max(1, int(np.ceil(0.9 * len(error))))]))
 
 
@@ -140,9 +142,9 @@ def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float
 
 
 def _open_motion(
-    soup: Soup, data: EnergyData, at: Int, seen: Mask, error: float, focal_sigma: float
+    soup: Soup, data: EnergyData, at: Int, valid: Mask, error: float, focal_sigma: float
 ) -> Float:
-    """(K,) standard deviation of log depth by the motion that a systematic error leaves open.
+    """(K,) standard deviation of log depth by a motion undetermined within a systematic error.
 
     A change of the component's motion moves a superpixel along its epipolar line, which its depth
     follows, and across it, which the flow contradicts. The information on the motion is that of
@@ -153,7 +155,7 @@ def _open_motion(
         soup: The answer.
         data: Anchors.
         at: (K,) superpixels of the component.
-        seen: (K,) True where their flow is known.
+        valid: (K,) True where the superpixel's flow is known.
         error: Systematic error of the flow, pixels.
         focal_sigma: Standard deviation of the log focal length.
     """
@@ -172,18 +174,18 @@ def _open_motion(
     longer -= np.einsum("nij,njk,nk->ni", slope, soup.R[at], flat)
     J = np.concatenate([-slope @ rotation.hat(X), slope * length, longer[..., None]], axis=2)
     along = np.einsum("nij,nj->ni", slope, turned)
-    # what a log depth moves, at least what a relief of one deviation needs to be seen
+    # squared image motion by log depth, at least that at which one deviation of relief is visible
     squared = np.sum(along**2, axis=1) + (error / RELIEF) ** 2
     follow = -np.einsum("ni,nij->nj", along, J) / squared[:, None]
     across = J + along[:, :, None] * follow[:, None]
-    # without a common factor of all depths, which what has no parallax does not follow
+    # less a common factor of all depths, which superpixels without parallax do not follow
     grown = np.sum(along**2, axis=1) / squared
-    share = grown[seen] @ follow[seen] / max(float(grown[seen] @ grown[seen]), 1e-12)
+    share = grown[valid] @ follow[valid] / max(float(grown[valid] @ grown[valid]), 1e-12)
     follow = follow - np.outer(grown, share)
-    information = np.mean(across[seen].transpose(0, 2, 1) @ across[seen], axis=0) / error**2
-    information += np.mean(follow[seen][:, :, None] * follow[seen][:, None], axis=0) / RELIEF**2
+    information = np.mean(across[valid].transpose(0, 2, 1) @ across[valid], axis=0) / error**2
+    information += np.mean(follow[valid][:, :, None] * follow[valid][:, None], axis=0) / RELIEF**2
     if not np.isfinite(information).all():
-        # numbers that no answer has, as a foreign solver may return
+        # a foreign solver may return a soup without finite information
         return np.full(len(at), np.inf)
     covariance = np.linalg.pinv(information[:6, :6], rcond=1e-12, hermitian=True)
     motion = np.einsum("ni,ij,nj->n", follow[:, :6], covariance, follow[:, :6])

@@ -1,8 +1,8 @@
 """The information of the energy at an answer, and the marginal variances that follow from it.
 
 See docs/confidence.md. The information is in nine coordinates per superpixel. Of its inverse the
-blocks of the planes are kept: marginal variances, which know that a neighbour is as unsure, not
-the conditional ones of a superpixel whose neighbours are held.
+blocks of the planes are kept: marginal variances, which include the uncertainty of neighbours, not
+conditional variances, which would take the neighbours as exact.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.solve.selected_inverse import BlockCholesky
 
 SMOOTHING = 0.03
-"""Width in pixels within which a norm is taken for its square: no flow is more exact."""
+"""Width in pixels within which a norm is treated as a square: no flow is more exact."""
 LEAST_LEARNED = 1e-4
-"""Least share of the information that is counted as the flow's."""
+"""Least share of the information that is attributed to the flow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +36,9 @@ class Information:
         matrix: (9 N, 9 N) `sum c J^T J` over all norms, c their weight over their smoothed length,
             both triangles. Coordinates of a superpixel: relative inverse depth at the anchor and
             its two slopes, rotation (3), shift of the moved anchor over depth (3).
-        growth: (9 N,) direction in which all depths grow alike; the information has none there.
+        growth: (9 N,) direction in which all depths grow by one factor; the information is 0 there.
         plane: (N, 3) relative inverse depth and slopes at the soup.
-        layout: Anchors and radii that these refer to.
+        layout: Anchors and radii of the coordinates.
     """
 
     matrix: sparse.csr_matrix
@@ -84,7 +84,7 @@ class Marginals:
 
 
 def marginals(info: Information, sizes: Int, component: Int) -> Marginals:
-    """Marginal covariances where the mean log depth of all pixels is held.
+    """Marginal covariances with the mean log depth of all pixels fixed.
 
     Args:
         info: Information at the soup.
@@ -99,7 +99,7 @@ def marginals(info: Information, sizes: Int, component: Int) -> Marginals:
     # coordinates without any information get a negligible one, so that the matrix is regular
     least = 1e-12 * float(diagonal.max()) or 1.0
     weight = np.where(diagonal > least, 0.0, least)
-    # any weight on the global scale makes the matrix definite; what it is cancels below
+    # any weight on the global scale makes the matrix definite; its value cancels below
     largest = 9 * int(np.argmax(sizes))
     weight[largest] += max(diagonal[largest], least)
     solver = BlockCholesky(info.matrix + sparse.diags(weight), info.layout.anchor[:, :2])
@@ -107,11 +107,11 @@ def marginals(info: Information, sizes: Int, component: Int) -> Marginals:
     mean /= mean @ g
     h = solver.solve(mean)
     # covariance of P x, with P = I - g mean^T: depths relative to their mean
-    own = solver.inverse_blocks()[:, :3, :3]
+    covariance = solver.inverse_blocks()[:, :3, :3]
     g3, h3 = (v.reshape(n, -1)[:, :3] for v in (g, h))
     cross = g3[:, :, None] * h3[:, None]
-    both = g3[:, :, None] * g3[:, None] * (mean @ h)
-    plane = own - cross - cross.transpose(0, 2, 1) + both
+    mean_terms = g3[:, :, None] * g3[:, None] * (mean @ h)
+    plane = covariance - cross - cross.transpose(0, 2, 1) + mean_terms
     rows = _mean_log_depth(info, sizes, component)
     solved = solver.solve(rows)
     along = g @ rows
@@ -129,10 +129,10 @@ def _mean_log_depth(info: Information, sizes: Int, component: Int) -> Float:
 
 
 def spread_in_image(info: Information, plane: Float, labels: Labels, K_ref: Float) -> Float:
-    """(H, W) standard deviation of log depth of every pixel, as the marginals have it.
+    """(H, W) standard deviation of log depth of every pixel, by the marginals.
 
     Args:
-        info: Where the planes are.
+        info: Information with the planes.
         plane: (N, 3, 3) marginal covariances.
         labels: (H, W) superpixel of every pixel.
         K_ref: (3, 3) intrinsics of the reference frame.
@@ -147,11 +147,11 @@ def spread_in_image(info: Information, plane: Float, labels: Labels, K_ref: Floa
 
 
 def learned(variance: Float, without: Float) -> Float:
-    """Variance by what the flow adds to the terms on shape alone.
+    """Variance by the information that the flow adds to the terms on shape.
 
-    Information adds up: `1 / v - 1 / v0` is that of the flow, with the variance v of everything and
-    v0 without the flow. Where both are equal, nothing was learned.
+    Information adds up: `1 / v - 1 / v0` is that of the flow, with the variance v of all terms and
+    v0 without the flow. Where both are equal, the flow adds none.
     """
-    # one component alone has the mean that is held: neither varies
+    # the mean of a single component is the fixed one: both variances are 0
     share = np.divide(variance, without, out=np.zeros_like(variance), where=without > 0)
     return np.asarray(variance / np.clip(1 - share, LEAST_LEARNED, 1.0))

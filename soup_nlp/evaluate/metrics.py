@@ -149,7 +149,7 @@ def check_rule(scale: object) -> None:
     """Check that there is a scale rule of this name.
 
     Raises:
-        DataError: there is none.
+        DataError: the rule is unknown.
     """
     if not (isinstance(scale, str) and scale in get_args(Scale)):
         raise DataError(
@@ -161,7 +161,7 @@ def check_cap(cap: float | None) -> None:
     """Check that a depth cap is positive or None.
 
     Raises:
-        DataError: it is not; NaN is not.
+        DataError: the cap is 0, negative, NaN or no number.
     """
     if cap is None:
         return
@@ -193,8 +193,8 @@ def _compared(
     true = true_pixels(gt, cap) & keep
     if not true.any():
         raise DataError("no pixel has a true depth to compare with, within cap and mask")
-    both = true & np.isfinite(z) & (z > 0)
-    return z[both], gt[both], float(np.count_nonzero(both) / np.count_nonzero(true))
+    compared = true & np.isfinite(z) & (z > 0)
+    return z[compared], gt[compared], float(np.count_nonzero(compared) / np.count_nonzero(true))
 
 
 def _scale(z: Float, gt: Float, rule: Scale) -> float:
@@ -257,11 +257,11 @@ def scene_flow_epe(
     """
     est, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
     true = np.isfinite(gt).all(axis=-1)
-    both = true & np.isfinite(est).all(axis=-1)
-    n = int(both.sum())
+    compared = true & np.isfinite(est).all(axis=-1)
+    n = int(compared.sum())
     # one NaN in place of no pixel makes every mean NaN
     error, length = (
-        np.linalg.norm(v[both], axis=-1) if n else np.array([np.nan])
+        np.linalg.norm(v[compared], axis=-1) if n else np.array([np.nan])
         for v in (scale * est - gt, gt)
     )
     return {
@@ -273,25 +273,25 @@ def scene_flow_epe(
     }
 
 
-def component_overlaps(found: ArrayLike, true: ArrayLike) -> dict[int, tuple[int, float]]:
-    """The found component that covers each true one best, and their intersection over union.
+def component_overlaps(estimate: ArrayLike, true: ArrayLike) -> dict[int, tuple[int, float]]:
+    """The estimated component that overlaps each true one most, and their intersection over union.
 
     Args:
-        found: (H, W) labels from 0.
-        true: (H, W) true labels from 0; negative where unknown, which counts nowhere.
+        estimate: (H, W) labels from 0.
+        true: (H, W) true labels from 0; negative labels are unknown and not compared.
     """
-    a, b = np.asarray(found), np.asarray(true)
-    known = b >= 0
-    if not known.any():
+    a, b = np.asarray(estimate), np.asarray(true)
+    labelled = b >= 0
+    if not labelled.any():
         return {}
-    share = overlap_shares(b[known], a[known])
-    return {int(k): (int(share[k].argmax()), float(share[k].max())) for k in np.unique(b[known])}
+    share = overlap_shares(b[labelled], a[labelled])
+    return {int(k): (int(share[k].argmax()), float(share[k].max())) for k in np.unique(b[labelled])}
 
 
-def overlap_shares(one: NDArray[np.integer], other: NDArray[np.integer]) -> Float:
+def overlap_shares(first: NDArray[np.integer], second: NDArray[np.integer]) -> Float:
     """(A, B) intersection over union of the labels 0..A-1 and 0..B-1 of the same pixels (M,)."""
-    count = int(other.max()) + 1
-    flat, size = one.astype(np.int64) * count + other, count * (int(one.max()) + 1)
-    both = np.bincount(flat, minlength=size).reshape(-1, count)
-    union = both.sum(axis=0) + both.sum(axis=1, keepdims=True) - both
-    return np.asarray(both / np.maximum(union, 1))
+    count = int(second.max()) + 1
+    flat, size = first.astype(np.int64) * count + second, count * (int(first.max()) + 1)
+    shared = np.bincount(flat, minlength=size).reshape(-1, count)
+    union = shared.sum(axis=0) + shared.sum(axis=1, keepdims=True) - shared
+    return np.asarray(shared / np.maximum(union, 1))

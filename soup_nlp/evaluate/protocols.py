@@ -28,7 +28,7 @@ class Preset:
         low: Truth at or below this depth is left out.
         crop: Part of the image that counts, as shares; None for all of it.
         clamp: Range that scaled estimates are moved into; None for none.
-        text: What it is, in a few words.
+        text: The convention in a few words.
     """
 
     name: str
@@ -42,13 +42,13 @@ class Preset:
     def __str__(self) -> str:
         rule = "no scale" if self.scale == "none" else f"one {self.scale} scale"
         cap = "no cap" if self.cap is None else f"{self.low:g} < z <= {self.cap:g}"
-        more = ", Garg crop" if self.crop == GARG_CROP else ", cropped" if self.crop else ""
+        details = ", Garg crop" if self.crop == GARG_CROP else ", cropped" if self.crop else ""
         if self.clamp:
-            more += f", estimates clamped to [{self.clamp[0]:g}, {self.clamp[1]:g}]"
-        return f"{self.name}: {rule} per image, {cap}{more}"
+            details += f", estimates clamped to [{self.clamp[0]:g}, {self.clamp[1]:g}]"
+        return f"{self.name}: {rule} per image, {cap}{details}"
 
     def mask(self, truth: ArrayLike) -> Mask:
-        """Where a truth (H, W) or (M,) counts; a crop needs the image."""
+        """Pixels of a truth (H, W) or (M,) that count; a crop needs (H, W)."""
         gt = np.asarray(truth, np.float64)
         keep = (gt > self.low) & (gt <= (np.inf if self.cap is None else self.cap))
         if self.crop is not None:
@@ -107,7 +107,7 @@ def preset(name: str) -> Preset:
     """The preset of a name.
 
     Raises:
-        DataError: there is none.
+        DataError: the name is unknown.
     """
     if name not in PRESETS:
         raise DataError("unknown metric preset", found=repr(name), expected=", ".join(PRESETS))

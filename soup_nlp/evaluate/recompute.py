@@ -17,27 +17,27 @@ State = Mapping[str, Float]
 """lam (N,), n (N, 3), d (N,), R (N, 3, 3), t (N, 3) of a soup."""
 
 
-def lift(s: State, ray: Float, who: Int) -> tuple[Float, Float]:
+def lift(s: State, ray: Float, superpixel: Int) -> tuple[Float, Float]:
     """Points in both frames of rays on the planes of superpixels.
 
     Args:
-        s: Soup.
+        s: State of a soup.
         ray: (M, B, 3) rays.
-        who: (M,) superpixel of each row.
+        superpixel: (M,) superpixel of each row.
 
     Returns:
         (M, B, 3) reference-frame and next-frame points.
     """
-    facing = -(s["n"][who][:, None] * ray).sum(-1)
-    X = ((s["lam"] * s["d"])[who][:, None] / facing)[..., None] * ray
-    T = (s["lam"][:, None] * s["t"])[who]
-    return X, np.matmul(X, np.swapaxes(s["R"][who], 1, 2)) + T[:, None]
+    facing = -(s["n"][superpixel][:, None] * ray).sum(-1)
+    X = ((s["lam"] * s["d"])[superpixel][:, None] / facing)[..., None] * ray
+    T = (s["lam"][:, None] * s["t"])[superpixel]
+    return X, np.matmul(X, np.swapaxes(s["R"][superpixel], 1, 2)) + T[:, None]
 
 
 def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, float]:
     """Exact E and its weighted terms (paper Eq. 1 to 6 as in docs/formulation.md)."""
-    every = np.arange(len(s["lam"]))
-    A, B = (x[:, 0] for x in lift(s, e["anchor_ray"][:, None], every))
+    index = np.arange(len(s["lam"]))
+    A, B = (x[:, 0] for x in lift(s, e["anchor_ray"][:, None], index))
     T = s["lam"][:, None] * s["t"]
     scene = float((e["share"] * s["lam"] * s["d"]).sum())
 
@@ -61,15 +61,15 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
     leak = w["leak_arap"]
     cut = sum((1 - leak) * np.minimum(p, w["sigma_arap"]) + leak * p for p in parts)
     arap = float((e["edge_weight"] * cut).sum())
-    apart = _length(e["anchor_ray"][i] - e["anchor_ray"][k])
+    distance = _length(e["anchor_ray"][i] - e["anchor_ray"][k])
     rho = 1 / A[:, 2]
     change = (rho[i] - rho[k]) / ((rho[i] ** 4 + rho[k] ** 4) / 2) ** 0.25
     change = np.abs(change - e["prior_relief"])
-    prior = float((e["prior_weight"] * change / apart).sum())
+    prior = float((e["prior_weight"] * change / distance).sum())
     off = np.abs(np.log(A[i, 2]) - np.log(A[k, 2]) - e["depth_change"])
     depth = float((e["depth_weight"] * off).sum())
 
-    image = lift(s, e["pixel_ray"], every)[1] @ e["K_next"].T
+    image = lift(s, e["pixel_ray"], index)[1] @ e["K_next"].T
     miss = _length(image[..., :2] / image[..., 2:] - e["pixel_target"])
     proj = float((e["pixel_weight"] * np.minimum(miss, w["sigma_proj"])).sum())
 
@@ -84,7 +84,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
     turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
     orient = float((e["orient_weight"] * np.minimum(turn, w["sigma_orient"])).sum())
     middle = e["boundary_ray"].sum(axis=1, keepdims=True)
-    rhos = [1 / lift(s, middle, who)[0][:, 0, 2] for who in (i, k)]
+    rhos = [1 / lift(s, middle, superpixel)[0][:, 0, 2] for superpixel in (i, k)]
     sign = np.sign(e["order_weight"])
     behind, front = np.where(sign > 0, rhos, rhos[::-1])
     near = ((A[i, 2] ** -4 + A[k, 2] ** -4) / 2) ** 0.25
@@ -108,7 +108,7 @@ def constraints(s: State, rim_ray: Float, min_facing: float) -> dict[str, Float]
     """Violation of every kind of constraint, by superpixel (simplex: one number).
 
     Args:
-        s: Soup.
+        s: State of a soup.
         rim_ray: (N, V, 3) rays where visibility is imposed.
         min_facing: c of `-n . r >= c`.
     """
@@ -145,8 +145,8 @@ def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float
         cap: Truth beyond this depth is left out.
     """
     true = np.isfinite(gt) & (gt > 0) & (gt <= (np.inf if cap is None else cap))
-    both = true & np.isfinite(z) & (z > 0)
-    z, gt = z[both], gt[both]
+    compared = true & np.isfinite(z) & (z > 0)
+    z, gt = z[compared], gt[compared]
     if not len(z):
         return {"coverage": 0.0, "n_pixels": 0.0}
     ratio = gt / z

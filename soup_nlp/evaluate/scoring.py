@@ -32,7 +32,7 @@ DEPTHS = {"solution": "ref", "nlp": "nlp_ref", "start": "start_ref", "rigid": "r
 
 
 SURE = {"solution_90": 0.9, "solution_70": 0.7}
-"""Shares of the pixels with a true depth, the most certain ones, that are scored apart."""
+"""Shares of the pixels with a true depth, by least sigma, that are scored separately."""
 
 
 def score_depths(
@@ -54,8 +54,8 @@ def score_depths(
         sigma: (H, W) uncertainty of the depth "solution".
 
     Returns:
-        By the same names, "constant", "solution_next" for the next frame, and those of `SURE` for
-        the pixels where sigma is least; what has no true pixel is absent.
+        Metrics by the same names, "constant", "solution_next" for the next frame, and the names of
+        `SURE` for the pixels of least sigma; a depth map without true pixels has none.
     """
     out: dict[str, DepthMetrics] = {}
     if truth is None:
@@ -71,8 +71,8 @@ def score_depths(
             out["constant"] = depth_metrics(np.ones(gt.shape), gt, scale=scale, cap=cap)
     if sigma is not None and "solution" in out:
         estimate, gt = at_truth(truth, depths["solution"])
-        for name, kept in surest(gt, at_truth(truth, sigma)[0]).items():
-            out[name] = depth_metrics(estimate, kept, scale=scale, cap=cap)
+        for name, sure_gt in surest(gt, at_truth(truth, sigma)[0]).items():
+            out[name] = depth_metrics(estimate, sure_gt, scale=scale, cap=cap)
     gt_next = truth.depth_next
     if depth_next is not None and gt_next is not None and true_pixels(gt_next, cap).any():
         out["solution_next"] = depth_metrics(depth_next, gt_next, scale=scale, cap=cap)
@@ -88,7 +88,7 @@ def at_truth(truth: Truth, image: Float) -> tuple[Float, Float]:
 
 
 def surest(gt: Float, sigma: Float) -> dict[str, Float]:
-    """True depths by the names of `SURE`: NaN but for the share of them where sigma is least."""
+    """True depths by the names of `SURE`: NaN except for the share with the least sigma."""
     true = true_pixels(gt, None) & np.isfinite(sigma)
     limits = {k: np.quantile(sigma[true], v) if true.any() else 0.0 for k, v in SURE.items()}
     return {k: np.where(true & (sigma <= limit), gt, np.nan) for k, limit in limits.items()}
@@ -115,7 +115,7 @@ def evaluate(
         Metrics by "solution", "start", "nlp" and "rigid" (if known) and "constant".
 
     Raises:
-        DataError: the cap is not positive, a file is missing, sizes differ, or the truth knows no
+        DataError: the cap is not positive, a file is missing, sizes differ, or the truth has no
             pixel.
     """
     check_cap(cap)
@@ -147,29 +147,29 @@ def _depths(result: object) -> dict[str, Float]:
     dense = getattr(result, "reconstruction", None)
     if dense is None:
         return {"solution": _map(result, "depth")}
-    others = {
+    other_depths = {
         name: getattr(getattr(result, f"{name}_reconstruction", None), "depth_ref", None)
         for name in ("nlp", "start")
     }
-    found = {"solution": dense.depth_ref, **others, "rigid": getattr(result, "rigid", None)}
-    return {name: z for name, z in found.items() if z is not None}
+    maps = {"solution": dense.depth_ref, **other_depths, "rigid": getattr(result, "rigid", None)}
+    return {name: z for name, z in maps.items() if z is not None}
 
 
-def _map(given: object, what: str) -> Float:
+def _map(values: object, what: str) -> Float:
     """(H, W) numbers.
 
     Raises:
-        DataError: it is something else.
+        DataError: the values are no map of numbers.
     """
     try:
-        array = np.asarray(given)
+        array = np.asarray(values)
     except ValueError:
         # rows of different lengths
         array = np.empty(0, object)
     if array.ndim != 2 or array.dtype.kind not in "fiu":
         raise DataError(
             f"{what} is no map",
-            found=repr_of(given),
+            found=repr_of(values),
             expected="(H, W) numbers, or a file; NaN where unknown",
         )
     return array.astype(np.float64)
@@ -178,7 +178,7 @@ def _map(given: object, what: str) -> Float:
 STEPS = 50
 """Points of a sparsification curve."""
 LAST = 0.02
-"""Share of the pixels that its last point keeps."""
+"""Share of the pixels kept at the last point of a sparsification curve."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class Sparsification:
 def sparsification(error: ArrayLike, uncertainty: ArrayLike) -> Sparsification:
     """Sort pixels by uncertainty and compare with sorting them by error.
 
-    Pixels of equal uncertainty are removed in an arbitrary order: each counts as their mean error.
+    Pixels of equal uncertainty count with their mean error, because their order is arbitrary.
 
     Args:
         error: (M,) errors, not negative; M at least 1.
@@ -213,8 +213,8 @@ def sparsification(error: ArrayLike, uncertainty: ArrayLike) -> Sparsification:
     kept = np.linspace(1.0, LAST, STEPS)
     last = np.maximum((kept * len(e)).astype(int) - 1, 0)
     _, group = np.unique(s, return_inverse=True)
-    alike = np.bincount(group, e) / np.bincount(group)
-    sums = np.cumsum(alike[np.sort(group)]), np.cumsum(np.sort(e))
+    tie_mean = np.bincount(group, e) / np.bincount(group)
+    sums = np.cumsum(tie_mean[np.sort(group)]), np.cumsum(np.sort(e))
     mean_error, best = (total[last] / (last + 1) for total in sums)
     whole = float(e.mean())
     ause = float((mean_error - best).mean() / whole) if whole > 0 else 0.0

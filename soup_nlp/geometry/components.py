@@ -1,4 +1,4 @@
-"""The rigid components of a solved soup: which pixels move as one, and how."""
+"""The rigid components of a solved soup: their pixels and their motions."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from soup_nlp.geometry.motion import RigidMotion, fit_motion
 from soup_nlp.geometry.soup import Soup
 
 SAME_PX = 0.5
-"""Motions that bring a component's points to within this of each other are one, pixels."""
+"""Two motions count as one if they map a component's points within this distance, pixels."""
 LEAST_PX = 0.05
-"""Distance below which a point no longer gains weight in a robust fit, pixels."""
+"""Distance below which the weight of a point in a robust fit no longer grows, pixels."""
 FITS = 20
 """Re-weighted fits of a motion."""
 
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """A group of superpixels that moves as one.
+    """A group of superpixels with one rigid motion.
 
     Attributes:
         label: Its number in the maps; 0 is the background.
         motion: next_from_ref, the camera's motion included, in the unit of the reconstruction.
         superpixels: Number of its superpixels.
         pixels: Number of its pixels.
-        residual_px: Median distance in the next image between where `motion` and where the
-            superpixels' own motions bring its points, pixels; large where it is not rigid.
+        residual_px: Median distance, in the next image, between the component's points moved by
+            `motion` and by their superpixels' motions, pixels; large if it is not rigid.
         borrowed: Share of its pixels whose depth is a guess from neighbours.
         centre: (3,) median of its points in the reference frame.
     """
@@ -57,10 +57,10 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """All rigid components, the background first, then by their pixels.
+    """All rigid components, the background first, then by decreasing number of pixels.
 
-    The background is the component with the most superpixels: what it does, the camera does the
-    other way round.
+    The background is the component with the most superpixels; the camera's motion is the inverse
+    of its motion.
 
     Attributes:
         of_superpixel: (N,) label of every superpixel.
@@ -101,7 +101,7 @@ class Components:
 
     @property
     def camera(self) -> RigidMotion:
-        """next_from_ref of the static scene; its `centre` is where the next camera is."""
+        """next_from_ref of the static scene; its `centre` is the next camera's."""
         return self.background.motion
 
     def own_motion(self, label: int) -> RigidMotion:
@@ -118,9 +118,9 @@ def find_components(
     K_next: Float,
     borrowed: Mask | None = None,
 ) -> Components:
-    """One rigid motion for every group of superpixels, groups of one motion joined.
+    """One rigid motion for every group of superpixels; groups with the same motion are joined.
 
-    A motion is fitted to what the superpixels' own motions do to their anchors and rims: least
+    A motion is fitted to the anchors and rims as their superpixels' motions move them: least
     absolute distances in the next image by re-weighted Procrustes fits.
 
     Args:
@@ -138,7 +138,7 @@ def find_components(
     count = np.bincount(label)
     motions: list[RigidMotion] = []
     joined = np.empty(len(count), np.int64)
-    # large ones first: small ones join those whose motion is theirs
+    # large groups first: a small group joins the large one with the same motion
     for c in np.argsort(-count, kind="stable"):
         mask = label == c
         x, y, weight = _usable(before[mask], after[mask], seg.sizes[mask])
@@ -181,7 +181,7 @@ def _usable(before: Float, after: Float, size: Int) -> tuple[Float, Float, Float
 
 
 def _gap(motion: RigidMotion, x: Float, y: Float, K: Float) -> Float:
-    """(M,) pixels between where a motion brings points and where they are."""
+    """(M,) distance in the image of points x, moved, from points y, pixels."""
     moved = motion(x)
     with np.errstate(divide="ignore", invalid="ignore"):
         gap = np.linalg.norm(project(K, moved) - project(K, y), axis=1)
@@ -190,7 +190,7 @@ def _gap(motion: RigidMotion, x: Float, y: Float, K: Float) -> Float:
 
 def _fit(x: Float, y: Float, size: Float, K: Float) -> RigidMotion:
     """The motion of least absolute distances in the image."""
-    # a length counts in the depth where it is
+    # lengths are relative to the depth of their points
     base = size / y[:, 2] ** 2
     motion = fit_motion(x, y, base)
     for _ in range(FITS):
@@ -199,6 +199,6 @@ def _fit(x: Float, y: Float, size: Float, K: Float) -> RigidMotion:
 
 
 def _first(soup: Soup, mask: Mask) -> RigidMotion:
-    """The motion of a group's first superpixel, for one that has no point in front."""
+    """The motion of a group's first superpixel, for a group without a point in front."""
     i = int(np.argmax(mask))
     return RigidMotion(soup.R[i], soup.translation[i])

@@ -13,14 +13,14 @@ COLOUR = 0.1
 SPREAD = 0.7
 """Standard deviation of distances, pixels of the small image."""
 ROWS = 128
-"""Rows that are computed at a time."""
+"""Rows per block of computation."""
 
 
 def grown_labels(labels: Labels, small: Image, image: Image) -> Labels:
     """Superpixels of a small image at the size of the large one, borders along its edges.
 
     Joint bilateral upsampling (Kopf et al., 2007) of labels: near a border the 3 x 3 nearest pixels
-    of the small image vote, the more the nearer they are in place and colour.
+    of the small image vote, with more weight the closer they are in position and colour.
 
     Args:
         labels: (h, w) superpixel of every pixel; -1 is a label too.
@@ -31,7 +31,7 @@ def grown_labels(labels: Labels, small: Image, image: Image) -> Labels:
         (H, W) labels.
     """
     (h, w), (height, width) = labels.shape, image.shape[:2]
-    # where another label is among the 3 x 3 pixels around a pixel
+    # pixels with more than one label among the 3 x 3 pixels around them
     border = ndimage.maximum_filter(labels, 3) != ndimage.minimum_filter(labels, 3)
     x = (np.arange(width) + 0.5) * (w / width) - 0.5
     column = np.rint(x).astype(np.int64).clip(0, w - 1)
@@ -43,8 +43,8 @@ def grown_labels(labels: Labels, small: Image, image: Image) -> Labels:
         part = labels[row[:, None], column]
         v, u = np.nonzero(border[row[:, None], column])
         if len(v):
-            place = np.stack([y[v], x[u]])
-            part[v, u] = _voted(labels, small, image[top + v, u], place, row[v], column[u])
+            position = np.stack([y[v], x[u]])
+            part[v, u] = _voted(labels, small, image[top + v, u], position, row[v], column[u])
         out[top:bottom] = part
     return out
 
@@ -54,35 +54,35 @@ def plane_depth(labels: Labels, normal: Float, offset: Float, K: Float) -> Float
 
     Args:
         labels: (H, W) plane of every pixel.
-        normal: (N, 3), towards the camera.
-        offset: (N,).
+        normal: (N, 3) normals towards the camera.
+        offset: (N,) offsets.
         K: (3, 3) intrinsics of the image.
     """
     height, width = labels.shape
     out = np.empty((height, width), np.float32)
     for top in range(0, height, ROWS):
-        own = labels[top : top + ROWS]
-        v, u = np.mgrid[top : top + len(own), 0:width]
-        facing = -np.einsum("hwc,hwc->hw", normal[own], rays(K, np.stack([u, v], axis=-1)))
+        block = labels[top : top + ROWS]
+        v, u = np.mgrid[top : top + len(block), 0:width]
+        facing = -np.einsum("hwc,hwc->hw", normal[block], rays(K, np.stack([u, v], axis=-1)))
         with np.errstate(divide="ignore", invalid="ignore"):
-            z = offset[own] / facing
-        out[top : top + ROWS] = np.where((own >= 0) & (facing > 1e-6) & (z > 0), z, np.nan)
+            z = offset[block] / facing
+        out[top : top + ROWS] = np.where((block >= 0) & (facing > 1e-6) & (z > 0), z, np.nan)
     return out
 
 
 def _voted(
-    labels: Labels, small: Image, colour: Image, place: Float, row: Int, column: Int
+    labels: Labels, small: Image, colour: Image, position: Float, row: Int, column: Int
 ) -> Labels:
-    """(P,) label with the most votes for pixels of a colour (P, 3) at places (2, P) (y, x)."""
+    """(P,) label with the most votes for pixels of a colour (P, 3) at positions (2, P) (y, x)."""
     h, w = labels.shape
     votes, weights = [], []
     for dv in (-1, 0, 1):
         for du in (-1, 0, 1):
             r, c = (row + dv).clip(0, h - 1), (column + du).clip(0, w - 1)
-            far = (place[0] - r) ** 2 + (place[1] - c) ** 2
-            other = ((small[r, c].astype(np.float32) - colour) ** 2).sum(-1) / 255.0**2
-            weights.append(np.exp(-far / (2 * SPREAD**2) - other / (2 * COLOUR**2)))
+            far = (position[0] - r) ** 2 + (position[1] - c) ** 2
+            difference = ((small[r, c].astype(np.float32) - colour) ** 2).sum(-1) / 255.0**2
+            weights.append(np.exp(-far / (2 * SPREAD**2) - difference / (2 * COLOUR**2)))
             votes.append(labels[r, c])
-    score = [sum(w * (one == of) for w, one in zip(weights, votes)) for of in votes]
+    score = [sum(w * (vote == candidate) for w, vote in zip(weights, votes)) for candidate in votes]
     best = np.argmax(score, axis=0)
     return np.asarray(np.stack(votes)[best, np.arange(len(best))], np.int32)

@@ -132,9 +132,9 @@ def _nearest(anchors: Float, k: int) -> Int:
     _, index = cKDTree(anchors).query(anchors, k=k + 1)
     index = index.reshape(n, k + 1)
     # coincident anchors can displace the point itself from the first place
-    own = index == np.arange(n)[:, None]
-    own[~own.any(1), -1] = True
-    return index[~own].reshape(n, k).astype(np.int64)
+    is_self = index == np.arange(n)[:, None]
+    is_self[~is_self.any(1), -1] = True
+    return index[~is_self].reshape(n, k).astype(np.int64)
 
 
 def _fold(knn: Int) -> tuple[Int, Int]:
@@ -183,8 +183,8 @@ def _colour_weight(image: Image, pixel: Int, which: Int, n_pairs: int, beta: flo
     v, u = pixel // width, pixel % width
     total = np.zeros(n_pairs)
     for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        other = colour[np.clip(v + dv, 0, height - 1), np.clip(u + du, 0, width - 1)]
-        gap2 = np.sum((colour[v, u] - other) ** 2, axis=1)
+        neighbour = colour[np.clip(v + dv, 0, height - 1), np.clip(u + du, 0, width - 1)]
+        gap2 = np.sum((colour[v, u] - neighbour) ** 2, axis=1)
         total += np.exp(-beta * np.sqrt(np.bincount(which, gap2, n_pairs)))
     return total
 
@@ -201,8 +201,8 @@ def _sample_along(points: Float, which: Int, count: Int, samples: int | None) ->
     start = np.concatenate([[0], np.cumsum(count)[:-1]])
     b = int(count.max()) if samples is None else samples
     # midpoints of b equal parts: b = 1 is the middle, large b tends to the whole boundary
-    place = (np.arange(b) + 0.5) / b
-    inside = np.minimum((place[None] * count[:, None]).astype(np.int64), count[:, None] - 1)
+    fraction = (np.arange(b) + 0.5) / b
+    inside = np.minimum((fraction[None] * count[:, None]).astype(np.int64), count[:, None] - 1)
     return points[order[start[:, None] + inside]].reshape(n_pairs, b, 2)
 
 
@@ -227,7 +227,7 @@ def _rim(labels: NDArray[np.int32], u: Float, v: Float, n: int) -> Float:
         angle = 2 * np.pi * k / RIM
         reach = u * np.cos(angle) + v * np.sin(angle)
         top = np.flatnonzero(reach == np.maximum.reduceat(reach, start)[owner])
-        # of pixels that reach equally far the last one stays
+        # of pixels at the same extreme the last one is kept
         last[owner[top]] = top
         out[:, k] = np.stack([u[last], v[last]], axis=1)
     return out

@@ -33,7 +33,7 @@ class RigidMotion:
         """The points (..., 3), moved.
 
         Raises:
-            DataError: they are not numbers, three of each point.
+            DataError: the points are not numbers of shape (..., 3).
         """
         try:
             x = np.asarray(points, dtype=np.float64)

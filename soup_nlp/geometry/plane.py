@@ -14,7 +14,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.geometry.soup import Soup
 
 TOLERANCE = 1e-7
-"""Violation of visibility that `tilt_to_camera` leaves alone: that of an NLP's answer."""
+"""Violation of visibility that `tilt_to_camera` accepts: the tolerance of an NLP's answer."""
 
 
 def inverse_depth(n: Float, D: Float) -> Float:
@@ -44,9 +44,9 @@ def about_anchor(Z: Float, g: Float, anchor_ray: Float) -> Float:
 
 
 def tilt_to_camera(soup: Soup, anchor_ray: Float, visibility_ray: Float, min_facing: float) -> Soup:
-    """The soup with planes that break visibility tilted about their anchors until they do not.
+    """The soup with planes that break visibility tilted about their anchors until they satisfy it.
 
-    The depth at the anchor stays; where it is negative it becomes the median of the others. A plane
+    The depth at the anchor is kept; a negative one becomes the median of the others. A plane
     parallel to the image satisfies every row.
 
     Args:

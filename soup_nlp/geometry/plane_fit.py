@@ -29,12 +29,12 @@ class PlaneFit:
     parallax: Float
 
     def pick(self, take: tuple[Int, Int]) -> PlaneFit:
-        """One candidate of each superpixel, (N, 1), by index arrays (N,) of both axes."""
+        """One candidate per superpixel, (N, 1), by index arrays (N,) of both axes."""
         return PlaneFit(*(v[take][:, None] for v in self.__dict__.values()))
 
-    def columns(self, kept: list[int]) -> PlaneFit:
+    def columns(self, indices: list[int]) -> PlaneFit:
         """The candidates in some columns."""
-        return PlaneFit(*(v[:, kept] for v in self.__dict__.values()))
+        return PlaneFit(*(v[:, indices] for v in self.__dict__.values()))
 
     def penalised(self) -> Float:
         """(N, C) cost in pixels, increased where the plane lies behind the camera.
@@ -78,7 +78,7 @@ def fit_planes(
         clip: Errors are clipped at this many pixels.
         rounds: Reweighting rounds.
     """
-    # coordinates apart, all pixels of one together: (N, C, S) each
+    # one array (N, C, S) per coordinate, the pixels contiguous
     y = R @ np.ascontiguousarray(ray.transpose(0, 2, 1))[:, None]
     front, shift = y[:, :, 2], t[:, :, None, 2]
     q = target[:, None]

@@ -59,28 +59,28 @@ class Soup:
         return self.lam[:, None] * self.t
 
     def taking(self, other: Soup, which: Mask) -> Soup:
-        """This soup with the superpixels `which` (N,) of another one."""
+        """This soup with the superpixels `which` (N,) of another soup."""
 
-        def put(own: Float, given: Float) -> Float:
-            out = own.copy()
-            out[which] = given[which]
+        def put(values: Float, replacements: Float) -> Float:
+            out = values.copy()
+            out[which] = replacements[which]
             return out
 
         parts = ("lam", "n", "d", "R", "t")
         return Soup(*(put(getattr(self, k), getattr(other, k)) for k in parts))
 
     def depth_at(self, ray: Float) -> Float:
-        """z (N, ...) of rays (N, ..., 3) on their own superpixel's plane, docs/formulation.md 3."""
+        """z (N, ...) of rays (N, ..., 3), each on its superpixel's plane, docs/formulation.md 3."""
         facing = -np.einsum("nc,n...c->n...", self.n, ray)
         return self.distance.reshape(-1, *[1] * (ray.ndim - 2)) / facing
 
-    def depth_across(self, who: Int, ray: Float) -> Float:
-        """(S, P) z of every ray (P, 3) on the planes of S superpixels, its row of `who` (P, S).
+    def depth_across(self, superpixels: Int, ray: Float) -> Float:
+        """(S, P) z of every ray (P, 3) on the planes of S superpixels each, `superpixels` (P, S).
 
-        A plane that faces its ray by less than 1e-3 is taken to face it by that.
+        `-n . ray` is taken as 1e-3 where it is less.
         """
-        facing = np.maximum(-np.einsum("psc,pc->sp", self.n[who], ray), 1e-3)
-        return np.asarray(self.distance[who.T] / facing)
+        facing = np.maximum(-np.einsum("psc,pc->sp", self.n[superpixels], ray), 1e-3)
+        return np.asarray(self.distance[superpixels.T] / facing)
 
     def points(self, ray: Float) -> Float:
         """Reference-frame points (N, ..., 3) of rays (N, ..., 3)."""
@@ -115,7 +115,7 @@ class Soup:
     def parallax(self, ray: Float) -> Float:
         """(N, 2) image motion, in ray units, by the translations of points along rays (N, 3).
 
-        It is the distance in the next image from where the rotation alone brings them.
+        It is the displacement in the next image from the points moved by the rotation alone.
         """
         far = np.einsum("nij,nj->ni", self.R, self.points(ray))
         near = far + self.translation
@@ -214,7 +214,7 @@ def reconstruct(
 
 
 def nearest_on_top(target: Float, z: Float, size: tuple[int, int]) -> Int:
-    """Which reference pixel every pixel of the next frame shows: the nearest surface wins.
+    """Reference pixel that every pixel of the next frame shows: that of the nearest surface.
 
     Cracks of one pixel in a stretched surface are closed.
 
@@ -232,20 +232,22 @@ def nearest_on_top(target: Float, z: Float, size: tuple[int, int]) -> Int:
     at = target.reshape(-1, 2)[far_first]
 
     def cells(corners: Float) -> tuple[Int, Int]:
-        """Pixels of the next frame on which corners (P, 2) lie, and which of them do."""
+        """Pixels of the next frame on which corners (P, 2) lie, and numbers of these corners."""
         u, v = corners.astype(np.int64).T
         inside = np.flatnonzero((u >= 0) & (v >= 0) & (u < width) & (v < height))
         return (v * width + u)[inside], inside
 
     out = np.full(height * width, -1)
-    # where an index is repeated the last value stays: that of the nearest pixel
+    # of values with the same index the last one, that of the nearest pixel, is kept
     cell, which = cells(np.floor(at + 0.5))
     out[cell] = far_first[which]
-    # cracks of a stretched surface alone take what covers them: taken everywhere, a footprint of
-    # 2 x 2 pixels makes silhouettes grow and slanted surfaces nearer
+    # footprints of 2 x 2 pixels fill only the cracks of a stretched surface: everywhere, they would
+    # make silhouettes larger and slanted surfaces nearer
     crack, low = out < 0, np.floor(at)
-    found = [cells(low + corner) for corner in ([0, 0], [0, 1], [1, 0], [1, 1])]
-    cell, which = (np.concatenate(x) for x in zip(*((c[crack[c]], w[crack[c]]) for c, w in found)))
+    covered = [cells(low + corner) for corner in ([0, 0], [0, 1], [1, 0], [1, 1])]
+    cell, which = (
+        np.concatenate(x) for x in zip(*((c[crack[c]], w[crack[c]]) for c, w in covered))
+    )
     order = np.argsort(which, kind="stable")
     out[cell[order]] = far_first[which[order]]
     return out.reshape(height, width)

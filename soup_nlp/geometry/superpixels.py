@@ -15,11 +15,11 @@ from soup_nlp.errors import DataError
 LEAST_PIECE = 0.25
 """Pieces smaller than this share of the mean area join a neighbour."""
 ENOUGH = 0.5
-"""Share of the wanted number below which texture has shattered the clusters."""
+"""Share of the wanted number below which texture has broken the clusters into fragments."""
 NEAR = 0.03
 """Largest share by which the number of superpixels differs from the wanted one."""
 ASKED = 4
-"""Most further calls of SLIC for more superpixels."""
+"""Largest number of further calls of SLIC for more superpixels."""
 COMPACTNESS = 10.0
 """SLIC's balance of colour and distance; scikit-image's default."""
 SMOOTHING_PX = (0.0, 1.0, 2.0, 4.0)
@@ -57,7 +57,7 @@ def segment(
     if count == 1:
         return np.zeros((height, width), np.int32)
     if method == "grid" or np.ptp(image) == 0:
-        # SLIC has nothing to follow on an image of one colour: its limit is the grid
+        # on an image of one colour SLIC has no edges to follow and would return the grid
         return _grid(height, width, count)
     for smoothing in SMOOTHING_PX:
         labels = _slic(image, count, smoothing)
@@ -124,10 +124,10 @@ def split_components(labels: Labels, min_size: int) -> Labels:
     if small.all():
         small[np.argmax(sizes)] = False
     if small.any():
-        lost = small[pieces]
-        nearest = ndimage.distance_transform_edt(lost, return_distances=False, return_indices=True)
+        hole = small[pieces]
+        nearest = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
         pieces = pieces[tuple(nearest)]
-        # filling may leave a fragment cut off from its new owner: one more pass settles it
+        # filling may cut a fragment off from the rest of its label: another pass makes it a label
         return split_components(_relabel(pieces), 1)
     return _relabel(pieces)
 

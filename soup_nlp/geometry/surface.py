@@ -17,10 +17,10 @@ JUMP = 0.1
 
 
 def hidden(rec: Reconstruction) -> Mask:
-    """(H, W) True where a reference pixel is not seen in the next frame.
+    """(H, W) True where a reference pixel is not visible in the next frame.
 
-    It lies behind a nearer surface there, or outside the image. Nothing in the next image says
-    what its depth is.
+    It lies behind a nearer surface there, or outside the image, so that the next image does not
+    determine its depth.
     """
     height, width = rec.depth_next.shape
     target = rec.flow + pixel_grid(*rec.depth_ref.shape)
@@ -36,13 +36,13 @@ def hidden(rec: Reconstruction) -> Mask:
 def joined(rec: Reconstruction, K: Float, group: NDArray[np.integer]) -> tuple[Mask, Mask]:
     """Whether neighbouring pixels lie on one continuous surface.
 
-    It does within a superpixel, and between two whose planes meet there and which belong to the
-    same group.
+    They do within a superpixel, and across the border of two superpixels of one group whose planes
+    meet there.
 
     Args:
         rec: Reconstruction.
         K: (3, 3) intrinsics of the reference frame.
-        group: (H, W) such as rigid components.
+        group: (H, W) groups such as rigid components.
 
     Returns:
         (H, W - 1) for every pixel and the one to its right, (H - 1, W) and the one below.
@@ -54,37 +54,37 @@ def joined(rec: Reconstruction, K: Float, group: NDArray[np.integer]) -> tuple[M
         ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
     ):
         i, k = rec.labels[a], rec.labels[b]
-        hold = (i == k) & np.isfinite(rec.depth_ref[a]) & np.isfinite(rec.depth_ref[b])
+        continuous = (i == k) & np.isfinite(rec.depth_ref[a]) & np.isfinite(rec.depth_ref[b])
         across = (i != k) & (group[a] == group[b])
         if across.any():
-            who = np.stack([i[across], k[across]], axis=1)
-            z = rec.soup.depth_across(who, 0.5 * (ray[a][across] + ray[b][across]))
+            pairs = np.stack([i[across], k[across]], axis=1)
+            z = rec.soup.depth_across(pairs, 0.5 * (ray[a][across] + ray[b][across]))
             near, far = z.min(axis=0), z.max(axis=0)
-            hold[across] = (far - near) <= JUMP * near
-        out.append(hold)
+            continuous[across] = (far - near) <= JUMP * near
+        out.append(continuous)
     return out[0], out[1]
 
 
 def at_jumps(right: Mask, below: Mask) -> Mask:
-    """(H, W) True for the pixels on both sides of where the surface breaks off, see `joined`.
+    """(H, W) True for the pixels on both sides of a break of the surface, see `joined`.
 
-    Images and flow are mixed there, and a mesh would stretch from one surface to the other.
+    Images and flow mix two surfaces there, and a mesh would stretch from one to the other.
     """
     out = np.zeros((len(right), right.shape[1] + 1), bool)
-    for a, b, hold in ((out[:, :-1], out[:, 1:], right), (out[:-1], out[1:], below)):
-        a |= ~hold
-        b |= ~hold
+    for a, b, continuous in ((out[:, :-1], out[:, 1:], right), (out[:-1], out[1:], below)):
+        a |= ~continuous
+        b |= ~continuous
     return out
 
 
 def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Int:
     """(M, 3) triangles of pixels v W + u, counter-clockwise as the camera sees them.
 
-    Every cell of `step` pixels that no break of the surface crosses has two.
+    Every cell of `step` pixels that no break of the surface crosses is split into two triangles.
 
     Args:
-        right: (H, W - 1) whether the surface goes on to the right, see `joined`.
-        below: (H - 1, W) the same downwards.
+        right: (H, W - 1) whether the surface continues to the right, see `joined`.
+        below: (H - 1, W) whether it continues downwards.
         keep: (H, W) pixels that are part of the surface.
         step: Pixels of a side of a cell.
     """
@@ -103,5 +103,5 @@ def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Int:
     a = (v * width + u) * step
     b, c = a + step, a + step * width
     d = c + step
-    # the image's y runs down: a, c, b turns to the left for who looks along z
+    # the image's y axis points down, so a, c, b is counter-clockwise for the camera
     return np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])

@@ -1,1 +1,1 @@
-"""Discrete labellings: pairwise energies minimised by TRW-S; knows nothing of soups."""
+"""Discrete labellings: pairwise energies minimised by TRW-S, independent of soups."""

@@ -1,8 +1,8 @@
 """The batches of nodes and the pairwise tables that TRW-S works through.
 
 A greedy colouring of the graph orders the nodes: colour by colour, and inside a colour by number.
-Nodes of one colour have no edge between them, so that handling them as one batch, a level, is the
-same computation as handling them one after the other. An edge leads from the level of its lower
+Nodes of one colour have no edge between them, so that processing them as one batch, a level, is the
+same computation as processing them one after the other. An edge leads from the level of its lower
 colour up to that of its higher colour.
 """
 
@@ -23,24 +23,24 @@ class Side:
     Attributes:
         ids: (n,) edge numbers, sorted by the level's node.
         node: (n,) position in the level of each edge's node.
-        other: (n,) node at the far end.
+        far: (n,) node at the far end.
         parts: Positions into ``ids`` by the table axis of the level's node: ``(1, positions)``
             for a node that comes first in its edge, ``(2, positions)`` for one that comes second.
-        who: (k,) positions in the level that have at least one of these edges.
-        starts: (k,) where each of them starts in ``ids``.
+        linked: (k,) positions in the level that have at least one of these edges.
+        starts: (k,) position in ``ids`` of the first edge of each of these nodes.
     """
 
     ids: np.ndarray
     node: np.ndarray
-    other: np.ndarray
+    far: np.ndarray
     parts: tuple[tuple[int, np.ndarray], ...]
-    who: np.ndarray
+    linked: np.ndarray
     starts: np.ndarray
 
     def add(self, out: np.ndarray, values: np.ndarray) -> None:
-        """Add (n, L) values of the edges to the (m, L) rows of the level's nodes, in place."""
-        if self.who.size:
-            out[self.who] += np.add.reduceat(values, self.starts, axis=0)
+        """Add values (n, L) of the edges to the rows (m, L) of the level's nodes, in place."""
+        if self.linked.size:
+            out[self.linked] += np.add.reduceat(values, self.starts, axis=0)
 
 
 @dataclass(frozen=True)
@@ -100,10 +100,10 @@ def plan_levels(colour: np.ndarray, edges: np.ndarray) -> list[Level]:
     gamma = 1.0 / np.maximum(chains, 1)
     nodes = np.argsort(colour, kind="stable")
     cuts = np.searchsorted(colour[nodes], np.arange(count + 1))
-    place = np.empty(n, dtype=np.int64)
-    place[nodes] = np.arange(n) - cuts[colour[nodes]]
-    ups = _sides(early, late, forwards, colour, place)
-    downs = _sides(late, early, ~forwards, colour, place)
+    position = np.empty(n, dtype=np.int64)
+    position[nodes] = np.arange(n) - cuts[colour[nodes]]
+    ups = _sides(early, late, forwards, colour, position)
+    downs = _sides(late, early, ~forwards, colour, position)
     return [
         Level(nodes[a:b], gamma[nodes[a:b], None], up, down)
         for a, b, up, down in zip(cuts[:-1], cuts[1:], ups, downs)
@@ -111,27 +111,27 @@ def plan_levels(colour: np.ndarray, edges: np.ndarray) -> list[Level]:
 
 
 def _sides(
-    near: np.ndarray, far: np.ndarray, head: np.ndarray, level: np.ndarray, place: np.ndarray
+    near: np.ndarray, far: np.ndarray, head: np.ndarray, level: np.ndarray, position: np.ndarray
 ) -> list[Side]:
     """One :class:`Side` per level, of the edges seen from their ``near`` node.
 
     Args:
         near: (E,) node on this side of every edge.
-        far: (E,) node at the other end.
+        far: (E,) node at the far end.
         head: (E,) whether ``near`` comes first in its edge.
         level: (N,) level of every node.
-        place: (N,) position of every node in its level.
+        position: (N,) position of every node in its level.
     """
-    ids = np.lexsort((place[near], level[near]))
+    ids = np.lexsort((position[near], level[near]))
     cuts = np.searchsorted(level[near[ids]], np.arange(int(level.max()) + 2))
     out = []
     for a, b in itertools.pairwise(cuts):
-        mine = ids[a:b]
-        node = place[near[mine]]
-        who, starts = np.unique(node, return_index=True)
-        both = ((1, np.flatnonzero(head[mine])), (2, np.flatnonzero(~head[mine])))
-        parts = tuple(part for part in both if part[1].size)
-        out.append(Side(mine, node, far[mine], parts, who, starts))
+        members = ids[a:b]
+        node = position[near[members]]
+        linked, starts = np.unique(node, return_index=True)
+        by_axis = ((1, np.flatnonzero(head[members])), (2, np.flatnonzero(~head[members])))
+        parts = tuple(part for part in by_axis if part[1].size)
+        out.append(Side(members, node, far[members], parts, linked, starts))
     return out
 
 
@@ -156,7 +156,7 @@ class Tables:
 
     def lines(self, side: Side, labels: np.ndarray) -> np.ndarray:
         """(n, L) table entries over the labels of the level's node, the far end held fixed."""
-        fixed = labels[side.other]
+        fixed = labels[side.far]
         out = np.empty((len(side.ids), self.table.shape[1]), self.table.dtype)
         for axis, at in side.parts:
             rows = side.ids[at]

@@ -3,19 +3,19 @@
 The energy is ``E(x) = sum_i u_i(x_i) + sum_ij p_ij(x_i, x_j)``. The method is sequential
 tree-reweighted message passing (V. Kolmogorov, "Convergent tree-reweighted message passing for
 energy minimization", IEEE TPAMI 28(10), 2006) on monotonic chains, step by step as in its
-author's TRW_S-v1.3 with general tables: the bound of every iteration is the one that the original
-has if it visits the nodes in the order used here, colour by colour (another order has others):
+author's TRW_S-v1.3 with general tables: the bound of every iteration equals that of the original,
+if it visits the nodes in the same order, colour by colour (bounds depend on the order):
 
 * forward pass, for every node s in order: ``D_s = u_s + sum of the messages into s``, and for
   every later neighbour t ``M_st(x_t) = min over x_s of (gamma_s D_s - M_ts)(x_s) + p(x_s, x_t)``,
   less its minimum over x_t, with ``gamma_s = 1 / max(later neighbours, earlier neighbours)``;
-* backward pass, the same in reverse towards earlier neighbours once ``D_s`` lost its minimum;
-  the lower bound is the sum of the minima taken out of nodes and messages in this pass;
+* backward pass, the same in reverse towards earlier neighbours, ``D_s`` less its minimum;
+  the lower bound is the sum of the minima subtracted from nodes and messages in this pass;
 * decoding in order: ``x_i = argmin u_i + sum_(j<i) p_ji(x_j, .) + sum_(j>i) M_ji``, the first
   label in a tie.
 
-An edge stores one message, the one that the last pass over it wrote. Nodes of one colour run as one
-batch (:mod:`soup_nlp.mrf.levels`), which changes nothing but the order of floating-point sums.
+An edge stores one message, that of the last pass over it. Nodes of one colour are processed as one
+batch (:mod:`soup_nlp.mrf.levels`), which changes only the order of floating-point sums.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class TRWSResult:
     """Outcome of :func:`solve_trws`.
 
     Attributes:
-        labels: (N,) int64, the best labelling met.
+        labels: (N,) int64, the labelling of lowest energy found.
         energy: Its energy by :func:`mrf_energy`, in float64.
-        lower_bound: Largest bound met, at most ``energy``; -inf before the first iteration ended.
+        lower_bound: Largest bound so far, at most ``energy``; -inf if no iteration ended.
         iterations: Number of iterations, each one forward and one backward pass.
         status: ``"gap"``, ``"stagnation"``, ``"iterations"`` or ``"interrupted"``.
         ties: Nodes whose label was a tie, to rounding, when ``labels`` were decoded; 0 if they
@@ -80,10 +80,10 @@ def solve_trws(
             bound rose by at most ``stagnation * max(1, |bound|)``; negative: never.
         patience: See ``stagnation``.
         dtype: float64, or float32 for half the memory; the bound is then exact to that rounding.
-        init_labels: (N,) labels that the result is never worse than; they do not steer the method.
+        init_labels: (N,) labels whose energy the result does not exceed; they guide no message.
         callback: Called after every iteration as ``callback(iteration, bound, energy, best
-            energy)``, numbers of the working type; a true answer or a KeyboardInterrupt, there or
-            anywhere in the iterations, ends them with status ``"interrupted"``.
+            energy)``, numbers of the working type; a true return value, or a KeyboardInterrupt at
+            any time, ends the iterations with status ``"interrupted"``.
 
     Raises:
         ModelError: A cost is not finite in the working type.
@@ -117,7 +117,7 @@ def solve_trws(
     _, labels, ties = best
     energy = mrf_energy(labels, unary, edges, pairwise)
     if begin is not None and first < energy:
-        energy, labels, ties = first, begin, 0  # float32 took a worse labelling for a better one
+        energy, labels, ties = first, begin, 0  # float32 ranked a worse labelling as better
     bound = min(max((row[0] for row in rows), default=-math.inf), energy)
     return TRWSResult(labels, energy, bound, len(rows), status, ties)
 
@@ -133,9 +133,9 @@ def mrf_energy(
         edges: (E, 2) node numbers.
         pairwise: (E, L, L) tables.
     """
-    paid = pairwise[np.arange(len(edges)), labels[edges[:, 0]], labels[edges[:, 1]]]
-    alone = np.asarray(unary, np.float64)[np.arange(len(labels)), labels]
-    return float(alone.sum()) + math.fsum(paid.tolist())
+    edge_costs = pairwise[np.arange(len(edges)), labels[edges[:, 0]], labels[edges[:, 1]]]
+    node_costs = np.asarray(unary, np.float64)[np.arange(len(labels)), labels]
+    return float(node_costs.sum()) + math.fsum(edge_costs.tolist())
 
 
 class _Passes:
@@ -183,7 +183,7 @@ class _Passes:
         return out
 
     def _send(self, side: Side, level: Level, belief: np.ndarray) -> float:
-        """Replace the messages of one side of a level; the sum of the minima taken out."""
+        """Replace the messages of one side of a level; returns the sum of the subtracted minima."""
         belief = belief * level.gamma.astype(belief.dtype)
         sent = belief[side.node] - self.messages[side.ids]
         out = np.empty_like(sent)
@@ -193,11 +193,11 @@ class _Passes:
                 block = self.tables.block(side.ids[at])
                 block += sent[at, :, None] if axis == 1 else sent[at, None]
                 out[at] = block.min(axis=axis)
-        gone = self.absent[side.other]
-        np.copyto(out, np.inf, where=gone)
+        absent = self.absent[side.far]
+        np.copyto(out, np.inf, where=absent)
         least = out.min(axis=1, keepdims=True)
         out -= least
-        np.copyto(out, 0.0, where=gone)
+        np.copyto(out, 0.0, where=absent)
         self.messages[side.ids] = out
         return float(least.sum(dtype=np.float64))
 
@@ -214,7 +214,7 @@ class _Passes:
             best = total.argmin(axis=1)
             labels[level.nodes] = best
             energy += float(exact[np.arange(len(best)), best].sum(dtype=np.float64))
-            near = total.min(axis=1, keepdims=True)
-            near = near + rounding * np.maximum(1, np.abs(near))
-            ties += int(((total <= near).sum(axis=1) > 1).sum())
+            limit = total.min(axis=1, keepdims=True)
+            limit = limit + rounding * np.maximum(1, np.abs(limit))
+            ties += int(((total <= limit).sum(axis=1) > 1).sum())
         return energy, labels, ties

@@ -111,38 +111,38 @@ def prepare(
     fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
     if pair.focal_sigma >= GUESS_SIGMA:
         views = fitted.views
-        found = views.ray.reshape(-1, 3), views.target.reshape(-1, 3), views.weight.ravel()
-        better = focal_length(*found, views.focal[0], pair.focal_sigma, problem.seed)
+        matches = views.ray.reshape(-1, 3), views.target.reshape(-1, 3), views.weight.ravel()
+        better = focal_length(*matches, views.focal[0], pair.focal_sigma, problem.seed)
         full, pair = full.with_focal(*better), pair.with_focal(*better)
         seen = None if seen is None else seen.with_focal(*better)
         fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
         if log:
             log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
-    given, start = None, _begin(problem, pair, seg, fitted, options)
+    given_depth, start = None, _begin(problem, pair, seg, fitted, options)
     if pair.depth_prior is not None and problem.energy.weights.depth > 0:
-        own = start, seg, pair, fitted
+        pieces = start, seg, pair, fitted
         if s.superpixels > PIECES:
             few = segmented(superpixels(problem, pair, PIECES))
             fit = FlowFit.of(few, flow, pair.K_ref, pair.K_next, options)
-            own = _begin(problem, pair, few, fit, options), few, pair, fit
-        evidence = judged(*own, problem.depth_prior.kind)
+            pieces = _begin(problem, pair, few, fit, options), few, pair, fit
+        evidence = judged(*pieces, problem.depth_prior.kind)
         if evidence.used and not evidence.confirmed and s.follow_flow_px is not None:
-            # no flow knows where surfaces end
+            # the flow does not show where surfaces end
             seg = segmented(follow_depth(labels, evidence.log_depth(pair.depth_prior)))
             fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
             start = _begin(problem, pair, seg, fitted, options)
-        start, given = by_prior(start, seg, pair, fitted, evidence)
+        start, given_depth = by_prior(start, seg, pair, fitted, evidence)
         if log:
             log(str(evidence))
     done("start", start)
-    data, weights = build_energy(problem, pair, seg, start, given)
+    data, weights = build_energy(problem, pair, seg, start, given_depth)
     stages = solver_options(problem, start)
     larger = None if pair.size == full.size else full
     parts = problem, pair, seg, start, data, weights, start.soup, stages
-    case = Case(*parts, seen or pair, larger, given)
+    case = Case(*parts, seen or pair, larger, given_depth)
     if not presolve:
         return case
-    # one iteration of the constrained NLP is the smallest number that a solve has
+    # a solve has at least one iteration of the constrained NLP
     once = stages.replace(presolve=True, max_iter=1)
     watch = Watch(say=log) if log else None
     answer = solve_soup(start.soup, data, weights, case.formulation(), once, watch=watch)
@@ -164,17 +164,17 @@ def _begin(
 def _with_flow(
     problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] | None
 ) -> tuple[Pair, Pair | None]:
-    """A pair with its flow, and without a layer that stands still before the scene if it has one.
+    """A pair with its flow, and that pair without a still layer before the scene, if it has one.
 
     Args:
         problem: The merged problem.
         full: The pair at its own size.
         pair: The pair at the size that is solved.
-        log: Called with a line where there is such a layer.
+        log: Called with a line if there is such a layer.
     """
     flow = pair.flow
     if flow is None and pair is not full and problem.flow.is_file():
-        # a file has the size of the images
+        # a flow file has the size of the original images
         flow = resized_flow(problem.flow.load(full, problem.path), full, pair)
     flow = flow or problem.flow.load(pair, problem.path)
     pair = pair.with_flow(flow)
@@ -188,7 +188,7 @@ def _with_flow(
 
 
 def superpixels(problem: Problem, pair: Pair, count: int | None = None) -> Labels:
-    """The superpixels that a problem asks for, or so many, on a pair that carries its flow."""
+    """The superpixels of a problem, or `count` of them, on a pair that carries its flow."""
     assert pair.flow is not None
     s = problem.segmentation
     labels = segment(pair.image_ref, count or s.superpixels, s.method)
@@ -196,7 +196,7 @@ def superpixels(problem: Problem, pair: Pair, count: int | None = None) -> Label
 
 
 def solver_options(problem: Problem, start: Start) -> SolverOptions:
-    """The solver's options of a problem, its smoothing no wider than surfaces allow."""
+    """The solver's options of a problem, the smoothing no wider than bending surfaces allow."""
     solver = problem.solver
     if not start.bending or problem.energy.units != "pixel":
         return solver
@@ -204,14 +204,14 @@ def solver_options(problem: Problem, start: Start) -> SolverOptions:
     eps = dict.fromkeys(min(e, WIDEST_BENDING_EPS) for e in solver.presolve_eps)
     # E_arap truncated from the beginning tears bending surfaces; beside rigid regions E_arap
     # without truncation lets the scales of components slide
-    both = solver.untruncated or bool(start.bends.all())
-    return solver.replace(presolve_eps=tuple(eps), untruncated=both)
+    untruncated = solver.untruncated or bool(start.bends.all())
+    return solver.replace(presolve_eps=tuple(eps), untruncated=untruncated)
 
 
 def build_energy(
-    problem: Problem, pair: Pair, seg: Segmentation, start: Start, given: Given | None = None
+    problem: Problem, pair: Pair, seg: Segmentation, start: Start, given_depth: Given | None = None
 ) -> tuple[EnergyData, Weights]:
-    """The energy that a problem asks for, on a pair that carries its flow."""
+    """The energy of a problem, on a pair that carries its flow."""
     assert pair.flow is not None
     e = problem.energy
     pixels = None if e.pixel_samples == "all" else e.pixel_samples
@@ -222,41 +222,42 @@ def build_energy(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, at_anchors
     )
     data = without_flow(in_noise(data, start.noise), start.wrong)
-    free, bent = data.prior_weight, bending_weights(e.weights, len(seg))
+    prior_weight, bending = data.prior_weight, bending_weights(e.weights, len(seg))
     data = across_components(data, start.component, e.arap_across)
-    data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * free)
+    data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * prior_weight)
     parts = start.component
     if start.order is not None:
         guessed = start.tie == TIES.index("occlusion")
         data = with_order(data, start.soup, start.order, guessed, start.noise)
-    if given is not None and given.evidence.used:
-        # no flow holds slopes where the prior decides: they are held as those that bend
-        stiffer = np.where(bends, 1.0, bent.orient / max(e.weights.orient, 1e-12))
-        known = given.log_depth, given.opened, given.error, start.component, free, stiffer
-        data = with_prior(data, start.soup, *known, creased=not given.evidence.confirmed)
-        # a given depth has steps inside a component as well
+    if given_depth is not None and given_depth.evidence.used:
+        # the flow holds no slopes where the prior decides: E_orient does, as in bending regions
+        stiffer = np.where(bends, 1.0, bending.orient / max(e.weights.orient, 1e-12))
+        values = given_depth.log_depth, given_depth.opened, given_depth.error
+        arguments = *values, start.component, prior_weight, stiffer
+        data = with_prior(data, start.soup, *arguments, creased=not given_depth.evidence.confirmed)
+        # a given depth may have steps inside a component too
         parts = np.arange(len(seg))
     data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)
     if whole:
-        apart = start.surface * (int(start.component.max()) + 1) + start.component
-        data = across_discontinuities(data, apart, **ACROSS_DISCONTINUITIES)
+        pieces = start.surface * (int(start.component.max()) + 1) + start.component
+        data = across_discontinuities(data, pieces, **ACROSS_DISCONTINUITIES)
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, BENDING_ROTATION_PX if whole else None)
     else:
         data = in_length(data, start.soup, e.length)
     if whole:
-        return data, bent
+        return data, bending
     if bends.any():
-        data = within_bending(data, bends, e.weights, bent, BENDING_ROTATION_PX)
+        data = within_bending(data, bends, e.weights, bending, BENDING_ROTATION_PX)
     return data, e.weights
 
 
-# --- memory, estimated before it is taken ---------------------------------------------------------
+# --- memory, estimated before a solve ---------------------------------------------------------
 
 PIXEL = 800
 """Bytes per pixel of the reference image: flow in both directions, superpixels, maps, pictures."""
 ROW = 5_000
-"""Bytes per sampled pixel or boundary point: its row of data and its part of the derivatives."""
+"""Bytes per sampled pixel or boundary point: a row of data and a share of the derivatives."""
 EDGE = 20_000
 """Bytes per edge and neighbour pair in the two programs and their factors."""
 NEIGHBOURS = 3
@@ -279,7 +280,7 @@ def check_fits(problem: Problem, pair: Pair) -> None:
             expected=f"1 to {pixels // 4} for {width}x{height}",
         )
     graph = n * (s.neighbours + NEIGHBOURS)
-    # a superpixel cannot have more samples than pixels, nor more boundary than its own
+    # a superpixel has no more samples than pixels, and no more boundary points than its outline
     sampled = problem.energy.pixel_samples
     inside = pixels if sampled == "all" else min(pixels, n * sampled)
     around = 4 * (pixels / n) ** 0.5
@@ -309,23 +310,23 @@ def check_fits(problem: Problem, pair: Pair) -> None:
 # --- a layer that stands still before the scene --------------------------------------------------
 
 LEAST_SHARE = 0.003
-"""Share of the pixels that must stand still for a layer to be looked for."""
+"""Least share of pixels that stand still for the search for a layer."""
 LEAST_FLOW = 2.0
 """Median displacement, pixels, below which the camera may be at rest."""
 PIXELS = 6000
-"""The motion of what moves is fitted to so many."""
+"""Largest number of moving pixels to which their motion is fitted."""
 
 
 def see_through(pair: Pair, seed: int = 0) -> Pair | None:
-    """The pair without a still layer, and with the flow of what moves behind it.
+    """The pair without a still layer, and with the flow of the moving scene behind it.
 
     Args:
         pair: A pair whose flow was computed from its images.
-        seed: Of the sample that the motion is fitted to.
+        seed: Seed of the sample to which the motion is fitted.
 
     Returns:
-        Grey images (as RGB) without the layer, and the corrected flow; None where nothing stands
-        still, where all may, or where the images do not contradict what stands still.
+        Grey images (as RGB) without the layer, and the corrected flow; None if no pixel stands
+        still, if all may, or if the images do not contradict the flow of those that do.
     """
     flow = pair.flow
     assert flow is not None
@@ -336,11 +337,11 @@ def see_through(pair: Pair, seed: int = 0) -> Pair | None:
         return None
     v, u = np.nonzero(sure & ~at_rest)
     pick = np.random.default_rng(seed).permutation(len(v))[:PIXELS]
-    place = np.stack([u, v], axis=-1)[pick].astype(float)
+    pixel = np.stack([u, v], axis=-1)[pick].astype(float)
     move = flow.uv[v, u][pick].astype(float)
     motions = repeated(
-        rays(pair.K_ref, place),
-        rays(pair.K_next, place + move),
+        rays(pair.K_ref, pixel),
+        rays(pair.K_next, pixel + move),
         flow.confidence[v, u][pick].astype(float),
         float(pair.K_next[0, 0]),
         count=1,

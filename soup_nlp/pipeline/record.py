@@ -1,4 +1,4 @@
-"""What a case holds before its solve and a run after it: inputs, energy, solution, scores."""
+"""Records of a case before its solve and of a run after it: inputs, energy, solution, scores."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Case:
         seen: The pair as the photometric term sees it: without a layer that stands still before
             the scene, where there is one.
         original: The pair at its own size, where it was larger than `max_size`; else None.
-        given: What was made of a depth prior; None without one.
+        given: Depth prior as judged against the flow; None without a prior.
     """
 
     problem: Problem
@@ -117,7 +117,7 @@ class Run(Case):
         metrics: By "solution" (delivered), "nlp" (where refined), "start", "constant", "rigid",
             and "solution_next" for the next frame; a key without truth is absent.
         seconds: Wall time by stage; those that start with nlp_ are parts of "nlp".
-        confidence: How sure `reconstruction` is.
+        confidence: Uncertainty of `reconstruction`.
         refined: Result of the refinement of `solution`; None where it is off.
         nlp_reconstruction: Dense 3D of `solution`, where there is an NLP and it was refined.
         full: Depth at the images' own size, where the pair was solved at a smaller one.
@@ -158,7 +158,7 @@ class Run(Case):
 
     @cached_property
     def components(self) -> Components:
-        """What moves as one, with its rigid motion; the first is the static scene."""
+        """Rigid components with their motions; the first is the static scene."""
         pair, start = self.pair, self.start
         geometry = self.soup, self.segmentation, start.part, pair.K_ref, pair.K_next
         return find_components(*geometry, start.borrowed)
@@ -166,7 +166,7 @@ class Run(Case):
     @property
     def camera(self) -> RigidMotion:
         """next_from_ref of the static scene, in the unit of the reconstruction; its `centre` is the
-        next camera as the reference frame sees it."""
+        centre of the next camera in the reference frame."""
         return self.components.camera
 
     @property
@@ -177,7 +177,7 @@ class Run(Case):
 
     @property
     def answer(self) -> Soup:
-        """Ipopt's last iterate, whose constraints hold to its tolerance only; the start where the
+        """Ipopt's last iterate, whose constraints hold to Ipopt's tolerance only; the start if the
         NLP was skipped."""
         if not self.solution.stages:
             return self.solution.soup
@@ -205,7 +205,7 @@ class Run(Case):
 
     @property
     def solved(self) -> bool:
-        """Whether the NLP converged (or was skipped) and nobody interrupted the refinement."""
+        """Whether the NLP converged (or was skipped) and the refinement was not interrupted."""
         solved = self.solution.converged or self.solution.status == "Skipped"
         return solved and (self.refined is None or self.refined.status != "interrupted")
 

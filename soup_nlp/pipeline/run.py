@@ -37,7 +37,7 @@ from soup_nlp.storage.progress import Listener, Watch
 
 EXACT, EXACT_PARALLAX = 0.015, 1.0
 """Flow is exact below this median re-projection error of the start, with more parallax than this,
-both in pixels; E_photo, which knows pixels to a tenth, would only disturb it."""
+both in pixels; E_photo, exact to a tenth of a pixel, would only disturb it."""
 
 PAIR = "soup_nlp.Pair(image_ref, image_next, K_ref)"
 """How a pair is made, for messages."""
@@ -130,8 +130,8 @@ def run(
 def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
     """The refinement of the NLP's solution or the start.
 
-    The images count unless rigid motions explain the flow better than images could tell. Flow that
-    stands still does not count as exact: anything explains it.
+    E_photo is used unless rigid motions explain the flow more exactly than images can tell. A flow
+    without parallax does not count as exact, because any depth explains it.
     """
     problem, start, photo = case.problem, case.start, None
     exact = np.median(start.parallax) > EXACT_PARALLAX and np.median(start.error) < EXACT
@@ -154,7 +154,7 @@ def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
 
 
 def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> Run:
-    """Reconstruct and score a solution: everything that a run holds but its times.
+    """Reconstruct and score a solution: a whole run except its times.
 
     Args:
         case: The problem before the solve.
@@ -181,9 +181,9 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         depths["nlp"] = between.depth_ref
     if rigid is not None:
         depths["rigid"] = rigid
-    given = vars(case) | {"soup": solution.soup if refined is None else refined.soup}
+    fields = vars(case) | {"soup": solution.soup if refined is None else refined.soup}
     return Run(
-        **given,
+        **fields,
         solution=solution,
         start_reconstruction=before,
         reconstruction=after,
@@ -231,7 +231,7 @@ def solve_pair(
 ) -> Run:
     """Solve a pair that is in memory.
 
-    The problem of the run holds a hash of the pair, so its config.yaml cannot be solved again.
+    The problem of the run holds a hash of the pair only, so that its config.yaml cannot be solved.
     `soup-nlp show street` lists the keys of a problem.
 
     Args:

@@ -29,28 +29,28 @@ def feasible(p: Particles, visibility_ray: Float, min_facing: float) -> Mask:
 
 
 def unary_costs(
-    p: Particles, data: EnergyData, weights: Weights, who: Int | None = None
+    p: Particles, data: EnergyData, weights: Weights, superpixels: Int | None = None
 ) -> tuple[Float, Mask]:
     """alpha1 E_proj of every particle, and whether it keeps its pixels in front of the camera.
 
     Args:
         p: (N, L) particles.
-        data: Pixels of the pair; all or sampled, as the data has them.
+        data: Pixels of the pair, all or sampled.
         weights: alpha1 and its truncation.
-        who: (N,) superpixels whose particles these are; None for all, in order.
+        superpixels: (N,) superpixels that the particles belong to; None for all, in order.
 
     Returns:
         (N, L) costs and (N, L) bool.
     """
     n_nodes, n_labels = p.shape
     out, ahead = np.empty(p.shape), np.empty(p.shape, bool)
-    every = np.arange(n_nodes) if who is None else who
+    index = np.arange(n_nodes) if superpixels is None else superpixels
     step = max(1, UNARY_BYTES // (8 * 3 * n_labels * max(1, data.pixel_ray.shape[1])))
     for a in range(0, n_nodes, step):
         b = slice(a, a + step)
-        ray, confidence = data.pixel_ray[every[b]], data.pixel_weight[every[b]]
-        target = data.pixel_target[every[b], None]
-        H = data.K_next @ p.of_some(b).homographies
+        ray, confidence = data.pixel_ray[index[b]], data.pixel_weight[index[b]]
+        target = data.pixel_target[index[b], None]
+        H = data.K_next @ p.subset(b).homographies
         y = np.matmul(H, np.swapaxes(ray, 1, 2)[:, None])
         used = confidence[:, None] > 0
         ahead[b] = (y[:, :, 2] > 1e-9).all(axis=2, where=used)
@@ -101,9 +101,9 @@ class PairCosts:
         step = max(1, BLOCK_BYTES // (out.itemsize * labels * labels))
         buffers = np.empty((4, step, labels, labels), dtype)
         for rows, add in ((self.arap_row, self._arap), (self.cont_row, self._cont)):
-            there = np.flatnonzero(rows >= 0)
-            for a in range(0, len(there), step):
-                at = there[a : a + step]
+            present = np.flatnonzero(rows >= 0)
+            for a in range(0, len(present), step):
+                at = present[a : a + step]
                 out[at] += add(state, rows[at], unit, buffers[:, : len(at)])
         return out
 
@@ -172,7 +172,7 @@ class PairCosts:
         scale[:] = s.factor((d.pair_factor / d.pair_unit)[rows] / (1 if d.local_units else unit))
         if d.local_units:
             scale *= _nearness(s, i, k, x)
-        # both points lie on the same ray: their gap is |r| times that of the depths
+        # both points lie on one ray r: their distance is |r| times the difference of their depths
         _distance2(Xi, Xk, total, x)
         np.sqrt(total, out=total)
         total *= scale
@@ -196,10 +196,12 @@ class PairCosts:
         d = self.data
         i, k = d.pairs[rows].T
         ray, sign = d.boundary_ray[rows].mean(axis=1), np.sign(d.order_weight[rows])
-        # larger by the step where it is covered
-        more = [s.factor(np.where(sign * one > 0, 1 + d.order_step[rows], 1.0)) for one in (1, -1)]
-        rho_i, rho_k = (s.inverse_along(who, ray).astype(s.dtype) for who in (i, k))
-        lack = rho_i[:, :, None] * more[0] - rho_k[:, None, :] * more[1]
+        # the inverse depth of the covered side, enlarged by the step
+        factors = [
+            s.factor(np.where(sign * side > 0, 1 + d.order_step[rows], 1.0)) for side in (1, -1)
+        ]
+        rho_i, rho_k = (s.inverse_along(nodes, ray).astype(s.dtype) for nodes in (i, k))
+        lack = rho_i[:, :, None] * factors[0] - rho_k[:, None, :] * factors[1]
         lack *= s.factor(sign)
         lack /= _nearness(s, i, k, out)
         lack += np.hypot(lack, HINGE)
@@ -219,9 +221,9 @@ def _leaky(y: AnyFloat, sigma: float, leak: float) -> AnyFloat:
 
 
 class _State:
-    """Components are the first axis, (c, N, L), so that a block of edges reads contiguous numbers.
+    """Particles with components on the first axis, (c, N, L): a block of edges reads contiguously.
 
-    What is subtracted for every pair of labels has the type of the tables.
+    Arrays that are subtracted for every pair of labels have the type of the tables.
     """
 
     def __init__(self, p: Particles, data: EnergyData, dtype: type | np.dtype) -> None:
@@ -244,19 +246,19 @@ class _State:
         """Values of the edges of a block, (b, 1, 1)."""
         return values.astype(self.dtype)[:, None, None]
 
-    def inverse_along(self, who: Int, ray: Float) -> Float:
+    def inverse_along(self, nodes: Int, ray: Float) -> Float:
         """(b, L) inverse depths along one ray (b, 3) each."""
-        (*n, D) = self.plane[:, who]
+        (*n, D) = self.plane[:, nodes]
         return np.asarray(-sum(n[c] * ray[:, c, None] for c in range(3)) / D)
 
-    def boundary(self, who: Int, ray: Float) -> tuple[AnyFloat, AnyFloat]:
+    def boundary(self, nodes: Int, ray: Float) -> tuple[AnyFloat, AnyFloat]:
         """Distances along boundary rays (b, B, 3), and next-frame points.
 
         Returns:
             (B, b, L) depths times |r|, and (3 B, b, L) points.
         """
-        (*n, D), R = self.plane[:, who], self.R[:, who]
-        T = np.moveaxis(self.shift[who], 2, 0)
+        (*n, D), R = self.plane[:, nodes], self.R[:, nodes]
+        T = np.moveaxis(self.shift[nodes], 2, 0)
         r = ray.transpose(1, 2, 0)[..., None]
         facing = -(n[0] * r[:, 0] + n[1] * r[:, 1] + n[2] * r[:, 2])
         facing = np.where(np.abs(facing) < 1e-12, 1e-12, facing)
@@ -299,14 +301,14 @@ def _distance2(a: AnyFloat, b: AnyFloat, out: AnyFloat, buffer: AnyFloat) -> Non
 def _anchor_gap(s: _State, ray: Float, i: Int, k: Int) -> Float:
     """(3, b, L, L) `(R_i - R_k) (X_i + X_k) / 2 + T_i - T_k`."""
 
-    def turned(who: Int, other: Int) -> Float:
-        r = ray[other].T[..., None]
-        R = s.R[:, who]
+    def turned(nodes: Int, partners: Int) -> Float:
+        r = ray[partners].T[..., None]
+        R = s.R[:, nodes]
         return np.stack([sum(R[3 * c + j] * r[j] for j in range(3)) for c in range(3)])
 
-    own_i, own_k = (s.Y[:, j] + s.T[:, j] for j in (i, k))
+    sum_i, sum_k = (s.Y[:, j] + s.T[:, j] for j in (i, k))
     # Y = R X + T, so R_i X_i / 2 + T_i = (Y_i + T_i) / 2
-    out = own_i[..., :, None] - own_k[..., None, :]
+    out = sum_i[..., :, None] - sum_k[..., None, :]
     out += turned(i, k)[..., :, None] * s.Z[k][:, None, :]
     out -= turned(k, i)[..., None, :] * s.Z[i][:, :, None]
     return 0.5 * out

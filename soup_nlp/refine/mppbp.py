@@ -2,9 +2,10 @@
 
 Every round draws particles around the current soup, writes the exact energy over them as a pairwise
 MRF, finds a labelling of low energy with TRW-S, and continues from it. The current belief is
-always particle 0 and a choice is taken only if the exact energy (`objective`) is lower: it never
-rises. Feasibility holds by construction: rotations by the exponential map, normals on the sphere,
-positive distances, visibility by an infinite cost, the simplex by the free global scale.
+always particle 0 and a labelling is accepted only if it lowers the exact energy (`objective`),
+which therefore never rises. Feasibility holds by construction: rotations by the exponential map,
+normals on the sphere, positive distances, visibility by an infinite cost, the simplex by the free
+global scale.
 
 With one global length unit (`local_units` off) the unit `u = sum_i c_i D_i` couples everything.
 The MRF then has u fixed and its first-order change in the unary costs; the comparison of rounds
@@ -51,10 +52,10 @@ DEPTH_REACH = 2.0
 """A proposed depth is at most this many times the upper quartile of the neighbours' depths, and at
 least their lower quartile over this squared."""
 SWEPT = 6
-"""Planes swept over depth that every superpixel is offered, where images count."""
+"""Planes swept over depth among the particles of every superpixel, if images are used."""
 CONTRADICTED = 0.06
 """Share of superpixels whose flow the images contradict, below which there is one round: on such
-pairs the MRE after four is that after one."""
+pairs four rounds give the same MRE as one."""
 
 
 def refine_soup(
@@ -74,22 +75,22 @@ def refine_soup(
 
     With images the energy is that of `objective`. Where they contradict the flow of more than a
     few superpixels, planes swept over depth under the commonest motions are among the particles of
-    the first round; otherwise it is the only one.
+    the first round; otherwise there is only one round.
 
     Args:
         soup: Current belief. Planes that break visibility are first tilted until they do not.
         data: Numbers of the energy.
         weights: Its constants.
         options: Rounds, particles, limits.
-        start: The initialisation, whose objective is stated beside; None for `soup`.
+        start: The initialisation, whose objective is reported too; None for `soup`.
         photo: Photometric term; None for the flow alone.
-        seed: Of every draw.
+        seed: Seed of all draws.
         min_facing: Visibility, as in the constrained NLP.
         depth_ratio: The same.
         watch: Listener of the iterations of TRW-S, stop event and log; a stop keeps the best soup.
 
     Returns:
-        The best soup, normalised to sum(lam) = 1, and what happened.
+        The best soup, normalised to sum(lam) = 1, and the record of the rounds.
     """
     begin = time.perf_counter()
     rays = data.visibility_ray(depth_ratio)
@@ -115,7 +116,7 @@ def refine_soup(
 def objective(
     soup: Soup, data: EnergyData, weights: Weights, photo: Photometric | None = None
 ) -> Mapping[str, float]:
-    """What the refinement minimises, by term: E; with images also E_photo.
+    """Objective of the refinement by term: E; with images also E_photo.
 
     Where the images contradict the flow, E_proj is weaker (`Photometric.costs_of_flow`).
 
@@ -125,12 +126,13 @@ def objective(
         weights: Its constants.
         photo: Photometric term, if there is one.
     """
-    own = oracle.energy(soup, data, weights)
+    E = oracle.energy(soup, data, weights)
     if photo is None:
-        return own
+        return E
     proj = float(photo.costs_of_flow(Particles.of(soup), data, weights)[0].sum())
-    seen = photo.energy(soup)
-    return {**own, "proj": proj, "total": own["total"] - own["proj"] + proj + seen, "photo": seen}
+    e_photo = photo.energy(soup)
+    total = E["total"] - E["proj"] + proj + e_photo
+    return {**E, "proj": proj, "total": total, "photo": e_photo}
 
 
 def length_slope(soup: Soup, data: EnergyData, weights: Weights) -> float:
@@ -161,7 +163,7 @@ class Rounds:
         options: Rounds, particles, limits.
         photo: Photometric term; None for the flow alone.
         visibility: (N, V, 3) rays where visibility is imposed, and the least facing there.
-        seed: Of every draw.
+        seed: Seed of all draws.
     """
 
     def __init__(
@@ -217,7 +219,7 @@ class Rounds:
     def costs(self, p: Particles) -> tuple[Float, NDArray[np.floating]]:
         """The exact energy over particles as a pairwise MRF: unary and pairwise costs.
 
-        What is not feasible costs infinitely much.
+        Infeasible particles have infinite cost.
         """
         data, best, photo = self.data, self.best, self.photo
         flow = photo.costs_of_flow if photo else unary_costs
@@ -233,10 +235,10 @@ class Rounds:
             allowed &= within_reach(p, best, self.proposer.near, data.anchor_ray, DEPTH_REACH)
         unary[~allowed] = np.inf
         # the current belief is allowed even where it violates a constraint
-        lost = ~np.isfinite(unary[:, 0])
-        if lost.any():
+        forbidden = ~np.isfinite(unary[:, 0])
+        if forbidden.any():
             exact = self.weights.proj * oracle.reprojection(best, data, self.weights)
-            unary[lost, 0] = np.minimum(exact, 1e9)[lost]
+            unary[forbidden, 0] = np.minimum(exact, 1e9)[forbidden]
         # single precision suffices: a choice is taken only where the exact energy falls
         return unary, self.pairs.tables(p, unit, np.float32)
 
@@ -252,8 +254,8 @@ class Rounds:
             rng = self.proposer.rng
             add(swept(self.best, self.data, self.photo, SWEPT, rng), "swept")
         shares = WALKS if self.options.proposals == "walks" else {**WALKS, **NEIGHBOURS}
-        left = max(0, self.options.particles - len(kinds))
-        for kind, count in counts(shares, left).items():
+        remaining = max(0, self.options.particles - len(kinds))
+        for kind, count in counts(shares, remaining).items():
             if count:
                 add(self.proposer.propose(self.best, kind, count), kind)
         return parts[0].joined(*parts[1:]), kinds

@@ -2,7 +2,7 @@
 
 A proposal is written about the anchor of its superpixel: depth Z there, slope g of the relative
 inverse depth (`1 / Z(r) = (1 + g . (r - r_a)) / Z`, a chart of the sphere of normals), rotation
-R and translation T. Whatever is added to (log Z, g, rotation vector, T), the result is a plane
+R and translation T. Any step in (log Z, g, rotation vector, T) leads to a plane
 with a unit normal and a positive distance, and a motion in SE(3). Steps are in pixels of
 re-projection, so that one distribution fits every scene and every superpixel.
 """
@@ -27,7 +27,7 @@ NEIGHBOURS: Mapping[str, float] = {
     "neighbour_motion": 4,
     "neighbour_both": 5,
 }
-"""Kinds that take over what neighbours have: plane, motion or both."""
+"""Kinds that take over the plane, the motion or both of a neighbour."""
 KINDS = ("current", "swept", *WALKS, *NEIGHBOURS)
 """Kinds of particles by number."""
 STEP, WIDTH = 0.5, 1.2
@@ -70,25 +70,25 @@ class Particles:
 
     def joined(self, *others: Particles) -> Particles:
         """The particles of several sets, concatenated."""
-        every = (self, *others)
+        sets = (self, *others)
         return Particles(
-            *(np.concatenate([getattr(p, k) for p in every], axis=1) for k in ("n", "D", "R", "T"))
+            *(np.concatenate([getattr(p, k) for p in sets], axis=1) for k in ("n", "D", "R", "T"))
         )
 
     def take(self, which: Int) -> Particles:
-        """The particles that have the numbers `which` (N, C)."""
+        """The particles with the numbers `which` (N, C)."""
         rows = np.arange(len(self.D))[:, None]
         return Particles(*(a[rows, which] for a in (self.n, self.D, self.R, self.T)))
 
-    def of_some(self, who: Int | slice) -> Particles:
-        """The particles of some superpixels."""
-        return Particles(self.n[who], self.D[who], self.R[who], self.T[who])
+    def subset(self, which: Int | slice) -> Particles:
+        """The particles of the superpixels `which`."""
+        return Particles(self.n[which], self.D[which], self.R[which], self.T[which])
 
     def soup(self, labels: Int, share: Float) -> Soup:
         """The soup of labels (N,), with sum(lam) = 1 exactly restored (`Soup.normalised`)."""
-        own = self.take(labels[:, None])
-        one = np.ones(len(labels))
-        return Soup(one, own.n[:, 0], own.D[:, 0], own.R[:, 0], own.T[:, 0]).normalised(share)
+        p = self.take(labels[:, None])
+        ones = np.ones(len(labels))
+        return Soup(ones, p.n[:, 0], p.D[:, 0], p.R[:, 0], p.T[:, 0]).normalised(share)
 
 
 def anchor_depth(p: Particles, anchor_ray: Float) -> Float:
@@ -112,14 +112,14 @@ def neighbours(edges: Int, anchor_ray: Float) -> Int:
     n = len(anchor_ray)
     if not len(edges):
         return np.zeros((n, 0), np.int64)
-    own = np.concatenate([edges[:, 0], edges[:, 1]])
-    other = np.concatenate([edges[:, 1], edges[:, 0]])
-    gap = np.linalg.norm(anchor_ray[own] - anchor_ray[other], axis=1)
-    order = np.lexsort((gap, own))
-    degree = np.bincount(own, minlength=n)
+    node = np.concatenate([edges[:, 0], edges[:, 1]])
+    neighbour = np.concatenate([edges[:, 1], edges[:, 0]])
+    gap = np.linalg.norm(anchor_ray[node] - anchor_ray[neighbour], axis=1)
+    order = np.lexsort((gap, node))
+    degree = np.bincount(node, minlength=n)
     start = np.concatenate([[0], np.cumsum(degree)[:-1]])
     k = int(degree.min())
-    return other[order][start[:, None] + np.arange(k)].astype(np.int64)
+    return neighbour[order][start[:, None] + np.arange(k)].astype(np.int64)
 
 
 def counts(shares: Mapping[str, float], total: int) -> dict[str, int]:
@@ -135,7 +135,7 @@ class Proposer:
     Args:
         data: Rays and radii of the superpixels.
         near: (N, K) neighbours of every superpixel, nearest first.
-        seed: Of every draw.
+        seed: Seed of all draws.
     """
 
     def __init__(self, data: EnergyData, near: Int, seed: int) -> None:
@@ -144,20 +144,20 @@ class Proposer:
         self.focal = float(data.K_next[0, 0])
 
     def propose(self, soup: Soup, kind: str, count: int) -> Particles:
-        """`count` particles of a kind around a soup; of neighbours, no more than there are."""
+        """`count` particles of a kind around a soup, or fewer if there are fewer neighbours."""
         if kind in WALKS:
             return self._walk(soup, kind, count)
-        who = self._some(count)
-        R, T = soup.R[who], soup.translation[who]
+        sources = self._random_neighbours(count)
+        R, T = soup.R[sources], soup.translation[sources]
         if kind == "neighbour_motion":
             n = np.broadcast_to(soup.n[:, None], T.shape)
-            D = np.broadcast_to(soup.distance[:, None], who.shape)
+            D = np.broadcast_to(soup.distance[:, None], sources.shape)
             return Particles(n, D, R, T)
-        Z, g = self._extrapolated(soup, who)
+        Z, g = self._extrapolated(soup, sources)
         if kind == "neighbour_plane":
             # every second particle keeps the motion, the others scale it with the depth
-            own = soup.depth_at(self.data.anchor_ray)[:, None]
-            scale = np.where(np.arange(who.shape[1]) % 2, 1.0, Z / own)
+            depth = soup.depth_at(self.data.anchor_ray)[:, None]
+            scale = np.where(np.arange(sources.shape[1]) % 2, 1.0, Z / depth)
             R = np.broadcast_to(soup.R[:, None], R.shape)
             T = soup.translation[:, None] * scale[..., None]
         return from_anchor(Z, g, R, T, self.data.anchor_ray)
@@ -193,7 +193,7 @@ class Proposer:
         z = np.maximum(soup.moved(soup.points(ray))[:, 2], 1e-9)
         return 1.0 / np.maximum(parallax, 0.5)[:, None], z[:, None] / self.focal
 
-    def _some(self, count: int) -> Int:
+    def _random_neighbours(self, count: int) -> Int:
         """(N, count) different neighbours, the nearer ones preferred."""
         n, k = self.near.shape
         rank = np.arange(k) + 1.0
@@ -201,15 +201,15 @@ class Proposer:
         order = np.argsort(key, axis=1)[:, : min(count, k)]
         return np.take_along_axis(self.near, order, axis=1)
 
-    def _extrapolated(self, soup: Soup, who: Int) -> tuple[Float, Float]:
+    def _extrapolated(self, soup: Soup, sources: Int) -> tuple[Float, Float]:
         """Depth and slope, at each anchor, of the planes of other superpixels (N, C)."""
         ray = self.data.anchor_ray
-        own = soup.depth_at(ray)
-        m = inverse_depth(soup.n, soup.distance)[who]
+        depth = soup.depth_at(ray)
+        m = inverse_depth(soup.n, soup.distance)[sources]
         inverse = np.einsum("ncj,nj->nc", m, ray)
-        # a plane that does not meet the anchor's ray in front: its depth is borrowed instead
-        bad = inverse * own[:, None] < 0.1
-        Z = np.where(bad, own[who], 1.0 / np.where(bad, 1.0, inverse))
+        # where a plane does not meet the anchor's ray in front, its depth at its own anchor is used
+        bad = inverse * depth[:, None] < 0.1
+        Z = np.where(bad, depth[sources], 1.0 / np.where(bad, 1.0, inverse))
         g = np.where(bad[..., None], 0.0, m[..., :2] * Z[..., None])
         return Z, g
 
@@ -219,7 +219,7 @@ def within_reach(p: Particles, soup: Soup, near: Int, anchor_ray: Float, reach: 
 
     Lengths are measured in the depth of their anchors, so a superpixel at a thousand times the
     depth of its neighbours pays hardly anything for its motion. Such depths are not allowed,
-    except the current belief and depths between it and those of the neighbours.
+    except the current depth and those between it and the depths of the neighbours.
 
     Args:
         p: (N, L) particles.

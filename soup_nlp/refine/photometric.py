@@ -3,14 +3,14 @@
     E_photo = sum_i mean_s min(c_is, tau)
 
 c_is, 0 to 1, is the difference of soft census (`data.census`) between sampled pixel s of
-superpixel i and the pixel of the next frame where the superpixel's homography brings it. A sample
-that leaves the next frame, or that something nearer hides there, costs `UNSEEN` whatever is there:
-more than an agreement, less than a contradiction. What is nearer is read off a depth map of the
-next frame that is the same for all soups which are compared, so E_photo is one function of a soup.
+superpixel i and the pixel of the next frame to which the superpixel's homography maps it. A sample
+that leaves the next frame, or is hidden there by a nearer surface, costs `UNSEEN`: more than an
+agreement, less than a contradiction. Nearer surfaces are read off a depth map of the next frame
+which is the same for all soups that are compared, so that E_photo is one function of a soup.
 
 Where the images contradict the flow, E_proj is weaker and truncated; everywhere else it is that of
-E. They contradict it where a superpixel has a flow, but in the soup that followed it the visible
-samples disagree by more than `CONTRADICTION`, or most of them are not visible.
+E. They contradict the flow of a superpixel if, in the soup that followed this flow, the visible
+samples disagree by more than `CONTRADICTION`, or most samples are not visible.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from soup_nlp.refine.records import RefineOptions
 TAU = 0.35
 """A contradiction counts at most this much."""
 UNSEEN = 0.25
-"""What a sample costs that the next frame does not show."""
+"""Cost of a sample that is not visible in the next frame."""
 BEHIND = 1.1
-"""A sample is hidden where something is nearer by this factor."""
+"""A sample is hidden if the nearest surface is nearer by this factor."""
 SAMPLES = 24
 """Pixels per superpixel."""
 PROJ, SIGMA_PROJ = 0.3, 2.0
@@ -56,18 +56,18 @@ class Photometric:
 
     Attributes:
         ray: (N, S, 3) rays of the sampled pixels.
-        own: (2, N, S, 4) their census.
-        there: (2, H', W', 4) census of the next frame.
-        nearest: (H', W') depth of what the next frame shows; inf where nothing is known.
-        distance: (N,) distances of the planes of the soup that shows it: gives the length unit.
+        census_ref: (2, N, S, 4) census of the reference frame at the sampled pixels.
+        census_next: (2, H', W', 4) census of the next frame.
+        nearest: (H', W') depth of the nearest surface in the next frame; inf where unknown.
+        distance: (N,) distances of the planes of the soup behind `nearest`, the length unit.
         K_next: (3, 3) intrinsics of the next frame.
         weight: Factor of E_photo.
         contradicted: (N,) superpixels whose flow the images contradict.
     """
 
     ray: FloatMap
-    own: FloatMap
-    there: FloatMap
+    census_ref: FloatMap
+    census_next: FloatMap
     nearest: FloatMap
     distance: Float
     K_next: Float
@@ -77,10 +77,10 @@ class Photometric:
     def costs_of_flow(self, p: Particles, data: EnergyData, weights: Weights) -> tuple[Float, Mask]:
         """`unary_costs`, with a weaker, truncated E_proj where the images contradict the flow."""
         out, ahead = unary_costs(p, data, weights)
-        who = np.flatnonzero(self.contradicted)
+        superpixels = np.flatnonzero(self.contradicted)
         sigma = min(weights.sigma_proj, SIGMA_PROJ)
         weak = weights.replace(proj=PROJ * weights.proj, sigma_proj=sigma)
-        out[who] = unary_costs(p.of_some(who), data, weak, who)[0]
+        out[superpixels] = unary_costs(p.subset(superpixels), data, weak, superpixels)[0]
         return out, ahead
 
     def unit(self, soup: Soup) -> float:
@@ -113,17 +113,17 @@ class Photometric:
         """Truncated differences of census, and whether the next frame shows a sample: (n, L, S)."""
         u, v, seen = self._seen(p, b, unit)
         flat = u.shape[0] * u.shape[1], u.shape[2]
-        there = census_at(self.there, u.reshape(flat), v.reshape(flat))
-        there = there.reshape(2, *u.shape, 4)
-        there -= self.own[:, b, None]
-        np.abs(there, out=there)
-        return np.minimum(there.sum(axis=(0, 4)) / 16.0, TAU), seen
+        difference = census_at(self.census_next, u.reshape(flat), v.reshape(flat))
+        difference = difference.reshape(2, *u.shape, 4)
+        difference -= self.census_ref[:, b, None]
+        np.abs(difference, out=difference)
+        return np.minimum(difference.sum(axis=(0, 4)) / 16.0, TAU), seen
 
     def _seen(self, p: Particles, b: slice, unit: float) -> tuple[FloatMap, FloatMap, Mask]:
         """Pixels (u, v) of the next frame, and whether it shows them: (n, L, S) each."""
         n, labels = p.D[b].shape
         ray = self.ray[b].transpose(0, 2, 1)
-        H = (self.K_next @ p.of_some(b).homographies).reshape(n, labels * 3, 3).astype(np.float32)
+        H = (self.K_next @ p.subset(b).homographies).reshape(n, labels * 3, 3).astype(np.float32)
         x, y, z = np.moveaxis(np.matmul(H, ray).reshape(n, labels, 3, -1), 2, 0)
         seen = z > 1e-6
         ahead = np.where(seen, z, 1.0)
@@ -160,12 +160,12 @@ def photometric_term(
     flat = labels.ravel()
     count = np.bincount(flat)
     order = np.argsort(flat, kind="stable")
-    place = ((np.arange(SAMPLES) + 0.5) / SAMPLES * count[:, None]).astype(np.int64)
-    v, u = np.divmod(order[(np.cumsum(count) - count)[:, None] + place], labels.shape[1])
+    offset = ((np.arange(SAMPLES) + 0.5) / SAMPLES * count[:, None]).astype(np.int64)
+    v, u = np.divmod(order[(np.cumsum(count) - count)[:, None] + offset], labels.shape[1])
     photo = Photometric(
         ray=rays(pair.K_ref, np.stack([u, v], axis=-1).astype(float)).astype(np.float32),
-        own=census(pair.image_ref)[:, v, u],
-        there=census(pair.image_next),
+        census_ref=census(pair.image_ref)[:, v, u],
+        census_next=census(pair.image_next),
         nearest=np.nan_to_num(depth_next, nan=np.inf).astype(np.float32),
         distance=soup.distance,
         K_next=pair.K_next,
@@ -182,9 +182,9 @@ def photometric_term(
 # images alone.
 
 LEVELS = 64
-"""Depths that are tried."""
+"""Number of depths."""
 MOTIONS, TRIED = 2, 64
-"""Motions under which planes are swept, and the sample of present motions they are chosen from."""
+"""Motions under which planes are swept, and size of the sample of motions they are chosen from."""
 NEAREST = 1.5
 """The nearest depth tried is that of the 2 % nearest superpixels over this."""
 STEEP = 0.08
@@ -206,7 +206,7 @@ def swept(
         soup: Current belief; gives motions, orientations and the range of depths.
         data: Anchors.
         photo: Photometric term.
-        keep: Particles wanted.
+        keep: Number of particles.
         rng: Draws the sample of motions.
     """
     n, ray = len(soup), data.anchor_ray
@@ -252,11 +252,11 @@ def common_motions(
     X = soup.points(data.anchor_ray)
     moved = np.einsum("mij,nj->nmi", soup.R[pick], X) + soup.translation[pick]
     # rays of the next camera
-    there, own = (y[..., :2] / np.maximum(y[..., 2:], 1e-9) for y in (moved, soup.moved(X)))
-    gap = np.linalg.norm(there - own[:, None], axis=-1)
+    tried, actual = (y[..., :2] / np.maximum(y[..., 2:], 1e-9) for y in (moved, soup.moved(X)))
+    gap = np.linalg.norm(tried - actual[:, None], axis=-1)
     error = np.minimum(float(data.K_next[0, 0]) * gap, CLIP_PX)
-    best, kept = np.full((len(soup), 1), CLIP_PX), []
+    best, chosen = np.full((len(soup), 1), CLIP_PX), []
     for _ in range(min(count, len(pick))):
-        kept.append(int(np.minimum(best, error).sum(axis=0).argmin()))
-        best = np.minimum(best, error[:, kept[-1:]])
-    return soup.R[pick[kept]], soup.translation[pick[kept]]
+        chosen.append(int(np.minimum(best, error).sum(axis=0).argmin()))
+        best = np.minimum(best, error[:, chosen[-1:]])
+    return soup.R[pick[chosen]], soup.translation[pick[chosen]]

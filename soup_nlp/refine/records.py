@@ -27,7 +27,7 @@ class RefineOptions(Section):
     proposals: Literal["all", "walks"] = "all"
     """all, or walks: steps around the current belief alone, to any depth, as in the paper."""
     stagnation: NonNegative = 1e-2
-    """End after a round that lowers the objective by less than this share; 0 never."""
+    """Stop after a round that lowers the objective by less than this share; 0: never."""
     photo: NonNegative = 10.0
     """Factor of E_photo, which measures how far the images contradict a superpixel's homography
     (`refine.photometric`); 0 leaves the images out."""
@@ -43,8 +43,8 @@ class Round:
         energy: Objective (`mppbp.objective`) by term after the round.
         mrf_energy: Energy of the chosen labels in the MRF.
         bound: TRW-S's lower bound on every choice among these particles.
-        iterations: Of TRW-S.
-        status: Of TRW-S.
+        iterations: Iterations of TRW-S.
+        status: Status of TRW-S.
         ties: Superpixels whose label was a tie when decoded.
         taken: Whether the choice lowered E; if not, the belief stays.
         moved: Superpixels that left their current belief.
@@ -76,7 +76,7 @@ class Round:
 
     @property
     def gap(self) -> float:
-        """How far the choice can be from the best one among these particles."""
+        """Largest excess energy of the choice over the best one among these particles."""
         return self.mrf_energy - self.bound
 
 
@@ -87,8 +87,8 @@ class Refined:
     Attributes:
         soup: Best soup.
         energy_start: Objective (`mppbp.objective`) by term of the initialisation.
-        energy_begin: The same before the first round.
-        energy: The same of `soup`.
+        energy_begin: Objective before the first round.
+        energy: Objective of `soup`.
         rounds: Every round.
         status: "rounds" (all of them), "agreed" (one round: the images contradict the flow hardly
             anywhere), "stagnated", "interrupted" or "time limit".
