@@ -119,7 +119,7 @@ class Problem(Section):
     """Folder that relative paths start from (the file's own)."""
 
     def path(self, name: str) -> Path:
-        """A path of this problem, relative ones from its file's folder."""
+        """A path of this problem; a relative path starts from the folder of its file."""
         base, path = as_path(self.base, "folder of the problem"), as_path(name, "input", home=True)
         # realpath, unlike resolve, accepts a link to itself
         return Path(os.path.realpath(base / path))

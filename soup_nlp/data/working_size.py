@@ -78,7 +78,7 @@ def resized_flow(flow: Flow, pair: Pair, other: Pair) -> Flow:
 def resized(image: NDArray[Any], size: Sequence[int]) -> NDArray[Any]:
     """An image or a flow resized to (height, width): pixel means, or nearest pixels to enlarge.
 
-    Interpolation would make displacements between those of two objects.
+    Interpolation would mix the displacements of two objects.
     """
     how = cv2.INTER_AREA if size[0] <= image.shape[0] else cv2.INTER_NEAREST_EXACT
     return np.asarray(cv2.resize(image, (int(size[1]), int(size[0])), interpolation=how))
@@ -111,7 +111,7 @@ def _truth(truth: Truth, pair: Pair, small: Pair) -> Truth:
 
 
 def at_common_focal(pair: Pair) -> Pair:
-    """The pair with one image reduced to the focal lengths of the other one.
+    """The pair with one image reduced to the focal lengths of the other image.
 
     The finer image is reduced, since a blurred image shifts against a sharp one. The pair is
     returned unchanged if the focal lengths differ by less than a tenth.

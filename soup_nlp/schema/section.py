@@ -30,7 +30,7 @@ def explain(
     source: str,
     lines: Mapping[Keys, str],
 ) -> ConfigError:
-    """The first mistake as a ConfigError, with the number of further ones.
+    """The first mistake as a ConfigError, with the number of further mistakes.
 
     Args:
         error: Error of pydantic with all mistakes.

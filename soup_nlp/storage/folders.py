@@ -84,7 +84,7 @@ def is_foreign(folder: Path, name: str) -> bool:
 
 
 def release(folder: Path, names: Iterable[str], overwrite: bool) -> None:
-    """Check that files may be written; with `overwrite`, list those of the user in the mark.
+    """Check that files may be written; with `overwrite`, list files of the user in the mark.
 
     Raises:
         DataError: the folder holds files of the user with these names and `overwrite` is not set,
@@ -220,7 +220,7 @@ def staged(
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """A folder for temporary files, removed at the end, or by a later call if this one is killed.
+    """A folder for temporary files, removed at the end, or after a kill by a later call.
 
     Raises:
         DataError: the folder cannot be made.
@@ -260,7 +260,7 @@ def _temporary(parent: Path, prefix: str) -> Iterator[Path]:
 
 
 def _sweep(parent: Path, prefix: str) -> None:
-    """Remove temporary folders of ended processes, also of one that had the number of this one."""
+    """Remove temporary folders of ended processes, also if this process has the same number."""
     for path in parent.glob(f"{prefix}*"):
         number = re.match(r"(\d{1,9})-", path.name.removeprefix(prefix))
         if number is None or path in _open:

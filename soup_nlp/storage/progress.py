@@ -1,4 +1,4 @@
-"""Progress of long work: a record of every iteration, its listeners, and what stops it."""
+"""Progress of long work: a record of every iteration, its listeners, and interruption."""
 
 from __future__ import annotations
 

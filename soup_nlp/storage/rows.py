@@ -50,7 +50,7 @@ MeasureRows = Callable[[Sequence[Job], Path], list[Row]]
 
 
 def reason(row: Mapping[str, Any]) -> str:
-    """Why a row failed, on one line: what was wrong, where, and what was found."""
+    """The reason of a failure on one line: first line of the error, its place and actual value."""
     first, *lines = str(row.get("error")).splitlines() or ["no reason"]
     details = (line.strip() for line in lines)
     return ", ".join([first, *(d for d in details if d.startswith(("where: ", "found: ")))])

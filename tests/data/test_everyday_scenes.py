@@ -35,7 +35,7 @@ def background_parallax(p: Pair) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("name", ALL)
-def test_each_kind_has_its_parallax_and_its_movers(name, seed):
+def test_each_kind_has_its_parallax_and_moving_bodies(name, seed):
     p = pair(name, seed)
     far = background_parallax(p)
     if name in ("pan", "standing"):

@@ -43,7 +43,7 @@ def mixed(labels: np.ndarray) -> int:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.2])
-def test_borders_move_to_the_break_and_no_other(noise):
+def test_only_borders_at_the_discontinuity_move(noise):
     before = grid()
     assert mixed(before) == 6
     after = follow_flow(before, two_motions(noise=noise))
@@ -69,7 +69,7 @@ def test_borders_move_to_a_known_step_of_depth(step, split):
 
 
 @pytest.mark.parametrize(("jump", "margin"), [(0.0, 1.0), (0.9, 1.0), (3.0, 3.1)])
-def test_borders_stay_where_little_is_won(jump, margin):
+def test_borders_stay_where_the_residual_hardly_falls(jump, margin):
     np.testing.assert_array_equal(follow_flow(grid(), two_motions(jump), margin), grid())
 
 
@@ -95,7 +95,7 @@ def test_a_superpixel_without_flow_attracts_nothing():
     assert len(weight) == (~hole).sum()
 
 
-def test_flow_without_sense_still_leaves_a_partition():
+def test_random_flow_still_gives_a_partition():
     uv = np.random.default_rng(3).uniform(-20, 20, (HEIGHT, WIDTH, 2)).astype(np.float32)
     flow = Flow(uv, np.ones((HEIGHT, WIDTH), np.float32), "noise")
     n = assert_partition(follow_flow(grid(), flow))
@@ -103,7 +103,7 @@ def test_flow_without_sense_still_leaves_a_partition():
     assert 1 <= n <= 4 * 48
 
 
-def test_where_all_pixels_scatter_none_of_them_is_suspected():
+def test_scattered_pixels_are_no_outliers():
     """The spread of a superpixel is the scale of its weights if it exceeds `SCALE_PX`."""
     v, u = np.mgrid[0:40, 0:80].astype(float)
     labels = (u >= 40).astype(np.int32)
@@ -152,5 +152,5 @@ def mixed_shares() -> dict[float | None, float]:
         ),
     ],
 )
-def test_a_problem_has_fewer_mixed_superpixels_with_it_than_without(mixed_shares, most):
+def test_following_the_flow_leaves_fewer_mixed_superpixels(mixed_shares, most):
     assert mixed_shares[1.0] < most * mixed_shares[None]

@@ -36,7 +36,7 @@ def error(flow: Flow, pair) -> np.ndarray:
     return np.linalg.norm(flow.uv - pair.truth.flow, axis=2)
 
 
-def test_what_the_way_back_confirms_is_trusted():
+def test_a_consistent_round_trip_gives_confidence():
     forward = np.zeros((40, 60, 2), np.float32)
     forward[..., 0] = 2.0
     backward = -forward

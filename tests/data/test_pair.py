@@ -20,7 +20,7 @@ def test_rows_of_numbers_are_a_camera():
 
 
 @pytest.mark.parametrize("bad", [[[1, 2], [3]], "K.txt", {}, [["a"] * 3] * 3, [1, 2, 3]])
-def test_what_is_no_matrix_is_refused(bad):
+def test_a_camera_that_is_no_matrix_is_refused(bad):
     with pytest.raises(DataError, match="intrinsics"):
         Pair(IMAGE, IMAGE, K, bad)
 
@@ -87,7 +87,7 @@ def test_flows_are_taken_in_both_layouts_and_from_files(tmp_path):
 
 
 @pytest.mark.parametrize("bad", [None, 3, "missing.png", {}, [], [[1, [2]]], object(), b"x"])
-def test_what_is_no_image_or_flow_is_refused(bad):
+def test_arguments_that_are_no_image_or_flow_are_refused(bad):
     with pytest.raises(DataError):
         Pair(IMAGE, bad, K)
     with pytest.raises(DataError):

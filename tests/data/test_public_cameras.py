@@ -107,7 +107,7 @@ def test_intrinsics_of_arrays_are_checked_too() -> None:
         solve_pair(other, preset="none", cropped=True)
 
 
-def test_plausible_intrinsics_are_taken_without_a_word(folder: Path) -> None:
+def test_plausible_intrinsics_give_no_warning(folder: Path) -> None:
     for four in ((80, 80, 47.5, 31.5), (80, 90, 40, 38), (500, 500, 55, 31)):
         assert said(folder, intrinsics=[*four])[1] == ""
     # the principal point of the next frame is checked against its own middle
@@ -164,7 +164,7 @@ def test_undistortion_needs_the_file_of_a_camera_and_no_truth(folder: Path) -> N
             load(folder, undistort=True, **keys)
 
 
-def test_lenses_that_are_not_distorted_or_of_another_model(folder: Path) -> None:
+def test_undistorted_lenses_and_other_distortion_models(folder: Path) -> None:
     (folder / "K.txt").write_text("80 80 47.5 31.5 0 0 0 0 0")
     assert read_intrinsics(folder / "K.txt")[0, 0] == 80
     (folder / "K.yaml").write_text("camera_model: equidistant\nK: [1, 0, 0, 0, 1, 0, 0, 0, 1]")
@@ -213,7 +213,7 @@ def test_tum_format_of_other_sensors(name: str | None, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["files", "folder"])
-def test_the_scale_of_depth_is_given_or_said(kind: str, folder: Path) -> None:
+def test_an_assumed_scale_of_depth_gives_a_warning(kind: str, folder: Path) -> None:
     for k, name in enumerate("ab"):
         (folder / f"{name}.png").rename(folder / f"frame_{k}.png")
     (folder / "K.txt").write_text("80 80 47.5 31.5")

@@ -165,7 +165,7 @@ def test_avif_is_turned_by_exif(turned: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("brand", [b"heic", b"mif1", b"crx "])
-def test_heic_is_to_be_converted(brand: bytes, tmp_path: Path) -> None:
+def test_heic_gives_an_error_with_a_hint(brand: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftyp" + brand + bytes(100))
     with pytest.raises(DataError, match="convert it to PNG or JPEG first") as caught:
         read_image(tmp_path / "a.heic")

@@ -94,7 +94,7 @@ def test_labels_name_components_that_can_be_seen():
             assert count.min() > 0.003 * count.sum(), (name, seed)
 
 
-def test_motions_are_rigid_and_nan_only_for_what_bends():
+def test_motions_are_rigid_and_nan_only_for_bending_bodies():
     for name in SCENES:
         M = pair(name).truth.motions
         rigid = np.isfinite(M).all(axis=(1, 2))
@@ -107,7 +107,7 @@ def test_motions_are_rigid_and_nan_only_for_what_bends():
 
 
 @pytest.mark.parametrize("name", ["sheet", "banner"])
-def test_no_rigid_motion_explains_what_bends(name):
+def test_no_rigid_motion_explains_a_bending_body(name):
     p = pair(name)
     T = p.truth
     least = []

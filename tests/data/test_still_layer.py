@@ -49,7 +49,7 @@ def reflecting(street: Pair) -> Pair:
     return replace(street, image_ref=images[0], image_next=images[1])
 
 
-def test_what_stands_still_leaves_the_images():
+def test_a_static_layer_is_removed_from_the_images():
     layer, other = (np.dstack([texture(60, 80, seed)] * 3) for seed in (0, 1))
     for image in without_still_layer(layer, layer):
         assert image.std() == 0

@@ -111,7 +111,7 @@ def identity(path: Path) -> tuple[int, ...]:
     return state.st_ino, state.st_mode, state.st_size, state.st_mtime_ns
 
 
-def test_the_result_of_something_else_is_kept(tmp_path, monkeypatch):
+def test_the_result_of_another_subject_is_kept(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     target = folders.default_folder("a", "frames 0 and 1")
     assert target == Path("out/a")
@@ -142,7 +142,7 @@ def test_a_folder_into_which_nothing_is_written_is_not_made(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["file", "changed", "folder", "link", "dangling link"])
-def test_what_was_not_made_here_is_refused(kind, tmp_path):
+def test_foreign_files_are_not_overwritten(kind, tmp_path):
     target = tmp_path / "out"
     target.mkdir()
     path = foreign(target, kind)
@@ -279,7 +279,7 @@ def killed(target: Path, moves: int) -> None:
     assert ended.returncode == -signal.SIGKILL
 
 
-def test_what_a_kill_leaves_is_removed_by_the_next_run(tmp_path):
+def test_temporary_folders_of_a_kill_are_removed_by_the_next_run(tmp_path):
     target = tmp_path / "out"
     write(target, a="1", b="1")
     killed(target, 0)

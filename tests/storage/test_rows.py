@@ -80,7 +80,7 @@ def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
         append_row(tmp_path / "rows.jsonl" / "x.jsonl", {})
 
 
-def test_parallel_processes_and_one_that_dies(tmp_path):
+def test_parallel_processes_and_a_process_that_dies(tmp_path):
     # the children must find this module's function
     os.environ["PYTHONPATH"] = os.pathsep.join(
         [str(Path(__file__).parents[1] / "helpers"), os.environ.get("PYTHONPATH", "")]

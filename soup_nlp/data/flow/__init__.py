@@ -1,1 +1,1 @@
-"""Sources of optical flow, its confidence, and what follows from it."""
+"""Sources of optical flow, its confidence and correction, and superpixel borders along it."""

@@ -125,7 +125,7 @@ class AffineFlow:
         return np.stack([np.ones(len(which)), du / self.size[which], dv / self.size[which]], axis=1)
 
     def residual(self, which: Int, u: Int, v: Int, uv: Float) -> Float:
-        """(P,) distance, pixels, of flows (P, 2) from those of superpixels `which` (P,)."""
+        """(P,) distance of flows (P, 2) from those fitted to superpixels `which` (P,), pixels."""
         predicted = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
         return np.where(self.fitted[which], np.linalg.norm(uv - predicted, axis=1), np.inf)
 

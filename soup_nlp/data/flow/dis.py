@@ -126,7 +126,7 @@ MIN_SIDE = 16
 """Smallest image side for DIS, pixels."""
 
 FINEST_SCALE, PATCH_SIZE, PATCH_STRIDE = 0, 8, 2
-"""Full resolution, and denser patches than those of OpenCV's medium preset (stride 3)."""
+"""Full resolution, and denser patches than in OpenCV's medium preset (stride 3)."""
 ITERATIONS, ALPHA, DELTA, GAMMA = 20, 30.0, 1.0, 10.0
 """Longer and smoother refinement than the preset (5 iterations, alpha 20), with less weight on
 intensities (preset: delta 5): the error falls on driving, indoor and rendered pairs."""

@@ -78,7 +78,7 @@ class Network:
         self.size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
 
     def outputs(self, *images: Image) -> tuple[list[Any], tuple[int, int]]:
-        """Outputs for images (H, W, 3) of one size, and the (rows, columns) that they come from."""
+        """Outputs for images (H, W, 3) of equal size, and the (rows, columns) of the inputs."""
         height, width = images[0].shape[:2]
         rows, cols = self.size or (-(-n // 8) * 8 for n in (height, width))
         black, white = self.levels

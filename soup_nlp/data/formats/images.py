@@ -50,8 +50,8 @@ def check_body(count: int, expected: int, path: PathLike, what: str) -> None:
 def decode(path: PathLike, what: str) -> NDArray[Any]:
     """Decode an image file as stored, with all its bits, to grey, BGR or BGRA.
 
-    OpenCV decodes the file; Pillow, to 8 bits, decodes what OpenCV rejects. The size in the header
-    is checked first, since a small file can have many pixels of one colour.
+    OpenCV decodes the file, or else Pillow, to 8 bits. The size in the header is checked first,
+    since a small file can have many pixels of one colour.
     """
     content = read_bytes(path, what)
     try:
@@ -109,7 +109,7 @@ def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]
 
 
 def exif_tags(path: PathLike) -> dict[int, Any]:
-    """EXIF tags of an image file, those of the picture and of the camera; empty without EXIF.
+    """EXIF tags of an image file, about the picture and about the camera; empty without EXIF.
 
     Warns:
         DataWarning: EXIF is malformed and is ignored.

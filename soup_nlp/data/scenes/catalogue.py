@@ -47,7 +47,7 @@ def render_scene(
 
     Returns:
         A `Pair` with full `Truth` in metres and no flow. Component 0 is the static background.
-        Motions are `next_from_ref` with the camera's motion included; NaN for what bends.
+        Motions are `next_from_ref` with the camera's motion included; NaN for bending bodies.
     """
     check_image_size(width, height, "scene", name)
     layout, focal, contrast = _LAYOUTS[name]
