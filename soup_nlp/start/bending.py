@@ -4,8 +4,8 @@ The flow is discontinuous along the outline of a rigid component that moves inde
 bending surface it is continuous, but no single rigid motion explains it. If such a surface is cut
 into rigid pieces, each with its own parallax, the depths do not follow its shape.
 
-Of a rigid surface one motion explains the flow of most superpixels, whatever else moves there; of a
-bending one no motion does. The test does not depend on the number of superpixels or of rigid
+On a rigid surface one motion explains the flow of most superpixels, whatever else moves there; on
+a bending surface no motion does. The test does not depend on the number of superpixels or of rigid
 components.
 """
 
@@ -47,8 +47,8 @@ def systematic_error(noise: float) -> float:
 def turn_alone(views: Views, choice: Choice, usable: Mask, noise: float) -> Float | None:
     """The camera's rotation, if it explains the flow of the main motion without depth.
 
-    It does if the rigid motion of most superpixels, with depths, has an error that is smaller by no
-    more than the systematic error of the flow: movers that it took along do not count.
+    The rotation does if the main rigid motion, with depths, lowers the error by no more than the
+    systematic error of the flow in the median, which movers assigned to that motion do not change.
     The focal length is free in the fit, because a wrong one leaves a residual that depths explain.
 
     Args:
@@ -63,7 +63,7 @@ def turn_alone(views: Views, choice: Choice, usable: Mask, noise: float) -> Floa
     at = np.flatnonzero(usable & (choice.label == 0))
     if not len(at):
         return None
-    turn, error = fit_turn(views.some(at))
+    turn, error = fit_turn(views.subset(at))
     gain = np.median(error - choice.fit.cost[at, 0])
     return None if gain > systematic_error(noise) else turn
 
@@ -75,7 +75,7 @@ def turned(x: Float, ray: Float) -> Float:
 
 
 def fit_robustly(miss: Callable[[Float], Float], size: int) -> Float:
-    """(size,) parameters with the least Cauchy loss of `miss`, pixels, from 0 and narrowing."""
+    """(size,) parameters with the least Cauchy loss of `miss`, pixels, by narrowing scales."""
     x = np.zeros(size)
     for scale in (10.0, 3.0, 1.0, 0.3):
         x = least_squares(lambda x: miss(x).ravel(), x, loss="cauchy", f_scale=scale, max_nfev=30).x
@@ -177,10 +177,10 @@ LEAST_SHARE = 0.06
 """Least share of the superpixels that makes a surface: a smaller one joins a neighbour, because a
 few superpixels with a wrong flow look like a bending one."""
 LEAST_LEFT = 15
-"""Least number of superpixels of such a piece beside a rigid motion: few large ones mix flows."""
+"""Least number of superpixels of a piece split from a rigid surface: large ones mix flows."""
 SURELY = 0.5
-"""Share of the limit of a bending surface's excess up to which a motion explains a surface surely,
-so that what it leaves is not an error of the flow."""
+"""Share of the limit of a bending surface's excess up to which a motion surely explains a surface,
+so that pieces it does not explain are no errors of the flow."""
 MEDIAN_PIXELS, LEAST_SCALE = 3000, 0.02
 """Pixels of a fit of the least median error, and the least scale of its refinement, pixels."""
 
@@ -193,8 +193,8 @@ def surface_motions(
     A surface bends if under every rigid motion the median excess of its superpixels' error over the
     residual of an affine flow of their own is above the flow's systematic error plus `NOISES` times
     its noise. Pieces that the best motion does not explain are surfaces of their own if they have
-    `LEAST_SHARE`, and `LEAST_LEFT` superpixels: a small jump along an outline joins what bends to
-    the rest.
+    `LEAST_SHARE`, and `LEAST_LEFT` superpixels: where the flow jumps little along its outline, a
+    bending surface is joined to its surroundings.
 
     Args:
         views: Rays, targets and confidence of every superpixel.
@@ -217,30 +217,30 @@ def surface_motions(
     bends = np.zeros(len(seg), bool)
     left = [np.flatnonzero(surface == c) for c in np.unique(surface[usable])]
     while left:
-        every = left.pop()
-        at = every[usable[every]]
-        held = [motions[c] for c in np.unique(label[at])]
-        tried = candidates(views, at, motions[0], held, noise, o.seed)
-        given = len(tried)
+        members = left.pop()
+        at = members[usable[members]]
+        present = [motions[c] for c in np.unique(label[at])]
+        tried = candidates(views, at, motions[0], present, noise, o.seed)
+        candidate_count = len(tried)
         tried += _least_median(views, at, noise, o)
-        excess = views.some(at).fit(tried).cost - residual[at, None]
+        excess = views.subset(at).fit(tried).cost - residual[at, None]
         middle = np.median(excess, axis=0)
-        # where many motions explain half of a surface badly, that of the least median is chance
-        middle[given:][middle[given:] > SURELY * most] = np.inf
+        # where many motions explain half of a surface badly, the one of least median is chance
+        middle[candidate_count:][middle[candidate_count:] > SURELY * most] = np.inf
         best = int(np.argmin(middle))
-        bends[every] = middle[best] > most
-        if bends[every[0]]:
+        bends[members] = middle[best] > most
+        if bends[members[0]]:
             continue
         motions.append(tried[best])
         if middle[best] > SURELY * most:
             continue
-        # large pieces that it does not explain are surfaces of their own
-        apart = np.zeros(len(seg), bool)
-        apart[at[excess[:, best] > most]] = True
-        piece = connected_pieces(apart, seg, whole)
+        # large pieces that the motion does not explain are surfaces of their own
+        unexplained = np.zeros(len(seg), bool)
+        unexplained[at[excess[:, best] > most]] = True
+        piece = connected_pieces(unexplained, seg, whole)
         left += [
             np.flatnonzero(piece == c)
-            for c in np.unique(piece[apart])
+            for c in np.unique(piece[unexplained])
             if np.sum(piece == c) >= max(LEAST_SHARE * len(seg), LEAST_LEFT)
         ]
     return motions, bends
@@ -249,21 +249,21 @@ def surface_motions(
 def _least_median(views: Views, at: Int, noise: float, o: SeededStart) -> list[Motion]:
     """The motion with the least median error on superpixels `at`, refined, if there is one.
 
-    RANSAC has an inlier distance, within which a compromise with what bends has more inliers.
+    RANSAC has an inlier distance, within which a compromise with the bending part has more inliers.
     """
     step = max(1, len(at) * views.ray.shape[1] // MEDIAN_PIXELS)
     r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
-    found = essential_motion(r, q, views.focal[0], None, o.seed)
-    if found is None:
+    motion = essential_motion(r, q, views.focal[0], None, o.seed)
+    if motion is None:
         return []
     weight = views.weight[at].ravel()[::step]
-    return [refine_near(found, r, q, weight, views.focal[0], max(noise, LEAST_SCALE))]
+    return [refine_near(motion, r, q, weight, views.focal[0], max(noise, LEAST_SCALE))]
 
 
 def joined(surface: Int, usable: Mask, seg: Segmentation) -> Int:
-    """(N,) surfaces, the ones with too few usable superpixels joined to a neighbour.
+    """(N,) surfaces; those with too few usable superpixels are joined to a neighbour.
 
-    The smallest joins the one with which it has the longest outline, until each has `LEAST_SHARE`.
+    The smallest joins the neighbour with the longest common outline, until each has `LEAST_SHARE`.
     """
     surface, (i, k) = surface.copy(), seg.pairs.T
     length = seg.boundary_length.astype(float)

@@ -25,7 +25,7 @@ UNEXPLAINED_PX = 0.1
 """Error below which a superpixel does not look for another motion, pixels."""
 PIECES, PIECE_SIZE = 6, 4
 """Largest number of unexplained pieces that get candidate motions in a round, and the least number
-of superpixels of one: fewer do not determine a motion."""
+of superpixels of a piece: fewer do not determine a motion."""
 
 
 def least_gain(noise: float) -> float:
@@ -45,7 +45,7 @@ def dominant(views: Views, o: SeededStart) -> list[Motion]:
     w = views.weight.ravel()
     good = np.flatnonzero(w > 0.3 * w.max())
     pick = good if len(good) <= 6000 else rng.choice(good, 6000, replace=False)
-    found = repeated(
+    motions = repeated(
         r[pick],
         q[pick],
         w[pick],
@@ -54,10 +54,10 @@ def dominant(views: Views, o: SeededStart) -> list[Motion]:
         threshold=o.threshold_px,
         seed=o.seed,
     )
-    if not found:
+    if not motions:
         # nothing determines a motion (no flow at all): a sideways camera keeps depth defined
-        found = [Motion(np.eye(3), np.array([1.0, 0.0, 0.0]))]
-    return found
+        motions = [Motion(np.eye(3), np.array([1.0, 0.0, 0.0]))]
+    return motions
 
 
 LEAST_NOISE, MOST_NOISE = 0.05, 0.6
@@ -98,11 +98,11 @@ def of_pieces(
     for c in np.argsort(-sizes)[:PIECES]:
         if sizes[c] < PIECE_SIZE:
             break
-        own = piece == c
-        r, q = views.ray[own].reshape(-1, 3), views.target[own].reshape(-1, 3)
-        flow = r, q, views.weight[own].ravel(), views.focal[0]
-        found = estimate(*flow, max(3 * noise, 0.3), o.seed)
-        out += [] if found is None else [found]
+        members = piece == c
+        r, q = views.ray[members].reshape(-1, 3), views.target[members].reshape(-1, 3)
+        flow = r, q, views.weight[members].ravel(), views.focal[0]
+        motion = estimate(*flow, max(3 * noise, 0.3), o.seed)
+        out += [] if motion is None else [motion]
         out.append(fit_translation(motions[0].R, *flow, max(noise, 0.1)))
     return out
 
@@ -222,14 +222,14 @@ def rigid_choice(
     Returns:
         The choice, and the noise of the flow, pixels.
     """
-    known = views.weight.any(axis=1)
+    with_flow = views.weight.any(axis=1)
     for extend in range(ROUNDS + 1):
         fit = views.fit(motions)
         cost = fit.penalised()
-        kept = select(cost, limited_noise(cost.min(axis=1)[known]))
+        kept = select(cost, limited_noise(cost.min(axis=1)[with_flow]))
         motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
-        noise = limited_noise(cost.min(axis=1)[known])
-        # what no motion explains yet, piece by piece
+        noise = limited_noise(cost.min(axis=1)[with_flow])
+        # motions of the pieces that no motion explains yet
         extra = of_pieces(views, seg, motions, cost, noise, o) if extend < ROUNDS else []
         if not extra:
             break

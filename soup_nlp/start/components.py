@@ -51,11 +51,13 @@ def borrow(
     """
     mu, slope = mu.copy(), slope.copy()
     for c in np.unique(label[weak]):
-        own, strong = weak & (label == c), ~weak & (label == c)
-        known = np.flatnonzero(strong if strong.any() else ~weak)
-        near = cKDTree(seg.anchors[known]).query(seg.anchors[own], k=min(5, len(known)))[1]
-        mu[own] = np.median(mu[known][near.reshape(own.sum(), -1)], axis=1)
-        slope[own] = 0.0
+        borrowers, strong = weak & (label == c), ~weak & (label == c)
+        lenders = np.flatnonzero(strong if strong.any() else ~weak)
+        near = cKDTree(seg.anchors[lenders]).query(seg.anchors[borrowers], k=min(5, len(lenders)))[
+            1
+        ]
+        mu[borrowers] = np.median(mu[lenders][near.reshape(borrowers.sum(), -1)], axis=1)
+        slope[borrowers] = 0.0
     return mu, slope
 
 
@@ -86,8 +88,8 @@ TIES = (
 contact below: it stands on its lower neighbours. outline: it touches its neighbours. cut off below:
 the lower image border hides what it stands on. nothing: it has no neighbour with a scale. ground:
 it was lifted to the ground. fixed in the image: it stands still there, though the camera moves,
-and is placed by its outline. given depth: a depth prior says it. occlusion: it covers what is
-behind it, and is placed in front of it by a guess."""
+and is placed by its outline. given depth: a depth prior gives it. occlusion: it covers its
+background, and is placed in front of the background by a guess."""
 FIXED = TIES.index("fixed in the image")
 UNSUPPORTED = 1e-6
 """Added to the placed share of a component's support, so that the longest contact goes first where
@@ -154,7 +156,7 @@ def contact_scales(
     Components are placed one after the other, in the order of their contact length with placed
     components times the placed share of their lower neighbours (1 where there are none). The roof
     of a car that is cut into pieces is thus placed after its wheels, and not on the background.
-    Nothing stands on what is fixed in the image.
+    No component stands on one that is fixed in the image.
 
     Args:
         soup: Planes, every motion in its own scale.
@@ -228,11 +230,11 @@ def contact_scales(
 def nearer_where_cut_off(
     far: Float, label: Int, seg: Segmentation, fixed: Mask, usable: Mask
 ) -> Float:
-    """(C,) log factor by which components come nearer whose lower end is not seen.
+    """(C,) log factor by which components with a hidden lower end come nearer.
 
-    It is not seen if the lower image border cuts it off, or if the superpixels below it have no
-    flow, so that they may belong to it. What such a component stands on is not visible, and its
-    visible neighbours are behind it, so contact gives its largest depth. Its smallest plausible
+    The lower end is hidden if the lower image border cuts it off, or if the superpixels below it
+    have no flow, so that they may belong to the component. Its support is not visible then, and
+    its visible neighbours are behind it, so contact gives its largest depth. Its smallest plausible
     depth is the one at which it moves as far relative to the camera as the scene does. The middle
     of both, in logarithms, has an error of at most the square root of their ratio. Components that
     touch are treated as one group, since a person may be cut into pieces.
@@ -250,10 +252,10 @@ def nearer_where_cut_off(
     group, groups = group_of[label], int(group_of.max()) + 1
     # support of a group, visible and beyond the border, weighted by the squared height difference
     around = outlines(group, seg)
-    known = usable[around.neighbour]
+    usable_neighbour = usable[around.neighbour]
     seen, unknown = (
         np.bincount(around.component[on], around.weight[on], minlength=groups)
-        for on in (around.below & known, around.below & ~known)
+        for on in (around.below & usable_neighbour, around.below & ~usable_neighbour)
     )
     last = group[seg.labels[-1]]
     cut_off = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
@@ -262,16 +264,16 @@ def nearer_where_cut_off(
     for g in np.setdiff1d(
         np.flatnonzero(cut_off + unknown > seen), group_of[[scene, *np.flatnonzero(fixed)]]
     ):
-        own = float(np.median(far[group == g]))
-        if pace < own < pace * np.exp(UNKNOWN):
-            nearer[group_of == g] = 0.5 * np.log(own / pace)
+        group_pace = float(np.median(far[group == g]))
+        if pace < group_pace < pace * np.exp(UNKNOWN):
+            nearer[group_of == g] = 0.5 * np.log(group_pace / pace)
     return nearer
 
 
 def nearer_where_fast(far: Float, label: Int) -> Float:
-    """(C,) log factor by which components come nearer that contact makes too fast.
+    """(C,) log factor by which components that contact makes too fast come nearer.
 
-    Contact puts what hangs in the air on the surface behind it.
+    Contact places an object in mid-air on the surface behind it.
 
     Args:
         far: (N,) displacement relative to the camera (`displacement`).
@@ -308,7 +310,7 @@ def displacement(soup: Soup, ray: Float, label: Int) -> Float:
 
 
 def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -> Float:
-    """(2, B) depths of both components at the B pairs that join two, from planes further inside.
+    """(2, B) depths of both components at the B pairs across outlines, from planes further inside.
 
     The flow is blurred across an outline, which falsifies the planes of the superpixels along it.
     The depth is therefore the median over their inner neighbours, whose planes are extended to the
@@ -335,8 +337,8 @@ def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -
     for side, p in np.ndindex(depth.shape):
         inner = behind[pairs[p, side]]
         if inner:
-            there = soup.depth_across(np.array([inner]), ray[p : p + 1])
-            depth[side, p] = 1 / np.median(1 / there)
+            inner_depth = soup.depth_across(np.array([inner]), ray[p : p + 1])
+            depth[side, p] = 1 / np.median(1 / inner_depth)
     return depth
 
 

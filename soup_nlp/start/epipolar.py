@@ -156,7 +156,7 @@ def refine(
         directions = np.concatenate([now.essential() @ turns, rotation.hat(shifts) @ now.R])
         return root[:, None] * sampson_slopes(now.essential(), directions, r, q, focal)
 
-    # from the inlier distance down to the noise: components that move a little otherwise let go
+    # from the inlier distance down to the noise, so that components that move otherwise drop out
     scale = max(0.1, 0.5 * threshold)
     x = np.zeros(5)
     for _ in range(REFINEMENTS):
@@ -176,7 +176,7 @@ def tangent(t: Float) -> Float:
 
 
 def around(motion: Motion) -> Callable[[Float], Motion]:
-    """Motions near one, by (5,) parameters: a rotation vector, and shifts along `tangent`."""
+    """Motions near a given one by (5,) parameters: rotation vector, and shifts along `tangent`."""
     basis = tangent(motion.t)
 
     def moved(x: Float) -> Motion:
@@ -312,7 +312,7 @@ FOCAL_ERROR, LEAST_FOCAL_ERROR_PX = 0.5, 0.005
 """Rise of the error by which a focal length is less probable by exp(-1/2), relative to the least
 error, and its lower limit in pixels: distortion and other systematic errors rise as much."""
 LEAST_FOCAL_SIGMA = 0.05
-"""Least standard deviation of a log focal length that is found so: half a step."""
+"""Least standard deviation of a log focal length by these fits: half a step."""
 FOCAL_PIXELS, FOCAL_NOISE_PX = 3000, 0.05
 """Largest number of correspondences of these fits, and the scale of their robust loss, pixels."""
 
@@ -353,5 +353,5 @@ def focal_length(
     density = np.exp(-(rise**2 + (x / sigma) ** 2) / 2)
     density /= density.sum()
     mean = float(density @ x)
-    found = float(np.sqrt(density @ (x - mean) ** 2))
-    return float(np.exp(mean)), float(np.clip(found, LEAST_FOCAL_SIGMA, sigma))
+    deviation = float(np.sqrt(density @ (x - mean) ** 2))
+    return float(np.exp(mean)), float(np.clip(deviation, LEAST_FOCAL_SIGMA, sigma))

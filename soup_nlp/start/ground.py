@@ -1,4 +1,4 @@
-"""Ground plane: raises what lies below it, and lowers what floats above it.
+"""Ground plane: superpixels below it are raised, and regions that float above it are lowered.
 
 A superpixel without usable flow (it leaves the image, is dark or moves too fast) borrows its depth
 from its neighbours, and a component without a known support is scaled by its outline. Both may come
@@ -41,18 +41,18 @@ TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
 
-def ground(mu: Float, ray: Float, weight: Float, known: Mask, seed: int) -> Float:
+def ground(mu: Float, ray: Float, weight: Float, reliable: Mask, seed: int) -> Float:
     """(N,) inverse depth of the ground on every ray; 0 above the horizon and where there is none.
 
     Args:
         mu: (N,) inverse depth at the anchors.
         ray: (N, 3) their rays.
         weight: (N,) area of every superpixel.
-        known: (N,) True where the depth is reliable.
+        reliable: (N,) True where the depth is reliable.
         seed: Seed of the random planes.
     """
     none = np.zeros(len(mu))
-    at = np.flatnonzero(known)
+    at = np.flatnonzero(reliable)
     if len(at) < 20:
         return none
     # inverse depth of a plane is linear in the ray; (x, y, 1) . p with p along the normal
@@ -67,27 +67,27 @@ def ground(mu: Float, ray: Float, weight: Float, known: Mask, seed: int) -> Floa
         return none
 
     def on(planes: Float) -> Mask:
-        there = planes @ ray[at].T
-        return np.asarray((there > 0) & (np.abs(mu[at] - there) < ON * np.abs(there)))
+        plane_mu = planes @ ray[at].T
+        return np.asarray((plane_mu > 0) & (np.abs(mu[at] - plane_mu) < ON * np.abs(plane_mu)))
 
     under = (mu[at] < (1 - BELOW) * (planes @ ray[at].T)) @ weight[at]
     best = planes[np.argmax(on(planes) @ weight[at] - under)]
     for _ in range(3):
-        own = at[on(best)]
-        root = np.sqrt(weight[own]) / mu[own]
-        best = np.linalg.lstsq(ray[own] * root[:, None], mu[own] * root)[0]
-    there = ray @ best
-    below = (there > 0) & (mu < (1 - BELOW) * there)
+        inliers = at[on(best)]
+        root = np.sqrt(weight[inliers]) / mu[inliers]
+        best = np.linalg.lstsq(ray[inliers] * root[:, None], mu[inliers] * root)[0]
+    plane_mu = ray @ best
+    below = (plane_mu > 0) & (mu < (1 - BELOW) * plane_mu)
     total = weight[at].sum()
     if weight[at][on(best)].sum() < LEAST_ON * total:
         return none
-    if weight[known & below].sum() > MOST_BELOW * total:
+    if weight[reliable & below].sum() > MOST_BELOW * total:
         return none
-    return np.maximum(there, 0.0)
+    return np.maximum(plane_mu, 0.0)
 
 
 def above_ground(
-    soup: Soup, ray: Float, weight: Float, known: Mask, component: Int, floor: Float
+    soup: Soup, ray: Float, weight: Float, reliable: Mask, component: Int, floor: Float
 ) -> tuple[Soup, Mask]:
     """The soup with unreliable or independently moving parts lifted to the ground.
 
@@ -98,7 +98,7 @@ def above_ground(
         soup: Start, its components scaled.
         ray: (N, 3) rays of the anchors.
         weight: (N,) area of every superpixel.
-        known: (N,) True where the depth is reliable and belongs to the largest component.
+        reliable: (N,) True where the depth is reliable and belongs to the largest component.
         component: (N,) group that moves as one.
         floor: (N,) inverse depth of the ground (`ground`).
 
@@ -114,12 +114,12 @@ def above_ground(
         return np.asarray(mu * soup.lam / lam < (1 - BELOW) * floor)
 
     for c in np.unique(component[below() & ~scene]):
-        own = np.flatnonzero((component == c) & (floor > 0))
-        under = own[below()[own]]
+        members = np.flatnonzero((component == c) & (floor > 0))
+        under = members[below()[members]]
         if weight[under].sum() > 0.5 * weight[component == c].sum():
             lam[component == c] *= np.median(mu[under] / floor[under])
             lifted |= component == c
-    left = below() & ~known
+    left = below() & ~reliable
     factor = mu[left] * soup.lam[left] / lam[left] / floor[left]
     lam[left] *= factor
     t[left & scene] /= factor[scene[left], None]
@@ -155,7 +155,7 @@ def floating(
     region = 1 + connected_pieces(stands, seg, whole)
     around, across = outlines(region, seg), region[i] != region[k]
     plane = np.linalg.lstsq(ray[floor > 0], floor[floor > 0])[0]
-    # of every entry of the outlines: log ratios of the depths of other side and ground to the own
+    # by entry of the outlines: log ratios of the other side's and the ground's depth to its own
     gap = np.concatenate([step[across], -step[across]])
     rise = -np.log(depth * np.maximum(middle @ plane, 1e-9))[:, across].ravel()
     out = []

@@ -65,29 +65,29 @@ def unorganised(views: Views, seg: Segmentation, o: SeededStart) -> tuple[Soup, 
     Returns:
         The soup, not normalised, and (N,) True where the result of another superpixel was taken.
     """
-    found = [_patch(views, seg, i, o) for i in range(len(seg))]
-    fails = np.array([p is None for p in found])
+    patches = [_patch(views, seg, i, o) for i in range(len(seg))]
+    fails = np.array([p is None for p in patches])
     source = np.arange(len(seg))
     if fails.any() and not fails.all():
         good = np.flatnonzero(~fails)
         source[fails] = good[cKDTree(seg.anchors[good]).query(seg.anchors[fails])[1]]
     sideways = Patch(Motion(np.eye(3), np.array([1.0, 0.0, 0.0])), np.array([0.0, 0.0, 1.0]))
-    own = [found[s] or sideways for s in source]
-    R, t = (np.stack([getattr(p.motion, name) for p in own]) for name in ("R", "t"))
+    sources = [patches[s] or sideways for s in source]
+    R, t = (np.stack([getattr(p.motion, name) for p in sources]) for name in ("R", "t"))
     # a borrowed plane keeps depth and slopes, since at this anchor it may be behind the camera
-    depth, slope = at_anchor(np.stack([p.m for p in own]), views.anchor[source])
+    depth, slope = at_anchor(np.stack([p.m for p in sources]), views.anchor[source])
     n, D = normal_and_distance(about_anchor(np.ones(len(seg)), slope, views.anchor))
     return Soup(np.ones(len(seg)), n, D, R, t / depth[:, None]), fails
 
 
 def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | None:
     """Motion and plane of a superpixel; None if its flow does not determine them."""
-    own = matches(views, np.array([i]))
-    if len(own.ray) < LEAST_PIXELS:
+    inside = matches(views, np.array([i]))
+    if len(inside.ray) < LEAST_PIXELS:
         return None
-    focal, seen = views.focal[0], np.vstack([own.ray, views.anchor[i]])
+    focal, seen = views.focal[0], np.vstack([inside.ray, views.anchor[i]])
     if not o.motion_neighbours:
-        H = fit_homography(own)
+        H = fit_homography(inside)
         choices = [] if H is None else in_front(H, seen)
         if len(choices) < 2:
             return choices[0] if choices else None
@@ -97,7 +97,7 @@ def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | N
     motion = essential_motion(around.ray, around.target, focal, o.threshold_px, o.seed)
     if motion is None:
         return None
-    m = plane_of(motion, own)
+    m = plane_of(motion, inside)
     return Patch(motion, m) if (seen @ m > 0).all() else None
 
 
@@ -111,28 +111,28 @@ def matches(views: Views, members: Int) -> Matches:
     return Matches(*(np.ascontiguousarray(v[use]) for v in (ray, target, weight)))
 
 
-def plane_of(motion: Motion, own: Matches) -> Float:
+def plane_of(motion: Motion, matched: Matches) -> Float:
     """Least-squares m (3,) in `q ~ R r + t (m . r)`, errors perpendicular to the target ray."""
-    y, q, t = own.ray @ motion.R.T, own.target, motion.t
-    root = np.sqrt(own.weight)[:, None]
+    y, q, t = matched.ray @ motion.R.T, matched.target, motion.t
+    root = np.sqrt(matched.weight)[:, None]
     a = (y[:, :2] - q[:, :2] * y[:, 2:]) * root
     b = (t[:2] - q[:, :2] * t[2]) * root
-    A = b[:, :, None] * own.ray[:, None, :]
+    A = b[:, :, None] * matched.ray[:, None, :]
     return np.asarray(np.linalg.lstsq(A.reshape(-1, 3), -a.ravel(), rcond=None)[0])
 
 
-def fit_homography(own: Matches) -> Float | None:
+def fit_homography(matched: Matches) -> Float | None:
     """Least-squares homography (3, 3) of rays, with the sign of positive depths, or None."""
-    if len(own.ray) < LEAST_PIXELS:
+    if len(matched.ray) < LEAST_PIXELS:
         return None
-    a, b = (np.ascontiguousarray(v[:, :2]) for v in (own.ray, own.target))
+    a, b = (np.ascontiguousarray(v[:, :2]) for v in (matched.ray, matched.target))
     try:
         H, _ = cv2.findHomography(a, b, 0)
     except cv2.error:
         return None
     if H is None or not np.isfinite(H).all():
         return None
-    ahead = own.ray @ H[2]
+    ahead = matched.ray @ H[2]
     if not (ahead > 0).all() and not (ahead < 0).all():
         return None
     return np.asarray(H if ahead[0] > 0 else -H, np.float64)
@@ -148,13 +148,13 @@ def in_front(H: Float, ray: Float) -> list[Patch]:
         _, Rs, ts, ns = cv2.decomposeHomographyMat(H, np.eye(3))
     except cv2.error:
         return []
-    found = []
+    patches = []
     for R, t, n in zip(Rs, ts, ns, strict=True):
         length = float(np.linalg.norm(t))
         # each comes as (t, n) and as (-t, -n), of which one faces the camera
         if np.linalg.det(R) > 0 and length > LEAST_MOTION and (ray @ n > 0).all():
-            found.append(Patch(Motion(R, t.ravel() / length), length * n.ravel()))
-    return found
+            patches.append(Patch(Motion(R, t.ravel() / length), length * n.ravel()))
+    return patches
 
 
 def epipolar_error(motion: Motion, around: Matches, focal: float) -> float:

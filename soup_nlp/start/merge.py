@@ -32,15 +32,15 @@ in units of the median error of all superpixels; the lower one decides, as flow 
 SMALL = 0.008
 """Largest share of the superpixels of a piece that may be a mixture of the flows around it."""
 MIXED_PX = 2.0
-"""Distance, pixels, of its flow from those around it up to which a piece that its own motion
-explains badly is a mixture."""
+"""Largest distance, pixels, between the flow of a mixture that its own motion explains badly and
+the flows around it."""
 PIXELS = 1500
 """Largest number of pixels of a component to which a motion is fitted."""
 AGREE = 0.7
 """Least share of a component's superpixels that its motion explains."""
 DISCONTINUITIES = (1.0, 0.5, 0.25)
-"""Jumps of the flow that separate two regions, relative to `discontinuity_px`. The smaller one is
-tried where no single motion explains a region that the larger one gives."""
+"""Jumps of the flow that separate two regions, relative to `discontinuity_px`. A smaller
+jump is tried where no single motion explains a region that a larger one separates."""
 
 
 def gather(
@@ -95,10 +95,10 @@ def unmoved(
 
     The motion of a piece with more than `SMALL` of all superpixels may be due to a systematic error
     of the flow if it lowers the mean error by less than the noise. A smaller piece may be a
-    mixture: along a depth discontinuity the flow of a superpixel mixes those of both sides. It is
-    one if its flow lies between those of the superpixels of the largest component around it. If its
-    own motion explains its flow badly and hardly better than the main motion does, a flow near
-    those around it is enough.
+    mixture: along a depth discontinuity the flow of a superpixel mixes those of both sides. It is a
+    mixture if its flow lies between the flows of adjacent superpixels of the largest component. If
+    its own motion explains its flow badly and hardly better than the main motion does, a flow near
+    the adjacent flows is enough.
 
     Args:
         component: (N,) rigid component of every superpixel.
@@ -113,11 +113,11 @@ def unmoved(
     gain = choice.gain(views)
     i, k = seg.pairs.T
     piece = connected_labels(component[i] == component[k], seg)
-    apart, mixed = choice.label > 0, np.zeros(len(seg), bool)
+    moving, mixed = choice.label > 0, np.zeros(len(seg), bool)
     for p in np.unique(piece[(component != main) & usable]):
         at = piece == p
         if at.mean() > SMALL:
-            mixed |= at & (apart[at].any() and gain[at].mean() < noise)
+            mixed |= at & (moving[at].any() and gain[at].mean() < noise)
             continue
         if usable[at].mean() <= 0.5:
             continue
@@ -127,8 +127,10 @@ def unmoved(
             continue
         middle, sides = np.median(flow[at], axis=0), flow[around]
         outside = np.maximum(sides.min(axis=0) - middle, middle - sides.max(axis=0)).max()
-        own = np.median(choice.error[at])
-        badly = own > 2 * noise and np.median(error[at]) < 3 * own and outside < MIXED_PX
+        own_error = np.median(choice.error[at])
+        badly = (
+            own_error > 2 * noise and np.median(error[at]) < 3 * own_error and outside < MIXED_PX
+        )
         mixed |= at & (badly or outside < 3 * noise)
     return mixed
 
@@ -148,12 +150,12 @@ def _one_motion_each(
     piece = connected_pieces(mover, seg, whole)
     for c in np.unique(piece[mover]):
         at = np.flatnonzero(piece == c)
-        # one motion already, and what a few pixels would change in it is not to be trusted
+        # it has one motion already, and a change of it by a few pixels is not reliable
         if len(at) < PIECE_SIZE or len(np.unique(label[at])) == 1:
             continue
-        held = [choice.motions[c] for c in np.unique(label[at])]
-        tried = candidates(views, at, choice.motions[0], held, noise, o.seed)
-        cost = views.some(at).fit(tried).penalised()
+        present = [choice.motions[c] for c in np.unique(label[at])]
+        tried = candidates(views, at, choice.motions[0], present, noise, o.seed)
+        cost = views.subset(at).fit(tried).penalised()
         m = int(np.argmin(np.minimum(cost, CLIP).mean(axis=0)))
         agrees = cost[:, m] < choice.error[at] + gain
         if agrees.sum() >= AGREE * len(at):
@@ -163,27 +165,27 @@ def _one_motion_each(
 
 
 def candidates(
-    views: Views, at: Int, main: Motion, held: list[Motion], noise: float, seed: int
+    views: Views, at: Int, main: Motion, present: list[Motion], noise: float, seed: int
 ) -> list[Motion]:
     """Candidate motions for superpixels `at`, fitted to all their pixels.
 
-    These are a translation with the rotation of `main`, before and after refinement, the refined
-    motions that the superpixels hold, and the motion of their own essential matrix.
+    These are a translation with the rotation of `main`, before and after refinement, the `present`
+    motions of the superpixels, refined, and the motion of their own essential matrix.
     """
     step = max(1, len(at) * views.ray.shape[1] // PIXELS)
     r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
     w = views.weight[at].ravel()[::step]
-    own = r, q, w, views.focal[0]
-    start = [fit_translation(main.R, *own, max(noise, 0.1)), *held]
-    found = estimate(*own, max(3 * noise, 0.3), seed)
-    refined = [refine_near(m, *own, max(noise, 0.1)) for m in start]
-    return [*refined, start[0], *([] if found is None else [found])]
+    correspondences = r, q, w, views.focal[0]
+    start = [fit_translation(main.R, *correspondences, max(noise, 0.1)), *present]
+    motion = estimate(*correspondences, max(3 * noise, 0.3), seed)
+    refined = [refine_near(m, *correspondences, max(noise, 0.1)) for m in start]
+    return [*refined, start[0], *([] if motion is None else [motion])]
 
 
 def _spread(
     views: Views, seg: Segmentation, jump: Float, choice: Choice, gain: float, o: SeededStart
 ) -> Choice:
-    """Choose among the motions of whole regions, alike for neighbours with continuous flow.
+    """Choose among the motions of whole regions, preferring equal ones where flow is continuous.
 
     Superpixels with their own motion may keep it. TRW-S is used because many superpixels have to
     change together, for example where half of a region has the camera's motion.

@@ -1,7 +1,7 @@
-"""What stands still in the image while the camera moves: bonnet, logo, text, dirt on the lens.
+"""Regions that stand still in the image of a moving camera: bonnet, logo, text, dirt on the lens.
 
-It is fixed to the camera, or moves as the camera does, so that its flow says nothing about depth,
-and nothing about the camera's motion either. A distant region stands still as well, but its depth
+They are fixed to the camera, or move as it does, so that their flow says nothing about depth, and
+nothing about the camera's motion either. A distant region stands still as well, but its depth
 under the camera's motion explains that. The flow of a fixed region contradicts every depth from the
 ground, where there is one, to infinity.
 """
@@ -21,12 +21,12 @@ from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import LEAST_PARALLAX_PX, Views
 
 STILL_PX = 1.0
-"""Mean displacement up to which a superpixel may stand still, pixels: it may reflect what moves."""
+"""Mean displacement up to which a superpixel may stand still, pixels: it may reflect movers."""
 CONTRADICTED_PX = 0.5
 """Least error of the best depth, pixels, beside the displacement."""
 LEAST_SCENE = 0.6
-"""Least share of the superpixels that the camera's motion explains; if it is less, what stands
-still may be the scene."""
+"""Least share of the superpixels that the camera's motion explains; below it, the
+still part may be the scene."""
 LEAST_SHARE = 0.5
 """Least share of still superpixels in a piece with continuous flow."""
 
@@ -58,22 +58,22 @@ def fixed_to_camera(
     moves = ~usable | (error > CONTRADICTED_PX)
     i, k = seg.pairs.T
     piece = connected_labels(moves[i] & moves[k] & (jump < o.discontinuity_px), seg)
-    count, own = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
-    core = may & ((own >= PIECE_SIZE) & (own >= LEAST_SHARE * count))[piece]
+    count, still_count = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
+    core = may & ((still_count >= PIECE_SIZE) & (still_count >= LEAST_SHARE * count))[piece]
     return core | (moves & towards_border(core, seg)), shift
 
 
 def _error_under(
-    camera: Motion, views: Views, seg: Segmentation, known: Mask, o: SeededStart
+    camera: Motion, views: Views, seg: Segmentation, reliable: Mask, o: SeededStart
 ) -> Float:
     """(N,) mean error, pixels, of the best depth up to infinity, or up to that of the ground."""
     fit = views.fit([camera])
     mu, error = fit.inverse_depth[:, 0], fit.penalised()[:, 0]
     if not (o.upright and o.ground):
         return error
-    known = known & (error < CONTRADICTED_PX) & (mu > 0)
-    known &= fit.parallax[:, 0] * np.abs(mu) > LEAST_PARALLAX_PX
-    floor = ground(mu, views.anchor, seg.sizes.astype(float), known, o.seed)
+    reliable = reliable & (error < CONTRADICTED_PX) & (mu > 0)
+    reliable &= fit.parallax[:, 0] * np.abs(mu) > LEAST_PARALLAX_PX
+    floor = ground(mu, views.anchor, seg.sizes.astype(float), reliable, o.seed)
     least = (1 - BELOW) * floor
     moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t
     return np.where(mu < least, np.maximum(error, views.distance(moved)), error)
@@ -82,8 +82,8 @@ def _error_under(
 def towards_border(core: Mask, seg: Segmentation) -> Mask:
     """(N,) True between the image border and the regions of `core` that touch it.
 
-    A bonnet reflects what moves, so that only parts of it stand still. The rest of it lies in the
-    convex hull of these parts and the border, for each side of the image by itself.
+    A bonnet reflects moving things, so that only parts of it stand still. The others lie in the
+    convex hull of the still parts and the border, for each side of the image by itself.
 
     Args:
         core: (N,) True where the image certainly stands still.
@@ -100,8 +100,10 @@ def towards_border(core: Mask, seg: Segmentation) -> Mask:
         reach = core & (depth == away.min(axis=0)) & np.isin(region, region[line[core[line]]])
         if reach.sum() < PIECE_SIZE:
             continue
-        place = np.column_stack([along, depth])
+        position = np.column_stack([along, depth])
         # joggled, because the points may lie on one line
-        hull = Delaunay(np.concatenate([place[reach], place[reach] * [1, 0]]), qhull_options="QJ")
-        inside |= hull.find_simplex(place) >= 0
+        hull = Delaunay(
+            np.concatenate([position[reach], position[reach] * [1, 0]]), qhull_options="QJ"
+        )
+        inside |= hull.find_simplex(position) >= 0
     return inside

@@ -51,8 +51,8 @@ class Start:
         motion: (N,) index of its motion in `motions`, -1 where it has its own.
         component: (N,) index of the rigid component, which shares one scale: the superpixels of a
             dominant motion, or a connected piece of superpixels with their own motions.
-        part: (N,) what moves as one, an index of `component`: its own, or the largest one where its
-            flow is not usable, so that its motion is not known.
+        part: (N,) group that moves as one, an index of `component`: its own, or the largest one
+            where its flow is not usable, so that its motion is not known.
         motions: The dominant motions.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
             where a region bends, discontinuities make up most of its outline.
@@ -62,7 +62,7 @@ class Start:
             components that start at a constant depth, each superpixel with a motion of its own. If
             the rest is small or has no parallax, or the camera is at rest, it is the whole image
             and one component.
-        wrong: (N,) True where no motion that earned itself explains the flow, which then counts as
+        wrong: (N,) True where no accepted motion (`earned`) explains the flow, which then counts as
             wrong.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Noise of the flow, pixels, see `limited_noise`.
@@ -166,17 +166,17 @@ def propose(
     soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
     grounded = np.zeros(len(seg), bool)
     if o.upright and o.ground:
-        known = ~weak & views.usable
-        own_ground = views.anchor, seg, K_ref, known, component, tie, o
-        soup, component, tie, floor = _on_ground(soup, *own_ground)
+        reliable = ~weak & views.usable
+        ground_input = views.anchor, seg, K_ref, reliable, component, tie, o
+        soup, component, tie, floor = _on_ground(soup, *ground_input)
         grounded = weak & (floor > 0)
     soup = soup.normalised()
     moved = (centre - views.anchor)[:, :2] * views.focal
     mixed = unmoved(component, choice, moved, usable, views, seg) & ~(fixed | bends)
     part = moving_parts(np.where(mixed, largest(component), component), views, seg, fixed | bends)
-    own = soup, error, parallax, weak, label, component, part
-    found = *own, choice.motions, surface, tie, grounded, bends
-    return Start(*found, wrong & ~bends, noise=limited_noise(error[~bends]))
+    fields = soup, error, parallax, weak, label, component, part
+    all_fields = *fields, choice.motions, surface, tie, grounded, bends
+    return Start(*all_fields, wrong & ~bends, noise=limited_noise(error[~bends]))
 
 
 def rigid_motions(
@@ -193,18 +193,18 @@ def _with_depth(choice: Choice, views: Views, poor: Mask, seg: Segmentation) -> 
     Args:
         choice: Motion and plane of every superpixel.
         views: Rays, targets and confidence of every superpixel.
-        poor: (N,) True where these are a neighbour's or have no confidence.
+        poor: (N,) True where the views are a neighbour's or have no confidence.
         seg: Superpixels and graphs.
     """
-    own, parallax = choice.fit, choice.parallax
-    mu, slope = own.inverse_depth[:, 0], own.slope[:, 0]
-    weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | (own.cost[:, 0] > 3.0) | poor
+    fit, parallax = choice.fit, choice.parallax
+    mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
+    weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | (fit.cost[:, 0] > 3.0) | poor
     weak |= views.weight.sum(axis=1) < 2.0
     if weak.all():
-        # where every superpixel has little parallax, it is used as long as it exceeds rounding
+        # where all parallax is little, it is used as long as it exceeds rounding
         weak = ~np.isfinite(mu) | (mu <= 0) | (parallax < 0.02)
     if weak.all():
-        # no depth is known: all are at one, where translations move the image as they did
+        # no depth is known: all depths are one, with translations that move the image as before
         length = np.where(mu > 0, mu, 0.0)
         mu, slope = np.ones(len(seg)), np.zeros((len(seg), 2))
     else:
@@ -219,10 +219,10 @@ def _constant(
 ) -> Start:
     """Start without relief, where everything bends or the camera is at rest (`turn` is given)."""
     soup, error = constant_depth(views, turn)
-    zero, every = np.zeros(len(surface), np.int64), np.ones(len(surface), bool)
-    own = soup, error, views.parallax(soup), every, zero - 1, zero, zero
-    found = *own, choice.motions, surface, zero, ~every, every
-    return Start(*found, ~every, at_rest=turn is not None, noise=noise)
+    zero, everywhere = np.zeros(len(surface), np.int64), np.ones(len(surface), bool)
+    fields = soup, error, views.parallax(soup), everywhere, zero - 1, zero, zero
+    all_fields = *fields, choice.motions, surface, zero, ~everywhere, everywhere
+    return Start(*all_fields, ~everywhere, at_rest=turn is not None, noise=noise)
 
 
 def with_regions(component: Int, mask: Mask, seg: Segmentation) -> Int:
@@ -234,9 +234,9 @@ def with_regions(component: Int, mask: Mask, seg: Segmentation) -> Int:
 def moving_parts(component: Int, views: Views, seg: Segmentation, kept: Mask) -> Int:
     """(N,) component of every superpixel, the largest one in pieces without usable flow.
 
-    What leaves the image or is hidden has a flow that is alike over some superpixels, and wrong. A
-    component of its own gives it a better depth than its neighbours do, but it need not move.
-    Beside a piece that does move it is taken to be part of it.
+    A part that leaves the image or is hidden has the same wrong flow over several superpixels. As a
+    component of its own it gets a better depth than from its neighbours, but it need not move.
+    Beside a piece that does move it is taken to be part of that piece.
 
     Args:
         component: (N,) rigid component of every superpixel.
@@ -251,8 +251,8 @@ def moving_parts(component: Int, views: Views, seg: Segmentation, kept: Mask) ->
     weight = np.bincount(piece, views.weight.mean(axis=1)) / np.bincount(piece)
     moves = kept | ((component != main) & (weight >= USABLE)[piece])
     beside = np.zeros(len(weight), bool)
-    for one, other in ((i, k), (k, i)):
-        beside[piece[one[~same & moves[other]]]] = True
+    for first, second in ((i, k), (k, i)):
+        beside[piece[first[~same & moves[second]]]] = True
     return np.where(moves | beside[piece], component, main)
 
 
@@ -264,8 +264,8 @@ def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
     parallax, whole = views.parallax(soup), np.zeros(len(seg), np.int64)
     noise = limited_noise(error)
     none = np.zeros(len(seg), bool)
-    own = soup, error, parallax, borrowed, whole - 1, whole, whole
-    return Start(*own, [], whole, whole, none, none, none, noise=noise)
+    fields = soup, error, parallax, borrowed, whole - 1, whole, whole
+    return Start(*fields, [], whole, whole, none, none, none, noise=noise)
 
 
 def _on_ground(
@@ -273,23 +273,23 @@ def _on_ground(
     anchor: Float,
     seg: Segmentation,
     K_ref: Float,
-    known: Mask,
+    reliable: Mask,
     component: Int,
     tie: Int,
     o: SeededStart,
 ) -> tuple[Soup, Int, Int, Float]:
     """Soup, components, ties and (N,) inverse depth of the ground, see `ground`.
 
-    What lies below the ground is lifted, and what floats above it is lowered.
+    Superpixels below the ground are lifted, and regions that float above it are lowered.
     """
-    known = known & (component == largest(component))
+    reliable = reliable & (component == largest(component))
     area = seg.sizes.astype(float)
-    floor = ground(1 / soup.depth_at(anchor), anchor, area, known, o.seed)
-    soup, lifted = above_ground(soup, anchor, area, known, component, floor)
+    floor = ground(1 / soup.depth_at(anchor), anchor, area, reliable, o.seed)
+    soup, lifted = above_ground(soup, anchor, area, reliable, component, floor)
     tie = np.where(lifted & (tie != FIXED), TIES.index("ground"), tie)
     lam, component = soup.lam.copy(), component.copy()
     for region, farther in floating(soup, seg, K_ref, floor, component):
-        # it moves by itself, as its flow says at any depth
+        # at the depth of the ground its flow shows a motion of its own
         lam[region] *= farther
         component[region] = component.max() + 1
         tie[region] = TIES.index("contact below")

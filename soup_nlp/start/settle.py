@@ -1,4 +1,4 @@
-"""Motions of rigid components where the flow leaves them open: with the least relief.
+"""Motions of rigid components that the flow does not determine: those with the least relief.
 
 A small turn and a small translation move an image almost alike (the bas-relief ambiguity). Motions
 whose residuals differ by less than the systematic error of the flow explain it equally well, and
@@ -19,7 +19,7 @@ from soup_nlp.start.epipolar import Motion, around, sampson, triangulate
 from soup_nlp.start.views import Views
 
 SYSTEMATIC, MOST_SYSTEMATIC_PX = 1.5, 0.15
-"""Error of the flow that is alike over large parts of the image, in units of its noise, and its
+"""Error of the flow that is the same over large parts of the image, in units of its noise, and its
 limit in pixels: more noise than that averages out."""
 RELIEF = 0.5
 """Standard deviation of log depth within a scene."""
@@ -47,8 +47,8 @@ def settle(views: Views, choice: Choice, centre: Float, usable: Float, noise: fl
     for c, motion in enumerate(motions):
         at = np.flatnonzero((choice.label == c) & (usable > 0))
         if len(at) >= PIECE_SIZE:
-            own = views.anchor[at], centre[at], usable[at], views.focal[0]
-            motions[c] = most_probable([motion], *own, min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX))
+            data = views.anchor[at], centre[at], usable[at], views.focal[0]
+            motions[c] = most_probable([motion], *data, min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX))
     return Choice.of(views, motions, choice.label)
 
 
@@ -68,7 +68,7 @@ def most_probable(
     Sampson distance and rho(x, c) = c^2 log(1 + x^2 / c^2) the Cauchy loss.
 
     Args:
-        motions: Where to begin; the best of the ends is taken.
+        motions: Initial motions; the best result is returned.
         r: (M, 3) reference rays.
         q: (M, 3) next rays.
         weight: (M,) confidence.
@@ -77,11 +77,11 @@ def most_probable(
         expected: (M,) log depth by a depth prior, from which relief is counted.
         spread: Standard deviation of the relief.
     """
-    root, found = np.sqrt(weight / weight.sum()), []
+    root, results = np.sqrt(weight / weight.sum()), []
 
-    def residual(own: Motion) -> Float:
-        distance = cauchy(sampson(own.essential(), r, q, focal), CLIP_PX)
-        depth = cauchy(relief(own, r, q, expected), spread)
+    def residual(motion: Motion) -> Float:
+        distance = cauchy(sampson(motion.essential(), r, q, focal), CLIP_PX)
+        depth = cauchy(relief(motion, r, q, expected), spread)
         return np.concatenate([root * distance / error, root * depth / spread])
 
     for unpack in map(around, motions):
@@ -91,8 +91,8 @@ def most_probable(
             x_scale=[0.01] * 3 + [0.1] * 2,
             max_nfev=30,
         )
-        found.append((float(end.cost), unpack(end.x)))
-    return min(found, key=lambda one: one[0])[1]
+        results.append((float(end.cost), unpack(end.x)))
+    return min(results, key=lambda result: result[0])[1]
 
 
 def cauchy(x: Float, scale: float) -> Float:

@@ -1,4 +1,4 @@
-"""What planes are fitted to: rays and flow targets of the sampled pixels of every superpixel."""
+"""Data of the plane fits: rays and flow targets of the sampled pixels of every superpixel."""
 
 from __future__ import annotations
 
@@ -88,11 +88,11 @@ class Views:
         return np.linalg.norm(soup.parallax(self.anchor) * np.asarray(self.focal), axis=1)
 
     def without(self, mask: Mask) -> Views:
-        """The same with confidence 0 in the superpixels of a mask (N,)."""
+        """The views with confidence 0 in the superpixels of a mask (N,)."""
         return replace(self, weight=np.where(mask[:, None], 0.0, self.weight))
 
-    def some(self, at: Int) -> Views:
-        """The entries of superpixels `at`."""
+    def subset(self, at: Int) -> Views:
+        """The views of superpixels `at`."""
         ray, target, weight = self.ray[at], self.target[at], self.weight[at]
         return Views(ray, target, weight, self.anchor[at], self.radius[at], self.focal)
 
@@ -100,7 +100,7 @@ class Views:
 def look(
     seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
 ) -> tuple[Views, Mask]:
-    """Rays and targets of sampled pixels, and (N,) True where they are those of a neighbour.
+    """Rays and targets of sampled pixels, and (N,) True where a neighbour's are used.
 
     Args:
         seg: Superpixels and graphs.
@@ -113,20 +113,20 @@ def look(
         DataError: fewer than 8 pixels have a usable flow.
     """
     width = seg.labels.shape[1]
-    index, there = sample_pixels(seg.labels, flow, o.samples, o.seed)
-    if there.sum() < 8:
+    index, filled = sample_pixels(seg.labels, flow, o.samples, o.seed)
+    if filled.sum() < 8:
         raise DataError(
             "too few pixels have a usable flow",
             where=f"flow {flow.source}",
-            found=int(there.sum()),
+            found=int(filled.sum()),
             expected="at least 8",
             hint="check the flow file, or lower the confidence threshold",
         )
-    index, there, poor = _fill_poor(seg, index, there)
+    index, filled, poor = _fill_poor(seg, index, filled)
     uv = np.stack([index % width, index // width], axis=-1).astype(float)
     displacement = flow.uv.reshape(-1, 2)[index].astype(float)
-    weight = np.where(there, flow.confidence.ravel()[index].astype(float), 0.0)
-    ray, target = rays(K_ref, uv), rays(K_next, uv + np.where(there[..., None], displacement, 0.0))
+    weight = np.where(filled, flow.confidence.ravel()[index].astype(float), 0.0)
+    ray, target = rays(K_ref, uv), rays(K_next, uv + np.where(filled[..., None], displacement, 0.0))
     anchor = rays(K_ref, seg.anchors)
     rim = rays(K_ref, seg.rim)
     radius = np.linalg.norm((rim - anchor[:, None])[..., :2], axis=-1).max(axis=1)
@@ -136,18 +136,18 @@ def look(
 
 
 def _fill_poor(
-    seg: Segmentation, index: Int, there: Mask, least: int = 8
+    seg: Segmentation, index: Int, filled: Mask, least: int = 8
 ) -> tuple[Int, Mask, Mask]:
     """Replace the samples of superpixels with few usable pixels by their nearest neighbour's."""
-    count = there.sum(axis=1)
+    count = filled.sum(axis=1)
     poor = count < least
     if not poor.any() or poor.all():
-        return index, there, poor
+        return index, filled, poor
     rich = np.flatnonzero(~poor)
     _, nearest = cKDTree(seg.anchors[rich]).query(seg.anchors[poor])
-    index, there = index.copy(), there.copy()
-    index[poor], there[poor] = index[rich[nearest]], there[rich[nearest]]
-    return index, there, poor
+    index, filled = index.copy(), filled.copy()
+    index[poor], filled[poor] = index[rich[nearest]], filled[rich[nearest]]
+    return index, filled, poor
 
 
 class FlowFit(NamedTuple):
@@ -155,7 +155,7 @@ class FlowFit(NamedTuple):
 
     Attributes:
         views: Rays, targets and confidence of every superpixel.
-        poor: (N,) True where these are a neighbour's, because too few pixels have a usable flow.
+        poor: (N,) True where a neighbour's views are used: too few pixels have a usable flow.
         fit: (N, 3, 2) affine flow, see `affine_flow`.
         residual: (N,) its mean error, pixels.
         jump: (P,) mean difference of the affine flows of two neighbours on their boundary, pixels.
@@ -173,15 +173,15 @@ class FlowFit(NamedTuple):
     ) -> FlowFit:
         """Fit a flow; arguments and errors are those of `look`."""
         views, poor = look(seg, flow, K_ref, K_next, o)
-        found = cls(views, poor, *affine_flow(views), np.zeros(0))
+        fitted = cls(views, poor, *affine_flow(views), np.zeros(0))
         edge = rays(K_ref, seg.boundary)
-        one, other = (found.followed(which, edge) for which in seg.pairs.T)
-        return found._replace(jump=np.linalg.norm(one - other, axis=-1).mean(axis=1))
+        first, second = (fitted.followed(which, edge) for which in seg.pairs.T)
+        return fitted._replace(jump=np.linalg.norm(first - second, axis=-1).mean(axis=1))
 
     def followed(self, which: Int, ray: Float) -> Float:
-        """(M, ..., 2) where the affine flows of superpixels `which` (M,) bring rays (M, ..., 3).
+        """(M, ..., 2) targets of rays (M, ..., 3) by the affine flows of superpixels `which` (M,).
 
-        In pixels from the next frame's principal point.
+        Targets are in pixels from the next frame's principal point.
         """
         v, wide = self.views, (slice(None), *(None,) * (ray.ndim - 2))
         off = (ray - v.anchor[which][wide])[..., :2] / v.radius[which][(*wide, None)]
@@ -210,7 +210,7 @@ def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Floa
     off = (views.ray - views.anchor[:, None])[..., :2] / views.radius[:, None, None]
     basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
     target = views.target[..., :2] * np.asarray(views.focal)
-    # without confident pixels any affine map will do: the ridge makes it one
+    # without confident pixels any affine map will do; the ridge keeps the system regular
     w = views.weight + 1e-6
     fit = np.zeros((len(basis), 3, 2))
     for _ in range(rounds):

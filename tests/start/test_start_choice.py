@@ -72,7 +72,7 @@ class Turns:
         whole = np.broadcast_to(R, (len(self.true), *R.shape))
         return self.planes(whole if label is None else R[label][:, None])
 
-    def some(self, at: np.ndarray) -> Turns:
+    def subset(self, at: np.ndarray) -> Turns:
         return Turns(self.true[at])
 
 
