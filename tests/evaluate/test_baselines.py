@@ -44,25 +44,25 @@ def made(
     ],
 )
 def test_exact_flow_gives_exact_depth_whatever_the_second_camera(fx, fy, skew, cx, cy, dtype, rtol):
-    """With a flow in double precision nothing but rounding is left."""
+    """In double precision only rounding remains."""
     K_next = np.array([[fx, skew, cx], [0, fy, cy], [0, 0, 1.0]])
     pair, z, _, t = made(K_next, dtype=dtype)
-    found = rigid_depth(pair)
-    np.testing.assert_allclose(found * np.linalg.norm(t), z, rtol=rtol)
+    depth = rigid_depth(pair)
+    np.testing.assert_allclose(depth * np.linalg.norm(t), z, rtol=rtol)
 
 
 def test_depth_without_parallax_is_unknown():
-    """Pixels moved to where a point at infinity would land have no depth, whatever the noise."""
+    """Pixels with the flow of a point at infinity have no depth."""
     pair, z, R, t = made(np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]]), dtype=np.float64)
     v, u = np.mgrid[:60, :80]
     far = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(pair.K_ref).T * 10 * FAR * 4
     x = (far @ R.T + t) @ pair.K_next.T
     uv = pair.flow.uv.copy()
     uv[:10] = (x[..., :2] / x[..., 2:] - np.stack([u, v], -1))[:10]
-    found = rigid_depth(pair.with_flow(Flow(uv, pair.flow.confidence)))
-    assert np.isnan(found[:10]).all()
-    np.testing.assert_allclose(found[10:] * np.linalg.norm(t), z[10:], rtol=1e-6)
-    assert np.isfinite(found).mean() == pytest.approx(50 / 60)
+    depth = rigid_depth(pair.with_flow(Flow(uv, pair.flow.confidence)))
+    assert np.isnan(depth[:10]).all()
+    np.testing.assert_allclose(depth[10:] * np.linalg.norm(t), z[10:], rtol=1e-6)
+    assert np.isfinite(depth).mean() == pytest.approx(50 / 60)
 
 
 def test_flow_without_confidence_is_ignored(orbit):
@@ -73,24 +73,24 @@ def test_flow_without_confidence_is_ignored(orbit):
     confidence[bad] = 0.0
     uv[0, 0], confidence[0, 0] = np.nan, 0.0
     bad[0, 0] = True
-    found = rigid_depth(orbit.with_flow(Flow(uv, confidence)))
-    np.testing.assert_array_equal(np.isnan(found), bad)
-    assert np.isfinite(found).mean() == pytest.approx(1 - bad.mean())
-    assert depth_metrics(found, orbit.truth.depth_ref).mre < 1e-4
+    depth = rigid_depth(orbit.with_flow(Flow(uv, confidence)))
+    np.testing.assert_array_equal(np.isnan(depth), bad)
+    assert np.isfinite(depth).mean() == pytest.approx(1 - bad.mean())
+    assert depth_metrics(depth, orbit.truth.depth_ref).mre < 1e-4
     # every other pixel takes the depth of the nearest one
-    filled = fill_nearest(found)
+    filled = fill_nearest(depth)
     assert np.isfinite(filled).all()
-    np.testing.assert_array_equal(filled[~bad], found[~bad])
+    np.testing.assert_array_equal(filled[~bad], depth[~bad])
     assert depth_metrics(filled, orbit.truth.depth_ref).mre < 0.05
 
 
 def test_confidence_weighs_the_motion(orbit):
-    """A moving half that is trusted little does not decide the motion."""
+    """A moving half of low confidence does not determine the motion."""
     uv, confidence = orbit.flow.uv.copy(), orbit.flow.confidence.copy()
     uv[:, :150] += np.linspace(3, 9, 150)[None, :, None]
     confidence[:, :150] = 0.02
-    found = rigid_depth(orbit.with_flow(Flow(uv, confidence)))
-    right = depth_metrics(found[:, 150:], orbit.truth.depth_ref[:, 150:])
+    depth = rigid_depth(orbit.with_flow(Flow(uv, confidence)))
+    right = depth_metrics(depth[:, 150:], orbit.truth.depth_ref[:, 150:])
     assert right.mre < 0.01
 
 
@@ -101,26 +101,26 @@ def test_points_behind_a_camera_are_unknown():
     uv[20:40, 20:40] *= -1
     behind = np.zeros(pair.size, bool)
     behind[20:40, 20:40] = True
-    found = rigid_depth(pair.with_flow(Flow(uv, pair.flow.confidence)))
-    np.testing.assert_array_equal(np.isnan(found), behind)
-    assert np.isfinite(found).mean() == pytest.approx(1 - behind.mean())
-    assert (fill_nearest(found) > 0).all()
+    depth = rigid_depth(pair.with_flow(Flow(uv, pair.flow.confidence)))
+    np.testing.assert_array_equal(np.isnan(depth), behind)
+    assert np.isfinite(depth).mean() == pytest.approx(1 - behind.mean())
+    assert (fill_nearest(depth) > 0).all()
 
 
 def test_dynamic_scene_is_not_rigid():
     pair = render_scene("street", width=256, height=109)
-    found = rigid_depth(pair.with_flow(flow_from_truth(pair)))
-    m = depth_metrics(found, pair.truth.depth_ref)
-    static = depth_metrics(found, pair.truth.depth_ref, mask=pair.truth.components == 0)
+    depth = rigid_depth(pair.with_flow(flow_from_truth(pair)))
+    m = depth_metrics(depth, pair.truth.depth_ref)
+    static = depth_metrics(depth, pair.truth.depth_ref, mask=pair.truth.components == 0)
     assert static.mre < m.mre < 0.05
 
 
 def test_without_flow_or_motion_there_is_no_baseline(orbit, monkeypatch):
     assert rigid_depth(replace(orbit, flow=None)) is None
-    none = Flow(orbit.flow.uv, np.zeros_like(orbit.flow.confidence))
-    assert rigid_depth(orbit.with_flow(none)) is None
+    unsure = Flow(orbit.flow.uv, np.zeros_like(orbit.flow.confidence))
+    assert rigid_depth(orbit.with_flow(unsure)) is None
     still = Flow(np.zeros_like(orbit.flow.uv), np.ones_like(orbit.flow.confidence))
-    found = rigid_depth(orbit.with_flow(still))
-    assert found is None or found.shape == orbit.size
+    depth = rigid_depth(orbit.with_flow(still))
+    assert depth is None or depth.shape == orbit.size
     monkeypatch.setattr("soup_nlp.start.epipolar.estimate", lambda *_: None)
     assert rigid_depth(orbit) is None

@@ -1,4 +1,4 @@
-"""Shares of the image whose depth is determined, and the reasons of the rest."""
+"""Shares of the image whose depth is determined, and the reasons for guesses."""
 
 from __future__ import annotations
 
@@ -18,58 +18,58 @@ def unsure(run, component_variance=None):
     """The same run where every pixel is a guess, though the flow is evidence of depth."""
     sure = run.confidence
     far = np.full_like(sure.evidence.turn, 9.0)
-    seen = replace(sure.evidence, turn=far, constant=far, solution=np.zeros_like(far))
+    evidence = replace(sure.evidence, turn=far, constant=far, solution=np.zeros_like(far))
     scale, start = sure.scale, run.start
     if component_variance is not None:
-        own = replace(
+        marginals = replace(
             sure.marginals, component=np.full_like(sure.marginals.component, component_variance)
         )
         far = displacement(run.soup, run.data.anchor_ray, start.component)
-        scale = scale_by_contact(own, start, run.segmentation.sizes, far)
+        scale = scale_by_contact(marginals, start, run.segmentation.sizes, far)
     sigma = np.full_like(sure.sigma, SIGMA_PRIOR)
-    return replace(run, confidence=replace(sure, sigma=sigma, scale=scale, evidence=seen))
+    return replace(run, confidence=replace(sure, sigma=sigma, scale=scale, evidence=evidence))
 
 
 def test_shares_add_up(small_run):
-    found = certainty(small_run)
-    assert found["determined"] + found["guess"] == pytest.approx(1.0)
-    assert sum(found[k] for k in ("flow", "contact", "outline")) == pytest.approx(
-        found["determined"]
+    shares = certainty(small_run)
+    assert shares["determined"] + shares["guess"] == pytest.approx(1.0)
+    assert sum(shares[k] for k in ("flow", "contact", "outline")) == pytest.approx(
+        shares["determined"]
     )
-    assert sum(found[k] for k in REASONS) == pytest.approx(found["guess"])
-    assert found["median_sigma"] < MOST_SIGMA
+    assert sum(shares[k] for k in REASONS) == pytest.approx(shares["guess"])
+    assert shares["median_sigma"] < MOST_SIGMA
 
 
 def test_every_guess_has_one_reason(small_run):
-    found = certainty(unsure(small_run))
-    assert found["determined"] == 0
-    assert np.isnan(found["median_sigma"])
-    assert sum(found[k] for k in REASONS) == pytest.approx(1.0)
+    shares = certainty(unsure(small_run))
+    assert shares["determined"] == 0
+    assert np.isnan(shares["median_sigma"])
+    assert sum(shares[k] for k in REASONS) == pytest.approx(1.0)
 
 
 def test_a_scale_that_contact_hardly_determines_is_named(small_run):
     start, labels = small_run.start, small_run.segmentation.labels
     loose = certainty(unsure(small_run, 1.0))
     firm = certainty(unsure(small_run, 1e-6))
-    others = (start.tie != TIES.index("reference"))[labels].mean()
+    tied_share = (start.tie != TIES.index("reference"))[labels].mean()
     # without evidence of depth the scale is not the reason
-    assert 0 <= firm["scale"] < loose["scale"] <= others
+    assert 0 <= firm["scale"] < loose["scale"] <= tied_share
     assert loose["scale"] + loose["weak"] == pytest.approx(firm["scale"] + firm["weak"])
     (line,) = certainty_lines(loose)
     assert "with a scale that contact hardly determines" in line
 
 
 def test_a_camera_at_rest_is_the_reason_of_every_guess(small_run):
-    rest = replace(small_run, start=replace(small_run.start, at_rest=True))
-    found = certainty(unsure(rest))
-    assert found["rest"] == 1.0
-    assert "turns or stands still" in guess_reason(found)
+    at_rest = replace(small_run, start=replace(small_run.start, at_rest=True))
+    shares = certainty(unsure(at_rest))
+    assert shares["rest"] == 1.0
+    assert "turns or stands still" in guess_reason(shares)
 
 
 def test_what_is_fixed_in_the_image_is_named(small_run):
     start = small_run.start
     tie = np.where(start.component == start.component[0], FIXED, start.tie)
-    found = certainty(unsure(replace(small_run, start=replace(start, tie=tie))))
-    own = (tie == FIXED)[small_run.segmentation.labels]
-    assert found["fixed"] == pytest.approx(own.mean())
-    assert "stands still in the image while the camera moves" in certainty_lines(found)[0]
+    shares = certainty(unsure(replace(small_run, start=replace(start, tie=tie))))
+    fixed = (tie == FIXED)[small_run.segmentation.labels]
+    assert shares["fixed"] == pytest.approx(fixed.mean())
+    assert "stands still in the image while the camera moves" in certainty_lines(shares)[0]

@@ -53,11 +53,11 @@ def dense(small_room, info):
     mean = np.zeros(len(info.growth))
     mean[::9] = -sizes / sizes.sum() / info.plane[:, 0]
     scale = 1 / np.sqrt(info.matrix.diagonal())
-    held = info.matrix.toarray() * np.outer(scale, scale)
+    scaled = info.matrix.toarray() * np.outer(scale, scale)
     # holding the mean is a constraint: its KKT matrix is regular
     row = mean * scale
     row /= np.linalg.norm(row)
-    kkt = np.block([[held, row[:, None]], [row[None], np.zeros((1, 1))]])
+    kkt = np.block([[scaled, row[:, None]], [row[None], np.zeros((1, 1))]])
     return np.linalg.inv(kkt)[:-1, :-1] * np.outer(scale, scale)
 
 
@@ -68,24 +68,24 @@ def blocks_of(matrix: np.ndarray, size: int) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_diagonal_blocks_equal_those_of_a_dense_inverse(seed):
-    """Random graphs; the last four have parts that nothing couples."""
+    """Random graphs; the last four have uncoupled parts."""
     rng = np.random.default_rng(seed)
     n, size = 30, 3
-    place = rng.uniform(0, 1, (n, 2))
-    near = np.linalg.norm(place[:, None] - place, axis=-1) < (0.35 if seed < 2 else 0.15)
+    position = rng.uniform(0, 1, (n, 2))
+    near = np.linalg.norm(position[:, None] - position, axis=-1) < (0.35 if seed < 2 else 0.15)
     J = rng.normal(size=(n * size, n * size)) * np.kron(near, np.ones((size, size)))
     A = J.T @ J * np.kron(near, np.ones((size, size))) + 40 * n * np.eye(n * size)
-    solver = BlockCholesky(sparse.csr_matrix(A), place)
+    solver = BlockCholesky(sparse.csr_matrix(A), position)
     inverse = np.linalg.inv(A)
     np.testing.assert_allclose(solver.inverse_blocks(), blocks_of(inverse, size), rtol=1e-8)
     b = rng.normal(size=(n * size, 2))
     np.testing.assert_allclose(solver.solve(b), inverse @ b, rtol=1e-7, atol=1e-12)
-    order = layers(sparse.csr_matrix(near), place)
+    order = layers(sparse.csr_matrix(near), position)
     assert len(order) > 2
     assert np.array_equal(np.sort(np.concatenate(order)), np.arange(n))
-    for k, own in enumerate(order):
+    for k, layer in enumerate(order):
         beyond = np.concatenate([*order[k + 2 :], np.zeros(0, int)])
-        assert not near[np.ix_(own, beyond)].any()
+        assert not near[np.ix_(layer, beyond)].any()
 
 
 def test_a_matrix_that_is_not_positive_is_refused():
@@ -97,13 +97,15 @@ def test_a_matrix_that_is_not_positive_is_refused():
 
 def test_marginals_are_those_of_a_dense_inverse(small_room, info, dense):
     component = np.arange(len(small_room)) % 3
-    found = marginals(info, small_room.segmentation.sizes, component)
-    np.testing.assert_allclose(found.plane, blocks_of(dense, 9)[:, :3, :3], rtol=1e-4, atol=1e-12)
+    variances = marginals(info, small_room.segmentation.sizes, component)
+    np.testing.assert_allclose(
+        variances.plane, blocks_of(dense, 9)[:, :3, :3], rtol=1e-4, atol=1e-12
+    )
     for c in range(3):
         row = np.zeros(len(info.growth))
-        own = np.where(component == c, small_room.segmentation.sizes, 0)
-        row[::9] = -own / own.sum() / info.plane[:, 0]
-        assert found.component[c] == pytest.approx(row @ dense @ row, rel=1e-4)
+        weight = np.where(component == c, small_room.segmentation.sizes, 0)
+        row[::9] = -weight / weight.sum() / info.plane[:, 0]
+        assert variances.component[c] == pytest.approx(row @ dense @ row, rel=1e-4)
 
 
 def test_all_depths_growing_alike_costs_nothing(info):
@@ -114,8 +116,8 @@ def test_all_depths_growing_alike_costs_nothing(info):
 def test_the_variance_of_a_pixel_is_of_log_depth(small_room, info, dense):
     """By the derivative of the log depth of a plane, by differences."""
     seg, K = small_room.segmentation, small_room.pair.K_ref
-    found = marginals(info, seg.sizes, np.zeros(len(small_room), int))
-    sigma = spread_in_image(info, found.plane, seg.labels, K)
+    variances = marginals(info, seg.sizes, np.zeros(len(small_room), int))
+    sigma = spread_in_image(info, variances.plane, seg.labels, K)
     v, u = 40, 100
     i = seg.labels[v, u]
 
@@ -152,17 +154,17 @@ def test_a_superpixel_with_partly_usable_flow_is_less_sure():
     confidence[:10, labels[0] == 1] = confidence[:10, labels[0] == 3] = 1.0
     uv = np.where(labels[..., None] == 3, [30.0, 0.0], 0.0)
     flow = Flow(uv.astype(np.float32), confidence.astype(np.float32), "test")
-    found = of_mixed_flow(flow, labels.astype(np.int32), (60, 60))
-    np.testing.assert_allclose(found, [0, MIXED, MIXED, 0], atol=1e-3)
+    sigma = of_mixed_flow(flow, labels.astype(np.int32), (60, 60))
+    np.testing.assert_allclose(sigma, [0, MIXED, MIXED, 0], atol=1e-3)
 
 
 def test_calibration_is_capped_where_nothing_is_known():
-    none, most, endless = calibrated(np.array([0.0, 1e9, np.inf]), 0.1)
-    assert none == 0.0
+    zero, most, endless = calibrated(np.array([0.0, 1e9, np.inf]), 0.1)
+    assert zero == 0.0
     assert most == endless == pytest.approx(SIGMA_PRIOR)
-    one, two = calibrated(np.array([0.001, 0.002]), 0.1)
-    assert two / one == pytest.approx(2**POWER, rel=1e-4)
-    assert calibrated(np.array([0.001]), 0.2)[0] == pytest.approx(two)
+    single, double = calibrated(np.array([0.001, 0.002]), 0.1)
+    assert double / single == pytest.approx(2**POWER, rel=1e-4)
+    assert calibrated(np.array([0.001]), 0.2)[0] == pytest.approx(double)
     # the prior's information is added to the pair's
     alone = calibrated(np.array([0.5]), 0.1, prior=np.inf)[0]
     assert calibrated(np.array([0.5]), 0.1)[0] ** -2 == pytest.approx(alone**-2 + SIGMA_PRIOR**-2)
@@ -180,11 +182,11 @@ def test_an_undetermined_superpixel_has_the_sigma_of_the_prior(small_room):
     weight = small_room.data.pixel_weight.copy()
     weight[blind] = 0.0
     data = replace(small_room.data, pixel_weight=weight)
-    free = small_room.weights.replace(arap=1e-9, cont=1e-9, orient=1e-9)
-    sigma = sure_of(small_room, data, free).sigma
-    own = small_room.segmentation.labels == blind
-    np.testing.assert_allclose(sigma[own], SIGMA_PRIOR, rtol=0.02)
-    assert sure_of(small_room).sigma[own].mean() < 0.9 * SIGMA_PRIOR
+    loose = small_room.weights.replace(arap=1e-9, cont=1e-9, orient=1e-9)
+    sigma = sure_of(small_room, data, loose).sigma
+    inside = small_room.segmentation.labels == blind
+    np.testing.assert_allclose(sigma[inside], SIGMA_PRIOR, rtol=0.02)
+    assert sure_of(small_room).sigma[inside].mean() < 0.9 * SIGMA_PRIOR
 
 
 @pytest.mark.slow
@@ -222,13 +224,15 @@ def test_a_focal_length_that_was_guessed_wrong_makes_depth_unsure():
 def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
     K = small_room.pair.K_ref, small_room.pair.K_next
     rec = reconstruct(small_room.soup, small_room.segmentation.labels, *K)
-    own = small_room.segmentation.labels == 25
+    inside = small_room.segmentation.labels == 25
     flow = small_room.pair.flow
     assert flow_misfit(rec, Flow(rec.flow.astype(np.float32), flow.confidence)).max() < 1e-4
-    moved = np.where(own[..., None], rec.flow + np.array([2.0, 0.0]), rec.flow).astype(np.float32)
-    found = flow_misfit(rec, Flow(moved, flow.confidence))
-    assert found[25] == pytest.approx(2.0, abs=1e-4)
-    assert np.delete(found, 25).max() < 1e-4
+    moved = np.where(inside[..., None], rec.flow + np.array([2.0, 0.0]), rec.flow).astype(
+        np.float32
+    )
+    misfit = flow_misfit(rec, Flow(moved, flow.confidence))
+    assert misfit[25] == pytest.approx(2.0, abs=1e-4)
+    assert np.delete(misfit, 25).max() < 1e-4
     quiet, loud = (calibrated(np.array([0.001]), 0.1, m) for m in (0.05, 0.4))
     # the geometric mean of noise and misfit is twice the noise
     assert loud / quiet == pytest.approx(2**POWER, rel=1e-3)
@@ -241,7 +245,7 @@ def test_misfit_and_spread_count_differently_where_surfaces_bend():
     assert base[0] == pytest.approx(BENDING_FACTOR * misfit * np.sqrt(spread[0]), rel=1e-4)
     half = calibrated(0.25 * spread, 0.1, misfit, prior=np.inf, bends=True)
     assert half[0] == pytest.approx(0.5 * base[0], rel=1e-3)
-    # small ones keep their order, and count for little
+    # small spreads keep their order and add little
     small = calibrated(LEAST_SPREAD * np.array([0.0, 0.1]), 0.1, LEAST_NOISE, bends=True)
     assert small[0] < small[1] == pytest.approx(small[0], rel=0.01)
     assert calibrated(spread, 0.6, misfit, prior=np.inf, bends=True) == base
@@ -253,11 +257,11 @@ def test_misfit_and_spread_count_differently_where_surfaces_bend():
 def test_systematic_uncertainty_is_added_at_any_noise(bends):
     spread = np.array([0.01])
     for noise in (0.05, 0.6):
-        alone, both = (
+        alone, total = (
             calibrated(spread, noise, 0.1, prior=np.inf, bends=bends, added=added)[0]
             for added in (0.0, 0.2)
         )
-        assert both**2 == pytest.approx(alone**2 + 0.2**2)
+        assert total**2 == pytest.approx(alone**2 + 0.2**2)
     assert calibrated(spread, 0.1, added=np.inf)[0] == pytest.approx(SIGMA_PRIOR)
 
 
@@ -271,7 +275,7 @@ def test_other_components_are_less_sure_than_the_reference(small_room):
     mean = np.sum(sizes[~reference] * scale[~reference]) / sizes.sum()
     np.testing.assert_allclose(scale[reference], mean, rtol=0.2)
     assert scale[~reference].min() > np.hypot(CONTACT, scale[reference][0]) * (1 - 1e-9)
-    # no component is less sure than a pair that says nothing
+    # no component is less certain than the prior
     raw = np.sqrt(sure.marginals.component)
     expected = 1 / np.sqrt(1 / raw**2 + 1 / SIGMA_PRIOR**2)
     np.testing.assert_allclose(sure.component_sigma, expected)
@@ -279,19 +283,19 @@ def test_other_components_are_less_sure_than_the_reference(small_room):
 
 def test_a_scale_is_open_where_contact_makes_a_component_too_fast(small_room):
     sure, start = sure_of(small_room), small_room.start
-    other = start.tie != TIES.index("reference")
-    fast = int(start.component[other][0])
-    one = start.component == fast
+    tied = start.tie != TIES.index("reference")
+    fast = int(start.component[tied][0])
+    moving = start.component == fast
 
     def scale(ratio):
-        far = np.where(one, ratio, 1.0)
+        far = np.where(moving, ratio, 1.0)
         return scale_by_contact(sure.marginals, start, small_room.segmentation.sizes, far)
 
     usual = scale(1.0)
     np.testing.assert_array_equal(scale(np.exp(0.9 * USUAL)), usual)
-    np.testing.assert_allclose(scale(5.0)[one], np.hypot(usual[one], np.log(5.0)))
-    # the others stay where they are
-    np.testing.assert_array_equal(scale(5.0)[~one], usual[~one])
+    np.testing.assert_allclose(scale(5.0)[moving], np.hypot(usual[moving], np.log(5.0)))
+    # the other components do not change
+    np.testing.assert_array_equal(scale(5.0)[~moving], usual[~moving])
 
 
 def test_a_camera_at_rest_leaves_everything_a_guess_that_keeps_its_order(small_room):
@@ -299,14 +303,14 @@ def test_a_camera_at_rest_leaves_everything_a_guess_that_keeps_its_order(small_r
     moving, resting = sure_of(small_room).sigma, sure_of(rests).sigma
     least = GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)
     assert least <= resting.min() <= resting.max() <= SIGMA_PRIOR
-    known = moving < MOST_SIGMA
-    assert np.all(np.diff(resting[known][np.argsort(moving[known])]) > -1e-9)
+    sure = moving < MOST_SIGMA
+    assert np.all(np.diff(resting[sure][np.argsort(moving[sure])]) > -1e-9)
     assert np.unique(resting).size > 1000
 
 
 def test_where_surfaces_bend_nothing_is_surer_than_relief_without_parallax(small_room):
-    every = np.ones(len(small_room.soup), bool)
-    bends = replace(small_room, start=replace(small_room.start, bends=every))
+    all_bend = np.ones(len(small_room.soup), bool)
+    bends = replace(small_room, start=replace(small_room.start, bends=all_bend))
     limit = BENDING_SIGMA / np.hypot(1, BENDING_SIGMA / SIGMA_PRIOR)
     assert sure_of(bends).sigma.min() >= limit * (1 - 1e-9)
 

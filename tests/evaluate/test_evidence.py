@@ -1,4 +1,4 @@
-"""What two views say of depth: residuals of a turn, of a constant depth, and of the answer."""
+"""Evidence for depth: residuals of a turn, of a constant depth, and of the answer."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ def scene(case, depth: float, t: tuple[float, float, float], turn: float = 0.02,
     return soup, replace(case.data, pixel_target=target, pixel_weight=weight)
 
 
-def of(case, *args, **more):
-    soup, data = scene(case, *args, **more)
+def evidence_of(case, *args, **options):
+    soup, data = scene(case, *args, **options)
     return evidence(soup, data, np.zeros(len(soup), np.int64), NOISE)
 
 
 def test_parallax_of_a_scene_with_relief_is_evidence(small_room):
-    found = of(small_room, 0.4, (0.3, 0.0, 0.1))
-    assert found.solution[0] < 1e-9
-    assert found.gap[0] > LEAST_GAP_PX
-    assert not found.guess[0]
-    assert np.median(found.sigma) < 0.1
+    result = evidence_of(small_room, 0.4, (0.3, 0.0, 0.1))
+    assert result.solution[0] < 1e-9
+    assert result.gap[0] > LEAST_GAP_PX
+    assert not result.guess[0]
+    assert np.median(result.sigma) < 0.1
 
 
 @pytest.mark.parametrize(("depth", "t"), [(0.4, (0.0, 0.0, 0.0)), (0.0, (0.3, 0.0, 0.1))])
 def test_a_turn_and_a_constant_depth_are_no_evidence(small_room, depth, t):
-    found = of(small_room, depth, t)
-    assert found.gap[0] < 0.02
-    assert found.guess[0]
+    result = evidence_of(small_room, depth, t)
+    assert result.gap[0] < 0.02
+    assert result.guess[0]
 
 
 def test_a_turn_is_no_evidence_with_a_wrong_focal_length(small_room):
@@ -61,21 +61,23 @@ def test_a_turn_is_no_evidence_with_a_wrong_focal_length(small_room):
     K = data.K_next.copy()
     K[:2, :2] *= 1.3
     ray = data.pixel_ray / np.array([1.3, 1.3, 1.0])
-    found = evidence(
+    result = evidence(
         soup, replace(data, K_next=K, pixel_ray=ray), np.zeros(len(soup), np.int64), NOISE
     )
-    assert found.turn[0] < 0.02
-    assert found.guess[0]
+    assert result.turn[0] < 0.02
+    assert result.guess[0]
 
 
 def test_less_parallax_leaves_more_open(small_room):
-    near, far = (np.median(of(small_room, 0.3, (x, 0.0, 0.0)).sigma) for x in (0.3, 0.06))
+    near, far = (np.median(evidence_of(small_room, 0.3, (x, 0.0, 0.0)).sigma) for x in (0.3, 0.06))
     assert far > 3 * near
 
 
 def test_a_far_background_leaves_no_more_open_before_it(small_room):
-    """The ratio of depths before a sky and of the sky is open, but not those of the former."""
-    before, after = (of(small_room, 0.3, (0.3, 0.0, 0.1), far=far).sigma for far in (1, 1e4))
+    """The depth of the sky relative to the foreground is open, the foreground's relief is not."""
+    before, after = (
+        evidence_of(small_room, 0.3, (0.3, 0.0, 0.1), far=far).sigma for far in (1, 1e4)
+    )
     assert np.median(before[1::2]) < np.median(after[1::2]) < 0.02
     assert after[::2].min() > 0.4
 
@@ -83,8 +85,8 @@ def test_a_far_background_leaves_no_more_open_before_it(small_room):
 def test_what_motion_leaves_open_is_that_of_refitted_motions(small_room):
     """The linear prediction agrees with depths that follow a changed motion."""
     soup, data = scene(small_room, 0.3, (0.3, 0.0, 0.1))
-    found = evidence(soup, data, np.zeros(len(soup), np.int64), NOISE)
-    # a turn about y by so much that the flow changes by the systematic error at most
+    result = evidence(soup, data, np.zeros(len(soup), np.int64), NOISE)
+    # a turn about y that changes the flow by at most the systematic error
     error = 0.5 * NOISE
     w = np.array([0.0, error / data.K_next[0, 0], 0.0])
     X = np.einsum("nij,nj->ni", rotation.exp(w) @ soup.R, data.anchor_ray)
@@ -96,24 +98,26 @@ def test_what_motion_leaves_open_is_that_of_refitted_motions(small_room):
     z = -np.sum(a * b, axis=1) / np.sum(a * a, axis=1)
     change = np.log(z / soup.depth_at(data.anchor_ray))
     change -= change.mean()
-    # this change is one of those that the error leaves open
-    assert np.sqrt(np.mean(change**2)) < 3 * np.sqrt(np.mean(found.sigma**2))
+    # the systematic error does not exclude this change
+    assert np.sqrt(np.mean(change**2)) < 3 * np.sqrt(np.mean(result.sigma**2))
 
 
 def test_the_uncertain_focal_length_counts_in_squares(small_room):
     soup, data = scene(small_room, 0.3, (0.3, 0.0, 0.1))
     component = np.zeros(len(soup), np.int64)
-    given, some, twice = (evidence(soup, data, component, NOISE, x).sigma for x in (0.0, 0.2, 0.4))
-    np.testing.assert_array_equal(given, evidence(soup, data, component, NOISE).sigma)
-    assert np.median(some) > 1.5 * np.median(given)
-    np.testing.assert_allclose(twice**2 - given**2, 4 * (some**2 - given**2), rtol=1e-9)
+    exact, uncertain, doubled = (
+        evidence(soup, data, component, NOISE, x).sigma for x in (0.0, 0.2, 0.4)
+    )
+    np.testing.assert_array_equal(exact, evidence(soup, data, component, NOISE).sigma)
+    assert np.median(uncertain) > 1.5 * np.median(exact)
+    np.testing.assert_allclose(doubled**2 - exact**2, 4 * (uncertain**2 - exact**2), rtol=1e-9)
 
 
 def test_a_component_without_flow_is_a_guess(small_room):
     soup, data = scene(small_room, 0.4, (0.3, 0.0, 0.1))
     component = (np.arange(len(soup)) >= len(soup) - 5).astype(np.int64)
     weight = np.where(component[:, None] == 1, 0.0, data.pixel_weight)
-    found = evidence(soup, replace(data, pixel_weight=weight), component, NOISE)
-    assert found.guess.tolist() == [False, True]
-    assert found.rows()[1]["turn_px"] is None
-    assert np.isinf(found.sigma[component == 1]).all()
+    result = evidence(soup, replace(data, pixel_weight=weight), component, NOISE)
+    assert result.guess.tolist() == [False, True]
+    assert result.rows()[1]["turn_px"] is None
+    assert np.isinf(result.sigma[component == 1]).all()

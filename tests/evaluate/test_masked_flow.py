@@ -1,4 +1,4 @@
-"""Where a part of the flow is missing, depth is sane and unsure, and the rest stays as it is."""
+"""Where flow is missing, depth is plausible and uncertain; elsewhere it hardly changes."""
 
 from __future__ import annotations
 

@@ -93,15 +93,15 @@ def test_a_preset_finds_no_error_in_a_scaled_truth():
 
 
 def test_metrics_and_check_agree_at_the_delta_thresholds():
-    """The check of a result folder recounts the shares: both must say the same at the edge."""
+    """The check of a result folder recounts the shares: both must agree at the thresholds."""
     truth = np.arange(1.0, 200.0)
     for k in (1, 2, 3):
         for z in (truth * 1.25**k, truth / 1.25**k):
-            m, other = (
+            m, recomputed = (
                 depth_metrics(z, truth, scale="none"),
                 recompute.scores(z, truth, "none", None),
             )
-            assert [m.delta1, m.delta2, m.delta3] == [other[f"delta{j}"] for j in (1, 2, 3)]
+            assert [m.delta1, m.delta2, m.delta3] == [recomputed[f"delta{j}"] for j in (1, 2, 3)]
     exact = [1.25, 1.25**2, 1.25**3]
     m = depth_metrics(exact, np.ones(3), scale="none")
     assert [m.delta1, m.delta2, m.delta3] == [0.0, 1 / 3, 2 / 3]
@@ -179,7 +179,7 @@ def test_bad_input(kwargs, words):
 
 
 def test_eigens_clamp_comes_after_the_scale():
-    """Median ratio 2: of 10, 20, 30, 60 become 20, 40, 60, 120, and the last is held at 80."""
+    """Median ratio 2: 10, 20, 30, 60 become 20, 40, 60, 120, and the last is clamped to 80."""
     truth = np.full((100, 200), np.nan)
     estimate = np.full(truth.shape, np.nan)
     for k, (z, gt) in enumerate([(10.0, 20.0), (20.0, 40.0), (30.0, 60.0), (60.0, 40.0)]):
@@ -189,7 +189,7 @@ def test_eigens_clamp_comes_after_the_scale():
     assert m.n_pixels == 4
     assert m.mre == pytest.approx((80.0 - 40.0) / 40.0 / 4)
     assert m.rmse == pytest.approx(np.sqrt((80.0 - 40.0) ** 2 / 4))
-    # from below: what is scaled to nothing is held at a millimetre
+    # from below: an estimate near 0 is clamped to a millimetre
     estimate[60, 53] = 1e-6
     m = PRESETS["eigen80"].score(estimate, truth)
     assert m.log_rmse == pytest.approx(np.log(40.0 / 1e-3) / 2)
@@ -222,10 +222,10 @@ def test_presets_apply_cap_and_crop():
 
 def test_overlaps_of_components():
     true = np.array([[0, 0, 0, 0], [0, 1, 1, -1], [2, 2, 2, 2]])
-    found = np.array([[0, 0, 0, 0], [3, 3, 3, 3], [0, 0, 2, 2]])
-    # component 1 has two pixels, of which 3 covers both; 3 has one more that is known
-    assert component_overlaps(found, true) == {0: (0, 4 / 7), 1: (3, 2 / 3), 2: (2, 0.5)}
-    assert component_overlaps(found, np.full((3, 4), -1)) == {}
+    estimate = np.array([[0, 0, 0, 0], [3, 3, 3, 3], [0, 0, 2, 2]])
+    # label 3 covers both pixels of component 1 and one more pixel that is known
+    assert component_overlaps(estimate, true) == {0: (0, 4 / 7), 1: (3, 2 / 3), 2: (2, 0.5)}
+    assert component_overlaps(estimate, np.full((3, 4), -1)) == {}
 
 
 # --- sparsification and coverage ------------------------------------------------------------------
@@ -235,16 +235,16 @@ ERROR = np.linspace(0.0, 1.0, 1001)
 
 
 def test_the_errors_themselves_are_a_perfect_uncertainty():
-    found = sparsification(ERROR[::-1], 3 * ERROR[::-1])
-    assert found.ause == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_allclose(found.error, found.oracle)
-    assert found.kept[0] == 1.0
-    assert found.kept[-1] == LAST
-    assert len(found.kept) == STEPS
+    curve = sparsification(ERROR[::-1], 3 * ERROR[::-1])
+    assert curve.ause == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(curve.error, curve.oracle)
+    assert curve.kept[0] == 1.0
+    assert curve.kept[-1] == LAST
+    assert len(curve.kept) == STEPS
 
 
 def test_the_area_of_a_linear_error():
-    """The mean of what the oracle keeps is kept / 2; sorted the wrong way it is 1 - kept / 2."""
+    """The mean error kept by the oracle is kept / 2, in the reverse order 1 - kept / 2."""
     kept = np.linspace(1.0, LAST, STEPS)
     worst = sparsification(ERROR, -ERROR)
     np.testing.assert_allclose(worst.oracle, kept / 2, atol=2e-3)
@@ -253,12 +253,12 @@ def test_the_area_of_a_linear_error():
 
 
 def test_equal_uncertainties_are_chance_in_whatever_order_they_come():
-    one = sparsification(ERROR, np.ones(len(ERROR)))
-    np.testing.assert_allclose(one.error, ERROR.mean())
+    constant = sparsification(ERROR, np.ones(len(ERROR)))
+    np.testing.assert_allclose(constant.error, ERROR.mean())
     half = ERROR > 0.5
-    there, back = (sparsification(ERROR[::k], half[::k]) for k in (1, -1))
-    np.testing.assert_allclose(there.error, back.error)
-    assert 0 < there.ause < one.ause
+    forward, backward = (sparsification(ERROR[::k], half[::k]) for k in (1, -1))
+    np.testing.assert_allclose(forward.error, backward.error)
+    assert 0 < forward.ause < constant.ause
 
 
 def test_no_error_has_no_area():

@@ -1,4 +1,4 @@
-"""Flow that tells nothing of depth, or nothing at all: the start says so and reproduces it."""
+"""Flow without parallax or without confidence: depth is borrowed, the flow is reproduced."""
 
 from __future__ import annotations
 

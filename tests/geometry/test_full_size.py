@@ -74,7 +74,7 @@ def test_labels_grow_to_the_edges_of_the_image():
     grown = grown_labels(labels.astype(np.int32), small, image)
     blocks = cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)
     assert (blocks != inside).sum() > 200
-    # what is left are pixels whose neighbours of the small image all lie on the other side
+    # the remaining pixels have only neighbours of the other side in the small image
     assert (grown != inside).sum() < 0.1 * (blocks != inside).sum()
 
 
@@ -100,9 +100,9 @@ def test_a_large_pair_comes_back_at_its_size():
     assert done.pair.size[0] * done.pair.size[1] <= 12_500
     assert done.full.depth_ref.shape == (128, 256)
     assert done.full.labels.shape == (128, 256)
-    known = np.isfinite(done.full.depth_next)
-    assert known.mean() > 0.9
-    # finer edges lose nothing
+    covered = np.isfinite(done.full.depth_next)
+    assert covered.mean() > 0.9
+    # the error does not grow at full size
     assert done.full.metrics.mre < 1.1 * done.metrics["solution"].mre
     assert "brought to 256x128" in facts(done)
     assert prepare(make_problem({**settings, "max_size": None})).original is None

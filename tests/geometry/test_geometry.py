@@ -102,8 +102,8 @@ def test_nearest_is_a_rotation_and_no_other_is_nearer(M, w):
     R = rotation.nearest(M)
     assert_rotations(R)
     gap = np.linalg.norm(M - R, axis=(1, 2))
-    other = rotation.exp(3 * w)[:, None] @ R[None]
-    assert (np.linalg.norm(M[None] - other, axis=(2, 3)) >= gap - 1e-9).all()
+    turned = rotation.exp(3 * w)[:, None] @ R[None]
+    assert (np.linalg.norm(M[None] - turned, axis=(2, 3)) >= gap - 1e-9).all()
 
 
 # --- planes ------------------------------------------------------------------------------------

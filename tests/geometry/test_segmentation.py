@@ -127,9 +127,9 @@ def test_knn_is_brute_force_nearest_first(seg):
     n, k = len(seg), 7
     d = np.linalg.norm(seg.anchors[:, None] - seg.anchors[None], axis=2)
     np.fill_diagonal(d, np.inf)
-    found = np.take_along_axis(d, seg.knn, axis=1)
+    nearest = np.take_along_axis(d, seg.knn, axis=1)
     # distances, not indices: a grid has ties
-    np.testing.assert_allclose(found, np.sort(d, axis=1)[:, :k], atol=1e-9)
+    np.testing.assert_allclose(nearest, np.sort(d, axis=1)[:, :k], atol=1e-9)
     assert (np.sort(seg.knn, axis=1)[:, 1:] != np.sort(seg.knn, axis=1)[:, :-1]).all()
     assert (seg.knn != np.arange(n)[:, None]).all()
 
@@ -147,8 +147,8 @@ def test_folded_edges_keep_every_direction(seg):
 @pytest.mark.parametrize("beta", [0.02, 0.0, 0.3])
 def test_edge_weight_is_equation_2(seg, image, beta):
     # 0.02 is the default
-    own = {} if beta == 0.02 else {"beta": beta}
-    seg = build_segmentation(seg.labels, image, neighbours=7, **own)
+    options = {} if beta == 0.02 else {"beta": beta}
+    seg = build_segmentation(seg.labels, image, neighbours=7, **options)
     i, k = seg.edges.T
     distance = np.linalg.norm(seg.anchors[i] - seg.anchors[k], axis=1)
     np.testing.assert_allclose(seg.edge_weight, seg.edge_multiplicity * np.exp(-beta * distance))
@@ -193,9 +193,9 @@ def test_shared_boundaries_and_w4_are_brute_force(seed):
     labels, image = small_labels(seed), noise(12, 10, seed)
     expected = brute_pairs(labels)
     seg = build_segmentation(labels, image, neighbours=1, beta_colour=0.7, boundary_samples=None)
-    found = [tuple(p) for p in seg.pairs.tolist()]
-    assert sorted(found) == sorted(expected)
-    for p, key in enumerate(found):
+    pairs = [tuple(p) for p in seg.pairs.tolist()]
+    assert sorted(pairs) == sorted(expected)
+    for p, key in enumerate(pairs):
         contact = expected[key]
         assert seg.boundary_length[p] == len(contact)
         middles = {tuple((np.array(a) + b)[::-1] / 2) for a, b in contact}
@@ -221,12 +221,12 @@ def test_rim_points_are_extreme_pixels_of_their_superpixel(seg):
     v, u = np.mgrid[0:height, 0:width]
     directions = seg.rim.shape[1]
     for i in range(len(seg)):
-        mine = seg.labels == i
+        inside = seg.labels == i
         for k in range(directions):
             angle = 2 * np.pi * k / directions
             ru, rv = seg.rim[i, k].astype(int)
-            assert mine[rv, ru]
-            reach = np.cos(angle) * u[mine] + np.sin(angle) * v[mine]
+            assert inside[rv, ru]
+            reach = np.cos(angle) * u[inside] + np.sin(angle) * v[inside]
             assert np.cos(angle) * ru + np.sin(angle) * rv == pytest.approx(reach.max())
 
 

@@ -26,20 +26,20 @@ def test_an_infinite_unary_cost_forbids_a_label():
     short = [u[keep] for u, keep in zip(unary, allowed)]
     cut = [t[np.ix_(allowed[a], allowed[b])] for (a, b), t in zip(edges, tables)]
     plain = followed(*padded(short, edges, cut), max_iter=6, **FOREVER)
-    other = followed(np.where(allowed, unary, np.inf), edges, tables, max_iter=6, **FOREVER)
-    np.testing.assert_allclose(other.bound_history, plain.bound_history, rtol=1e-12)
-    assert other.energy == pytest.approx(plain.energy)
-    assert allowed[np.arange(7), other.labels].all()
+    forbidding = followed(np.where(allowed, unary, np.inf), edges, tables, max_iter=6, **FOREVER)
+    np.testing.assert_allclose(forbidding.bound_history, plain.bound_history, rtol=1e-12)
+    assert forbidding.energy == pytest.approx(plain.energy)
+    assert allowed[np.arange(7), forbidding.labels].all()
 
 
 def test_parallel_edges_add_up_and_keep_the_bound():
     rng = np.random.default_rng(10)
     unary, edges, tables = dense(rng, 6, 8, 3)
-    twice = np.concatenate([edges, edges[[2, 5]], edges[[2, 7], ::-1]])
-    both = np.concatenate([tables, rng.normal(size=(4, 3, 3))])
-    result = followed(unary, twice, both, max_iter=50)
-    assert result.energy == pytest.approx(mrf_energy(result.labels, unary, twice, both))
-    least = brute(unary, twice, both)
+    all_edges = np.concatenate([edges, edges[[2, 5]], edges[[2, 7], ::-1]])
+    all_tables = np.concatenate([tables, rng.normal(size=(4, 3, 3))])
+    result = followed(unary, all_edges, all_tables, max_iter=50)
+    assert result.energy == pytest.approx(mrf_energy(result.labels, unary, all_edges, all_tables))
+    least = brute(unary, all_edges, all_tables)
     assert result.lower_bound <= least + 1e-9 <= result.energy + 2e-9
     assert rises(result)
 
@@ -132,10 +132,10 @@ def test_stops():
 def test_interruption_keeps_the_best(how):
     rng = np.random.default_rng(15)
     unary, edges, tables = dense(rng, 12, 50, 4)
-    seen = []
+    rows = []
 
     def callback(iteration, bound, energy, best):
-        seen.append((bound, energy, best))
+        rows.append((bound, energy, best))
         if iteration == 3:
             if how == "interrupt":
                 raise KeyboardInterrupt
@@ -144,7 +144,7 @@ def test_interruption_keeps_the_best(how):
 
     result = solve_trws(unary, edges, tables, callback=callback, **FOREVER)
     assert (result.status, result.iterations) == ("interrupted", 3)
-    bounds, energies, least = np.array(seen).T
+    bounds, energies, least = np.array(rows).T
     assert result.lower_bound == max(bounds)
     np.testing.assert_array_equal(least, np.minimum.accumulate(energies))
     assert result.energy == pytest.approx(least[-1])

@@ -1,4 +1,4 @@
-"""E_photo is its sum, knows neither scale nor exposure, and repairs what the flow says wrongly."""
+"""E_photo is its sum, depends on neither scale nor exposure, and corrects wrong flow."""
 
 from __future__ import annotations
 
@@ -56,8 +56,9 @@ class TwoPlanes:
         ref, nxt = back.copy(), np.roll(back, 4, axis=1)
         ref[:, 48:] = front[:, 48:]
         nxt[:, 56:] = front[:, 48:-8]
-        image, other = (np.repeat(x[..., None], 3, axis=2).astype(np.uint8) for x in (ref, nxt))
-        self.pair = Pair(image, other, K, K)
+        grey = np.stack([ref, nxt]).astype(np.uint8)
+        image, image_next = np.repeat(grey[..., None], 3, axis=3)
+        self.pair = Pair(image, image_next, K, K)
         self.labels = segment(image, 40, "grid")
         self.seg = build_segmentation(self.labels, image, 6, boundary_samples=2)
         n = len(self.seg)
@@ -86,7 +87,7 @@ class TwoPlanes:
 
 
 @pytest.fixture(scope="module")
-def two() -> TwoPlanes:
+def scene() -> TwoPlanes:
     return TwoPlanes()
 
 
@@ -110,134 +111,141 @@ def test_census_between_pixels_is_linear():
     np.testing.assert_allclose(census_at(layers, tall + 3, tall + 5)[:, -1, 0], layers[:, 5, 3])
 
 
-def test_costs_are_those_of_a_loop(two):
-    photo = two.look(two.truth, photo=7.0)
-    wrong = two.soup(np.where(two.near, 1.25, 1.7))
-    p = Particles.of(two.truth).joined(Particles.of(wrong))
-    found = photo.costs(p, 1.0)
-    ref, nxt = census(two.pair.image_ref), census(two.pair.image_next)
-    for i in range(0, two.count, 3):
-        at = np.flatnonzero(two.labels.ravel() == i)
+def test_costs_are_those_of_a_loop(scene):
+    photo = scene.look(scene.truth, photo=7.0)
+    wrong = scene.soup(np.where(scene.near, 1.25, 1.7))
+    p = Particles.of(scene.truth).joined(Particles.of(wrong))
+    costs = photo.costs(p, 1.0)
+    ref, nxt = census(scene.pair.image_ref), census(scene.pair.image_next)
+    for i in range(0, scene.count, 3):
+        at = np.flatnonzero(scene.labels.ravel() == i)
         at = at[((np.arange(SAMPLES) + 0.5) / SAMPLES * len(at)).astype(int)]
-        for c, depth in enumerate((two.truth.distance[i], wrong.distance[i])):
+        for c, depth in enumerate((scene.truth.distance[i], wrong.distance[i])):
             total = 0.0
             for v, u in zip(*np.divmod(at, WIDTH)):
                 x = u + 80.0 * SHIFT / depth
                 if x > WIDTH - 1 or depth >= BEHIND * photo.nearest[v, int(x + 0.5)]:
                     total += UNSEEN
                     continue
-                there = census_at(nxt, np.array([[x]]), np.array([[float(v)]]))[:, 0, 0]
-                total += min(np.abs(there - ref[:, v, u]).sum() / 16.0, TAU)
-            assert found[i, c] == pytest.approx(7.0 * total / SAMPLES, abs=1e-3)
+                sampled = census_at(nxt, np.array([[x]]), np.array([[float(v)]]))[:, 0, 0]
+                total += min(np.abs(sampled - ref[:, v, u]).sum() / 16.0, TAU)
+            assert costs[i, c] == pytest.approx(7.0 * total / SAMPLES, abs=1e-3)
 
 
-def test_energy_does_not_depend_on_scale(two):
-    photo = two.look(two.truth)
-    t = two.truth
+def test_energy_does_not_depend_on_scale(scene):
+    photo = scene.look(scene.truth)
+    t = scene.truth
     large = Soup(3 * t.lam, t.n, t.d, t.R, t.t)
     assert photo.energy(large) == pytest.approx(photo.energy(t), rel=1e-5)
 
 
-def test_blocks_do_not_show(two, monkeypatch):
-    photo = two.look(two.truth)
-    p = Particles.of(two.truth).joined(Particles.of(two.soup(np.full(two.count, 1.4))))
+def test_blocks_do_not_show(scene, monkeypatch):
+    photo = scene.look(scene.truth)
+    p = Particles.of(scene.truth).joined(Particles.of(scene.soup(np.full(scene.count, 1.4))))
     whole = photo.costs(p, 1.0)
     monkeypatch.setattr("soup_nlp.refine.photometric.BLOCK", 1)
     np.testing.assert_array_equal(photo.costs(p, 1.0), whole)
 
 
-def test_weight_zero_leaves_the_images_out(two):
+def test_weight_zero_leaves_the_images_out(scene):
     o = RefineOptions(photo=0)
-    assert photometric_term(two.pair, two.labels, two.truth, two.data(two.flow), o) is None
+    data = scene.data(scene.flow)
+    assert photometric_term(scene.pair, scene.labels, scene.truth, data, o) is None
 
 
-def test_sweep_finds_depths_that_the_start_does_not_have(two):
+def test_sweep_finds_depths_that_the_start_does_not_have(scene):
     rng = np.random.default_rng(0)
-    start = two.soup(np.exp(rng.uniform(np.log(0.8), np.log(3.0), two.count)))
-    found = swept(start, two.data(two.flow), two.look(start), 6, rng)
-    assert found.shape == (two.count, 6)
-    gap = np.abs(np.log(found.D / -found.n[..., 2] / two.truth.distance[:, None])).min(axis=1)
-    u = two.seg.anchors[:, 0]
+    start = scene.soup(np.exp(rng.uniform(np.log(0.8), np.log(3.0), scene.count)))
+    p = swept(start, scene.data(scene.flow), scene.look(start), 6, rng)
+    assert p.shape == (scene.count, 6)
+    gap = np.abs(np.log(p.D / -p.n[..., 2] / scene.truth.distance[:, None])).min(axis=1)
+    u = scene.seg.anchors[:, 0]
     assert np.median(gap[u < 85]) < 0.05
 
 
-def test_common_motions_are_those_of_the_components(two):
+def test_common_motions_are_those_of_the_components(scene):
     turn = rotation.exp(np.array([0.0, 0.05, 0.02]))
-    R = np.where(two.near[:, None, None], turn, np.eye(3))
-    soup = replace(two.truth, R=R)
-    found, shift = common_motions(soup, two.data(two.flow), 2, np.random.default_rng(0))
+    R = np.where(scene.near[:, None, None], turn, np.eye(3))
+    soup = replace(scene.truth, R=R)
+    rotations, shift = common_motions(soup, scene.data(scene.flow), 2, np.random.default_rng(0))
     assert shift.shape == (2, 3)
-    order = np.argsort(found[:, 0, 2])
-    np.testing.assert_array_equal(found[order], [np.eye(3), turn])
+    order = np.argsort(rotations[:, 0, 2])
+    np.testing.assert_array_equal(rotations[order], [np.eye(3), turn])
 
 
-def test_images_repair_what_the_flow_says_wrongly(two):
+def test_images_repair_what_the_flow_says_wrongly(scene):
     # a patch of the far plane has the near one's flow, at full confidence
-    lied = two.flow.uv.copy()
+    lied = scene.flow.uv.copy()
     lied[20:40, 10:30, 0] = 8.0
-    data, flow = two.data(two.flow), Flow(lied, two.flow.confidence, "lie")
-    bad = two.data(flow)
-    u, v = two.seg.anchors.T
+    data, flow = scene.data(scene.flow), Flow(lied, scene.flow.confidence, "lie")
+    bad = scene.data(flow)
+    u, v = scene.seg.anchors.T
     patch = (u > 12) & (u < 28) & (v > 22) & (v < 38)
-    depth = np.where(patch, NEAR, two.truth.distance)
-    start, w = two.soup(depth), Weights()
-    photo = two.look(start)
-    done = refine_soup(start, bad, w, OPTIONS, start=two.truth, photo=photo, seed=0)
+    depth = np.where(patch, NEAR, scene.truth.distance)
+    start, w = scene.soup(depth), Weights()
+    photo = scene.look(start)
+    done = refine_soup(start, bad, w, OPTIONS, start=scene.truth, photo=photo, seed=0)
     totals = [done.energy_begin["total"], *(r.energy["total"] for r in done.rounds)]
     assert (np.diff(totals) <= 0).all()
     assert done.energy == objective(done.soup, bad, w, photo)
-    assert done.energy_start == objective(two.truth, bad, w, photo)
-    scale = np.median(two.truth.distance / done.soup.distance)
-    error = np.abs(scale * done.soup.depth_at(data.anchor_ray) / two.truth.distance - 1)
+    assert done.energy_start == objective(scene.truth, bad, w, photo)
+    scale = np.median(scene.truth.distance / done.soup.distance)
+    error = np.abs(scale * done.soup.depth_at(data.anchor_ray) / scene.truth.distance - 1)
     assert error[patch].max() < 0.1
     alone = refine_soup(start, bad, w, OPTIONS, seed=0)
-    scale = np.median(two.truth.distance / alone.soup.distance)
+    scale = np.median(scene.truth.distance / alone.soup.distance)
     assert np.abs(scale * alone.soup.depth_at(data.anchor_ray)[patch] / FAR - 1).min() > 0.3
 
 
-def test_objective_is_e_without_images_and_e_plus_e_photo_where_they_agree(two):
-    data, w = two.data(two.flow), Weights(proj=2.0)
-    assert objective(two.truth, data, w) == oracle.energy(two.truth, data, w)
-    photo = replace(two.look(two.truth), contradicted=np.zeros(two.count, bool))
-    own = objective(two.truth, data, w, photo)
-    assert own["photo"] == pytest.approx(photo.energy(two.truth))
-    E = oracle.energy(two.truth, data, w)
-    assert own == pytest.approx({**E, "total": E["total"] + own["photo"], "photo": own["photo"]})
+def test_objective_is_e_without_images_and_e_plus_e_photo_where_they_agree(scene):
+    data, w = scene.data(scene.flow), Weights(proj=2.0)
+    assert objective(scene.truth, data, w) == oracle.energy(scene.truth, data, w)
+    photo = replace(scene.look(scene.truth), contradicted=np.zeros(scene.count, bool))
+    terms = objective(scene.truth, data, w, photo)
+    assert terms["photo"] == pytest.approx(photo.energy(scene.truth))
+    E = oracle.energy(scene.truth, data, w)
+    assert terms == pytest.approx(
+        {**E, "total": E["total"] + terms["photo"], "photo": terms["photo"]}
+    )
 
 
-def test_e_proj_is_weaker_and_truncated_only_where_the_images_contradict(two):
-    data, w = two.data(two.flow), Weights(proj=2.0)
-    contradicted = np.arange(two.count) % 3 == 0
-    photo = replace(two.look(two.truth), contradicted=contradicted)
-    wrong = two.soup(np.full(two.count, 0.6 * FAR))
+def test_e_proj_is_weaker_and_truncated_only_where_the_images_contradict(scene):
+    data, w = scene.data(scene.flow), Weights(proj=2.0)
+    contradicted = np.arange(scene.count) % 3 == 0
+    photo = replace(scene.look(scene.truth), contradicted=contradicted)
+    wrong = scene.soup(np.full(scene.count, 0.6 * FAR))
     full = 2.0 * oracle.reprojection(wrong, data, w)
     weak = 0.6 * oracle.reprojection(wrong, data, w.replace(sigma_proj=2.0))
     assert full.max() > 4.0
     expected = np.where(contradicted, weak, full)
-    found, _ = photo.costs_of_flow(Particles.of(wrong), data, w)
-    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-12)
+    costs, _ = photo.costs_of_flow(Particles.of(wrong), data, w)
+    np.testing.assert_allclose(costs[:, 0], expected, rtol=1e-12)
     assert objective(wrong, data, w, photo)["proj"] == pytest.approx(expected.sum())
 
 
-def test_images_contradict_where_a_soup_follows_a_wrong_flow(two):
-    data = two.data(two.flow)
-    patch = np.zeros(two.count, bool)
-    patch[np.unique(two.labels[20:40, 10:30])] = True
-    wrong = two.soup(np.where(patch, NEAR, two.truth.distance))
-    found = two.look(wrong).contradicted
-    assert found[patch].all()
-    # besides, only what leaves the view or is hidden
-    u = two.seg.anchors[:, 0]
-    assert not found[~patch & ((u < 38) | ((u > 58) & (u < 76)))].any()
+def test_images_contradict_where_a_soup_follows_a_wrong_flow(scene):
+    data = scene.data(scene.flow)
+    patch = np.zeros(scene.count, bool)
+    patch[np.unique(scene.labels[20:40, 10:30])] = True
+    wrong = scene.soup(np.where(patch, NEAR, scene.truth.distance))
+    contradicted = scene.look(wrong).contradicted
+    assert contradicted[patch].all()
+    # apart from these, only superpixels that leave the view or are hidden
+    u = scene.seg.anchors[:, 0]
+    assert not contradicted[~patch & ((u < 38) | ((u > 58) & (u < 76)))].any()
     nothing = replace(data, pixel_weight=np.zeros_like(data.pixel_weight))
-    assert not two.look(wrong).disagreeing(wrong, nothing).any()
+    assert not scene.look(wrong).disagreeing(wrong, nothing).any()
 
 
-def test_one_round_is_enough_where_images_and_flow_agree(two):
-    data, w = two.data(two.flow), Weights()
-    photo = two.look(two.truth)
+def test_one_round_is_enough_where_images_and_flow_agree(scene):
+    data, w = scene.data(scene.flow), Weights()
+    photo = scene.look(scene.truth)
     o = OPTIONS.replace(stagnation=0.0)
-    done = refine_soup(two.truth, data, w, o, photo=replace(photo, contradicted=np.zeros(40, bool)))
+    done = refine_soup(
+        scene.truth, data, w, o, photo=replace(photo, contradicted=np.zeros(40, bool))
+    )
     assert (done.status, len(done.rounds), done.contradicted) == ("agreed", 1, 0)
-    done = refine_soup(two.truth, data, w, o, photo=replace(photo, contradicted=np.ones(40, bool)))
+    done = refine_soup(
+        scene.truth, data, w, o, photo=replace(photo, contradicted=np.ones(40, bool))
+    )
     assert (done.status, len(done.rounds), done.contradicted) == ("rounds", 3, 40)

@@ -1,4 +1,4 @@
-"""Particles are feasible and mean what they say; rounds never raise E, and they find repairs."""
+"""Proposals are feasible and of the right size; rounds never raise E and repair superpixels."""
 
 from __future__ import annotations
 
@@ -75,11 +75,11 @@ class Planar:
         self.data = in_pixels(data, self.truth, seg)
         self.bad = rng.choice(n, broken, replace=False)
         m = {k: getattr(self.truth, k).copy() for k in ("lam", "n", "d", "R", "t")}
-        other = random_soup(seed + 7, n)
+        random = random_soup(seed + 7, n)
         for i in self.bad:
-            m["n"][i], m["R"][i] = other.n[i], other.R[i]
+            m["n"][i], m["R"][i] = random.n[i], random.R[i]
             m["d"][i] *= np.exp(rng.normal(0, 0.3))
-            m["t"][i] = other.t[i] * other.lam[i]
+            m["t"][i] = random.t[i] * random.lam[i]
         self.soup = Soup(**m)
 
 
@@ -120,7 +120,7 @@ def test_neighbours_on_one_plane_propose_that_plane(kind):
     same = np.abs(p.n - truth.n[:, None]).max(axis=2) < 1e-9
     same &= np.abs(p.D - truth.distance[:, None]) < 1e-9
     same &= np.abs(p.T - truth.translation[:, None]).max(axis=2) < 1e-9
-    # all but those beside the other component find themselves
+    # all superpixels except those beside the other component propose their own plane
     assert same.any(axis=1).mean() > 0.8
     assert same.mean() > 0.5
 
@@ -128,9 +128,9 @@ def test_neighbours_on_one_plane_propose_that_plane(kind):
 @pytest.mark.parametrize("total", [0, 1, 7, 49])
 def test_proposals_are_split_by_shares(total):
     shares = {**WALKS, **NEIGHBOURS}
-    found = counts(shares, total)
-    assert sum(found.values()) == total
-    for kind, count in found.items():
+    split = counts(shares, total)
+    assert sum(split.values()) == total
+    for kind, count in split.items():
         assert abs(count - total * shares[kind] / sum(shares.values())) <= 1
 
 
@@ -187,7 +187,7 @@ def test_broken_superpixels_are_repaired_by_their_neighbours():
     done = refine_soup(scene.soup, scene.data, weights, FEW.replace(particles=30), seed=0)
     assert done.energy["total"] < truth + 0.05 * (begin - truth)
     ratio = done.soup.depth_at(scene.data.anchor_ray) / scene.truth.depth_at(scene.data.anchor_ray)
-    # what remains is the scale between the two components, which two views do not determine
+    # two views do not determine the ratio of the scales of the two components
     for component in (scene.left, ~scene.left):
         assert np.abs(ratio[component] / np.median(ratio[component]) - 1).max() < 1e-3
 
@@ -195,8 +195,8 @@ def test_broken_superpixels_are_repaired_by_their_neighbours():
 def test_a_soup_at_its_optimum_is_left_alone():
     scene = Planar()
     # one plane under one motion with exact flow: E is 0
-    one = np.zeros(len(scene.truth), int)
-    same = Soup(*(v[one] for v in vars(scene.truth).values()))
+    first = np.zeros(len(scene.truth), int)
+    same = Soup(*(v[first] for v in vars(scene.truth).values()))
     y = same.moved(same.points(scene.data.pixel_ray.reshape(len(same), -1, 3)))
     data = replace(scene.data, pixel_target=camera.project(K_NEXT, y))
     # a slanted plane has relief, which E_prior charges
@@ -240,7 +240,7 @@ def test_interruption_and_time_limit_keep_the_best():
     [("stop", "interrupted"), ("interrupt", "interrupted"), ("wait", "time limit")],
 )
 def test_a_listener_can_end_a_round(what, status, monkeypatch):
-    """By the stop event or a KeyboardInterrupt, which TRW-S keeps to itself; or it takes long."""
+    """By the stop event, by a KeyboardInterrupt, which TRW-S catches, or by the time limit."""
     # TRW-S does not stop at a gap
     monkeypatch.setattr(mppbp, "TRWS_GAP", -1.0)
     tiny, stop, heard = Tiny("pixels", samples=6), threading.Event(), []
@@ -278,7 +278,7 @@ def test_few_particles_and_isolated_superpixels_work(particles):
 
 @pytest.mark.parametrize("chosen", [[0], [3, 7], range(6), range(12)])
 def test_the_mrf_follows_a_change_of_length_unit(chosen):
-    """In the paper's units every depth changes the unit of all: its price is in the unary costs."""
+    """In the paper's units every depth changes the length unit: unary costs contain that change."""
     tiny = Tiny(samples=6)
     data, weights = tiny.data, weights_for("paper", truncated=False)
     best = tiny.soup.normalised(data.share).retracted()
@@ -296,7 +296,7 @@ def test_the_mrf_follows_a_change_of_length_unit(chosen):
     exact = [oracle.energy(x, data, weights)["total"] for x in soups]
     share = data.share * best.distance
     unit = share[list(chosen)].sum() / share.sum()
-    # to first order; what the unit adds is much more than what is neglected
+    # to first order: the neglected terms are much smaller than the effect of the unit
     slope = mppbp.length_slope(best, data, weights)
     assert abs(np.diff(mrf)[0] - np.diff(exact)[0]) < 0.02 * abs(slope * h * unit)
 

@@ -36,7 +36,7 @@ def solve(folder: Path, *options: str) -> tuple[int, dict]:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory) -> Path:
+def result(tmp_path_factory) -> Path:
     """A result folder."""
     out = tmp_path_factory.mktemp("both")
     # a noise that the images contradict (otherwise one round is enough), too large for depth
@@ -44,8 +44,8 @@ def both(tmp_path_factory) -> Path:
     return out
 
 
-def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(both):
-    summary = json.loads((both / "summary.json").read_text())
+def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(result):
+    summary = json.loads((result / "summary.json").read_text())
     E = summary["energy"]
     assert E["nlp"]["total"] < E["start"]["total"]
     assert set(summary["metrics"]) >= {"start", "nlp", "solution", "constant"}
@@ -55,7 +55,7 @@ def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(both):
     assert len(r["rounds"]) == 3
     assert r["end"]["total"] < r["begin"]["total"]
     assert r["rounds"][-1]["energy"] == r["end"]
-    # the images have a say in what is lowered, the smooth terms of E are the same
+    # the objective has E_photo and a weaker E_proj, but the smooth terms of E
     smooth = {term: E["solution"][term] for term in ("arap", "cont", "orient")}
     assert {term: r["end"][term] for term in smooth} == pytest.approx(smooth, rel=1e-9)
     assert r["end"]["photo"] < r["begin"]["photo"]
@@ -63,33 +63,33 @@ def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(both):
     assert 0 < r["contradicted"] <= summary["sizes"]["superpixels"]
     assert set(r["rounds"][0]["accepted"]) == set(KINDS)
     assert r["end"].keys() >= {"total", *PAPER_TERMS, "prior"}
-    with h5py.File(both / "result.h5") as file:
+    with h5py.File(result / "result.h5") as file:
         for term in r["end"]:
             values = file[f"refine/energy_{term}"][:]
-            assert list(values) == [one["energy"][term] for one in r["rounds"]]
+            assert list(values) == [record["energy"][term] for record in r["rounds"]]
         assert file["refine/accepted"].shape == (3, len(KINDS))
         assert (file["refine/bound"][:] <= file["refine/mrf_energy"][:] + 1e-9).all()
         assert file["depth/nlp_ref"].shape == file["depth/ref"].shape
         assert np.abs(file["nlp/R"][:] - file["solution/R"][:]).max() > 0
-    assert check_folder(both).ok
+    assert check_folder(result).ok
 
 
-def test_the_verdict_tells_energy_gap_and_both_depths(both):
-    text = (both / "log.txt").read_text()
+def test_the_verdict_tells_energy_gap_and_both_depths(result):
+    text = (result / "log.txt").read_text()
     assert "refinement 3 rounds" in text
     assert "above the best among its particles" in text
     assert "NLP alone" in text
-    r = json.loads((both / "summary.json").read_text())["refinement"]
+    r = json.loads((result / "summary.json").read_text())["refinement"]
     rows = text[text.index("E + E_photo\n") :].splitlines()[1:4]
     for row, stage in zip(rows, ("start", "begin", "end")):
         assert float(row.split()[-1]) == pytest.approx(r[stage]["total"], rel=1e-4)
     told = " ".join(text.split())
     assert f"the images contradict the flow at {r['contradicted']} superpixels" in told
-    assert (both / "log.txt").read_text().count("refine ") >= 3
+    assert (result / "log.txt").read_text().count("refine ") >= 3
 
 
-def test_a_changed_history_is_found(both, tmp_path):
-    shutil.copytree(both, tmp_path, dirs_exist_ok=True)
+def test_a_changed_history_is_found(result, tmp_path):
+    shutil.copytree(result, tmp_path, dirs_exist_ok=True)
     path = tmp_path / "summary.json"
     told = json.loads(path.read_text())
     for change in (

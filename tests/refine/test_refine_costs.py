@@ -17,17 +17,17 @@ from soup_nlp.refine.particles import Particles, anchor_depth, within_reach
 
 
 def cloud(tiny: Tiny, labels: int, seed: int = 3, spread: float = 1.0) -> Particles:
-    """So many random soups as particles; particle 0 is the tiny soup."""
+    """Particles of `labels` soups: the tiny soup first, then random ones."""
     n = len(tiny.soup)
-    others = [Particles.of(random_soup(seed + k, n, spread)) for k in range(labels - 1)]
-    return Particles.of(tiny.soup).joined(*others)
+    random = [Particles.of(random_soup(seed + k, n, spread)) for k in range(labels - 1)]
+    return Particles.of(tiny.soup).joined(*random)
 
 
 def chosen(p: Particles, labels: np.ndarray) -> Soup:
     """The soup of labels, in the length unit of its particles."""
-    own = p.take(labels[:, None])
-    one = np.ones(len(labels))
-    return Soup(one, own.n[:, 0], own.D[:, 0], own.R[:, 0], own.T[:, 0])
+    picked = p.take(labels[:, None])
+    ones = np.ones(len(labels))
+    return Soup(ones, picked.n[:, 0], picked.D[:, 0], picked.R[:, 0], picked.T[:, 0])
 
 
 def assembled(costs: PairCosts, p: Particles, labels: np.ndarray, unit: float = 1.0) -> float:
@@ -57,7 +57,7 @@ def test_costs_of_chosen_labels_are_the_exact_energy(units, at_anchors, truncate
         unit = float(np.sum(tiny.data.share * soup.distance))
         exact = oracle.energy(soup, tiny.data, weights)["total"]
         assert assembled(costs, p, labels, unit) == pytest.approx(exact, rel=1e-12)
-        # and the soup that is delivered has the same energy: E does not depend on the scale
+        # the delivered soup has the same energy, because E does not depend on the scale
         delivered = oracle.energy(p.soup(labels, tiny.data.share), tiny.data, weights)["total"]
         assert delivered == pytest.approx(exact, rel=1e-12)
 
@@ -119,9 +119,9 @@ def test_visibility_is_that_of_the_nlp():
     rays = tiny.data.visibility_ray(5.0)
     assert feasible(p, rays, 1e-3).all()
     p.n[2, 1] = [0.0, 0.0, 1.0]
-    found = feasible(p, rays, 1e-3)
-    assert not found[2, 1]
-    assert found.sum() == found.size - 1
+    visible = feasible(p, rays, 1e-3)
+    assert not visible[2, 1]
+    assert visible.sum() == visible.size - 1
 
 
 def test_the_length_slope_is_the_derivative_of_the_energy():
@@ -145,12 +145,12 @@ def test_no_particle_runs_away_but_the_current_one_may_stay():
     p = Particles.of(far)
     p = p.joined(*(Particles(p.n, p.D * s, p.R, p.T) for s in (1.3, 100.0, 1e-3)))
     near = np.array([[j for j in range(n) if j != i][:6] for i in range(n)])
-    found = within_reach(p, far, near, tiny.data.anchor_ray, 2.0)
-    assert found[:, 0].all()
-    others = np.arange(n) != 3
-    assert found[others, 1].all()
-    assert not found[:, 2].any()
-    assert not found[others, 3].any()
-    # back to its neighbours is open to the one that ran away
-    assert found[3, 3]
+    allowed = within_reach(p, far, near, tiny.data.anchor_ray, 2.0)
+    assert allowed[:, 0].all()
+    unmoved = np.arange(n) != 3
+    assert allowed[unmoved, 1].all()
+    assert not allowed[:, 2].any()
+    assert not allowed[unmoved, 3].any()
+    # the distant superpixel may return to the depth of its neighbours
+    assert allowed[3, 3]
     assert anchor_depth(p, tiny.data.anchor_ray)[3, 3] < 2.0
