@@ -127,8 +127,8 @@ def test_moving_pixels_are_told_apart_under_one_scale():
         *(np.array([[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]]) for _ in range(2)),
         truth=Truth(depth_ref=depth, components=label),
     )
-    found = moving(pair, estimate, preset("paper"))
-    assert found == pytest.approx({"mre": 0.5 * 200 / 300, "rest": 0.0}, abs=1e-12)
+    errors = moving(pair, estimate, preset("paper"))
+    assert errors == pytest.approx({"mre": 0.5 * 200 / 300, "rest": 0.0}, abs=1e-12)
     still = replace(pair, truth=Truth(depth_ref=depth, components=0 * label))
     assert moving(still, estimate, preset("paper")) is None
 

@@ -49,7 +49,9 @@ def test_departures_are_all_differences_between_preset_and_defaults():
 @pytest.mark.parametrize("name", STUDIES)
 def test_the_variants_of_a_study_are_different_problems(name):
     variants = STUDIES[name].variants
-    assert len({item().problem(own).digest() for own in variants.values()}) == len(variants)
+    assert len({item().problem(overrides).digest() for overrides in variants.values()}) == len(
+        variants
+    )
 
 
 @pytest.mark.parametrize("departure", DEPARTURES, ids=lambda d: d.name)

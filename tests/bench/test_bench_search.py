@@ -36,12 +36,12 @@ SPACE = parse_space(TEXTS)
 
 def fake(cell: Cell) -> dict:
     """A row whose MRE is least at cont = 1e-3 and K = 12."""
-    given = dict(o.split("=", 1) for o in cell.overrides)
-    cont = float(given.get("energy.weights.cont", "0.1"))
-    k = float(given.get("segmentation.neighbours", "20"))
+    settings = dict(o.split("=", 1) for o in cell.overrides)
+    cont = float(settings.get("energy.weights.cont", "0.1"))
+    k = float(settings.get("segmentation.neighbours", "20"))
     mre = 0.02 * (1 + abs(math.log10(cont) + 3) + 0.1 * abs(k - 12))
-    own = {"solution": {"mre": mre}, "constant": {"mre": 0.4}}
-    return {"metrics": {cell.item.presets[0]: own}}
+    metrics = {"solution": {"mre": mre}, "constant": {"mre": 0.4}}
+    return {"metrics": {cell.item.presets[0]: metrics}}
 
 
 def broken(cell: Cell) -> dict:
@@ -103,8 +103,8 @@ def test_one_family_at_a_time_is_left_out():
     def frame(**trials: dict[str, float]) -> pd.DataFrame:
         lines = [
             {"variant": t, "sequence": f, "loss": math.log(mre)}
-            for t, own in trials.items()
-            for f, mre in own.items()
+            for t, mre_of_family in trials.items()
+            for f, mre in mre_of_family.items()
         ]
         return pd.DataFrame(lines)
 

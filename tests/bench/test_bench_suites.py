@@ -31,8 +31,8 @@ def test_a_suite_lists_the_pairs_whose_files_exist(tmp_path):
     for frame in frames:
         (base / f"frame_{frame:04d}.png").touch()
     (base / f"frame_{frames[0] + 1:04d}.png").touch()
-    found = list_suite("sintel", tmp_path / "data")
-    assert [(i.input["frame"], i.presets[0]) for i in found] == [(frames[0], "sintel70")]
+    listed = list_suite("sintel", tmp_path / "data")
+    assert [(i.input["frame"], i.presets[0]) for i in listed] == [(frames[0], "sintel70")]
 
 
 def test_a_pair_is_listed_with_every_flow_that_it_has(tmp_path):
@@ -40,8 +40,8 @@ def test_a_pair_is_listed_with_every_flow_that_it_has(tmp_path):
     assert flows == ["truth", "dis"]
     (tmp_path / "tum_fr1").mkdir()
     (tmp_path / "tum_fr1" / "frame_0.png").touch()
-    own = list_suite("shared", tmp_path)
-    assert {(i.name, i.flow) for i in own} == {
+    listed = list_suite("shared", tmp_path)
+    assert {(i.name, i.flow) for i in listed} == {
         ("motorcycle", "truth"), ("motorcycle", "dis"), ("tum_fr1", "dis"),
     }  # fmt: skip
 

@@ -201,8 +201,8 @@ def test_residuals_of_known_points(task):
     assert start.dual > 1e-2
     assert not start.within(task.limits)
     # multipliers that are not numbers are not used
-    found = examine(nlp, nlp.x0, np.full(nlp.ng, np.nan)).residuals
-    assert found.multipliers == "least squares"
+    residuals = examine(nlp, nlp.x0, np.full(nlp.ng, np.nan)).residuals
+    assert residuals.multipliers == "least squares"
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,7 @@ def test_residuals_of_known_points(task):
 def test_one_tolerance_decides_within_the_limit(
     changes, claimed, verified, exact, task, tmp_path, stub
 ):
-    stub(lambda given: replace(exact, **changes))
+    stub(lambda solved_task: replace(exact, **changes))
     (row,) = run(task, ["some"], tmp_path)
     assert (row["claimed"], row["verified"]) == (claimed, verified)
     late = changes.get("seconds", 0) > 20
@@ -226,7 +226,7 @@ def test_one_tolerance_decides_within_the_limit(
 
 
 def test_a_false_claim_is_seen(task, tmp_path, stub):
-    stub(lambda given: Answer(given.nlp.x0 + 1e-3, None, "optimal!", True, 1, 0.5))
+    stub(lambda solved_task: Answer(solved_task.nlp.x0 + 1e-3, None, "optimal!", True, 1, 0.5))
     (row,) = run(task, ["liar"], tmp_path)
     assert row["claimed"]
     assert not row["verified"]
@@ -237,10 +237,10 @@ def test_a_false_claim_is_seen(task, tmp_path, stub):
 
 
 def test_runs_resume_and_a_cut_line_is_run_again(task, tmp_path, stub):
-    calls = stub(lambda given: Answer(given.nlp.x0, None, "start", False, 0, 0.1))
+    calls = stub(lambda solved_task: Answer(solved_task.nlp.x0, None, "start", False, 0, 0.1))
 
-    def go(*names: str, given: Task = task) -> int:
-        return len(run(given, list(names), tmp_path))
+    def go(*names: str, with_task: Task = task) -> int:
+        return len(run(with_task, list(names), tmp_path))
 
     assert go("a", "b", "a") == 2
     assert go("a", "b", "c") == 3
@@ -250,12 +250,12 @@ def test_runs_resume_and_a_cut_line_is_run_again(task, tmp_path, stub):
     assert go("a", "b", "c") == 3
     assert calls == ["a", "b", "c", "c"]
     # other limits, other runs
-    assert go("a", given=replace(task, limits=replace(task.limits, tol=1e-3))) == 1
+    assert go("a", with_task=replace(task, limits=replace(task.limits, tol=1e-3))) == 1
     assert calls == ["a", "b", "c", "c", "a"]
 
 
 def test_rows_are_told_after_every_run_and_names_before(exact, task, tmp_path, stub):
-    stub(lambda given: exact)
+    stub(lambda solved_task: exact)
     seen: list[int] = []
     said: list[str] = []
     run(task, ["a", "b"], tmp_path, said.append, lambda rows: seen.append(len(rows)))

@@ -41,7 +41,12 @@ SMALL = [
 
 
 def row(
-    problem: str, solver: str, seconds: float, energy: float, verified: bool = True, **more: object
+    problem: str,
+    solver: str,
+    seconds: float,
+    energy: float,
+    verified: bool = True,
+    **fields: object,
 ) -> dict:
     return {
         "problem": problem, "superpixels": 10, "formulation": "f", "solver": solver,
@@ -49,7 +54,7 @@ def row(
         "energy_start": 9.0, "iterations": 3,
         "cpu_seconds": 1.0, "wall_seconds": 9.0, "peak_bytes": 1 << 20, "status": "a | b",
         "machine": "m", "versions": {"casadi": "3"}, "code": "1", "problem_hash": "0",
-        "start": "easy", "primal": 0.0, "limits": asdict(Limits()), **more,
+        "start": "easy", "primal": 0.0, "limits": asdict(Limits()), **fields,
     }  # fmt: skip
 
 
@@ -147,9 +152,9 @@ def test_a_minimum_is_reached_when_it_is_verified_and_near():
     assert reached(frame_of_runs(OF_FAMILY)).tolist() == [True, True, False, False, True]
     # lower than what was known is reached as well
     assert reached(frame_of_runs([family_row("one", "easy", 3.0)])).all()
-    found = summary(frame_of_runs(OF_FAMILY))[STUB]
-    runs = found.pop("runs")
-    assert found == {"tried_by": ["one", "two", "three"], "reached_by": ["one", "two"]}
+    entry = summary(frame_of_runs(OF_FAMILY))[STUB]
+    runs = entry.pop("runs")
+    assert entry == {"tried_by": ["one", "two", "three"], "reached_by": ["one", "two"]}
     assert runs["easy"]["two"] == [4.0001, 3.0, 60.0, True]
     assert runs["hard"] == {"one": [5.0, 1.0, 60.0, True], "two": [4.0003, 3.0, 60.0, True]}
 

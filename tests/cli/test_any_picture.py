@@ -45,12 +45,12 @@ def test_a_photo_is_turned_as_its_exif_says(orientation, suffix, tmp_path):
     np.testing.assert_allclose(pair.K_ref, [[80, 0, 79.5], [0, 80, 59.5], [0, 0, 1]])
     assert pair.focal_sigma == 0
     # axes of a given camera are unclear
-    given = {"input": {**source, "intrinsics": [200, 200, 79.5, 59.5]}, "base": str(tmp_path)}
+    raw = {"input": {**source, "intrinsics": [200, 200, 79.5, 59.5]}, "base": str(tmp_path)}
     if orientation == 1:
-        assert (make_problem(given).load_pair().image_ref == image).all()
+        assert (make_problem(raw).load_pair().image_ref == image).all()
     else:
         with pytest.raises(DataError, match="stored turned"):
-            make_problem(given).load_pair()
+            make_problem(raw).load_pair()
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +83,9 @@ def test_a_backward_flow_or_a_map_is_the_confidence(orbit):
     pair = problem(orbit).load_pair()
 
     def confidence(**besides):
-        own = problem(orbit, source="forward.flo", **besides)
-        assert set(besides.values()) <= {p.name for p in own.input_paths()}
-        return own.flow.load(pair, own.path).confidence
+        chosen = problem(orbit, source="forward.flo", **besides)
+        assert set(besides.values()) <= {p.name for p in chosen.input_paths()}
+        return chosen.flow.load(pair, chosen.path).confidence
 
     assert (confidence() == 1).all()
     checked = confidence(backward="backward.flo")
@@ -102,8 +102,8 @@ def test_confidence_that_does_not_fit_is_refused(orbit, tmp_path):
     pair = problem(orbit).load_pair()
 
     def load(**flow):
-        own = problem(orbit, **flow)
-        return own.flow.load(pair, own.path)
+        chosen = problem(orbit, **flow)
+        return chosen.flow.load(pair, chosen.path)
 
     with pytest.raises(ConfigError, match="file of a flow only"):
         load(source="dis", backward="backward.flo")

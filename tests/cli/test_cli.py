@@ -159,12 +159,12 @@ def images(tmp_path_factory) -> Path:
 
 def solve_files(images: Path, out: Path, **changes: str) -> int:
     options = {"ref": "a.png", "next": "b.png", "intrinsics": "144,144,79.5,59.5"} | changes
-    more = options.pop("sets", "segmentation.superpixels=40 segmentation.neighbours=6").split()
+    sets = options.pop("sets", "segmentation.superpixels=40 segmentation.neighbours=6").split()
     args = ["solve", "--out", str(out), "-q"]
     for key, value in options.items():
         path = key in ("ref", "next", "flow", "depth")
         args += [f"--{key.replace('_', '-')}", str(images / value) if path else value]
-    for item in more:
+    for item in sets:
         args += ["--set", item]
     return main(args)
 
@@ -242,36 +242,36 @@ def test_what_is_no_pair_and_no_result_is_refused(words, part, capsys):
 )
 def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
     monkeypatch.setattr("soup_nlp.cli.solve.certainty", lambda run: {"weak": 0.51})
-    own = {"status": "Solve_Succeeded", "solved": True, "guessed": 0.1, "mre": 0.1} | changes
+    outcome = {"status": "Solve_Succeeded", "solved": True, "guessed": 0.1, "mre": 0.1} | changes
     expected = SimpleNamespace(mre_at_most=0.2)
     fake = SimpleNamespace(
         refined=None,
-        solution=SimpleNamespace(status=own["status"]),
-        solved=own["solved"],
-        good=own["solved"] and own["guessed"] <= 0.5,
-        confidence=SimpleNamespace(guessed=own["guessed"]),
-        metrics={"solution": SimpleNamespace(mre=own["mre"])},
+        solution=SimpleNamespace(status=outcome["status"]),
+        solved=outcome["solved"],
+        good=outcome["solved"] and outcome["guessed"] <= 0.5,
+        confidence=SimpleNamespace(guessed=outcome["guessed"]),
+        metrics={"solution": SimpleNamespace(mre=outcome["mre"])},
         problem=SimpleNamespace(expected=expected),
     )
-    found = exit_code(fake, 0.2)
-    assert found[0] == code
-    assert part in found[1]
+    result = exit_code(fake, 0.2)
+    assert result[0] == code
+    assert part in result[1]
 
 
 def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch, capsys):
     """Results of two pairs frame_0, frame_1 do not replace each other, with and without --out."""
     monkeypatch.chdir(tmp_path)
-    for seed, place in enumerate(("a/clip", "b/clip")):
-        (tmp_path / place).mkdir(parents=True)
+    for seed, clip in enumerate(("a/clip", "b/clip")):
+        (tmp_path / clip).mkdir(parents=True)
         pair = render_scene("orbit", seed, 64, 48)
         for k, image in enumerate((pair.image_ref, pair.image_next)):
-            cv2.imwrite(f"{place}/frame_{k}.png", image)
+            cv2.imwrite(f"{clip}/frame_{k}.png", image)
     small = ["--superpixels=6", "--neighbours=3", "--no-refine", "-q", "--fov=50"]
     small += ["--set", "output.page=false"]
 
-    def solve(place: str, *more: str) -> int:
-        pair = ["--ref", f"{place}/frame_0.png", "--next", f"{place}/frame_1.png"]
-        return main(["solve", *pair, *small, *more])
+    def solve(clip: str, *arguments: str) -> int:
+        pair = ["--ref", f"{clip}/frame_0.png", "--next", f"{clip}/frame_1.png"]
+        return main(["solve", *pair, *small, *arguments])
 
     assert solve("a/clip") in (0, 1)
     assert solve("b/clip") in (0, 1)

@@ -60,11 +60,11 @@ def ctrl_c(times: int = 1, number: int = signal.SIGINT) -> None:
     [(SceneInput, "load"), (FlowOptions, "load"), (cases, "build_segmentation")],
 )
 def test_before_a_start_it_ends_after_the_stage(owner, stage, tmp_path, monkeypatch, capfd):
-    own = getattr(owner, stage)
+    original = getattr(owner, stage)
 
     def interrupted(*args, **kwargs):
         ctrl_c()
-        return own(*args, **kwargs)
+        return original(*args, **kwargs)
 
     monkeypatch.setattr(owner, stage, interrupted)
     assert solve(tmp_path / "out") == 130
@@ -107,11 +107,11 @@ def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeyp
 def test_sigterm_ends_like_ctrl_c(times, earlier, monkeypatch, capfd):
     before = (earlier / "result.h5").read_bytes()
     sent = iter([lambda: ctrl_c(times, signal.SIGTERM)])
-    own = solve_module.SolveLog.iteration
+    original = solve_module.SolveLog.iteration
     monkeypatch.setattr(
         solve_module.SolveLog,
         "iteration",
-        lambda *args: (next(sent, lambda: None)(), own(*args)),
+        lambda *args: (next(sent, lambda: None)(), original(*args)),
     )
     assert solve(earlier) == (1 if times == 1 else 130)
     assert "interrupt received" in capfd.readouterr().err
@@ -135,12 +135,12 @@ def test_a_second_one_in_the_solver_aborts_too(tmp_path, monkeypatch, capfd):
 
 
 def test_files_that_are_being_written_are_written(earlier, monkeypatch, capfd):
-    own, seen = folders.write_h5, []
+    original, seen = folders.write_h5, []
 
     def interrupted(*args):
         seen.append((earlier / "summary.json").exists())
         ctrl_c(3)
-        own(*args)
+        original(*args)
 
     monkeypatch.setattr(folders, "write_h5", interrupted)
     assert solve(earlier) == 0

@@ -64,8 +64,8 @@ def value(problem: Problem, key: str):
     return out
 
 
-def paper(*overrides: str, **more) -> Problem:
-    return make_problem({**SMALL, "preset": "paper", **more}, overrides)
+def paper(*overrides: str, **fields) -> Problem:
+    return make_problem({**SMALL, "preset": "paper", **fields}, overrides)
 
 
 def test_the_preset_is_what_the_paper_prints():
@@ -74,15 +74,15 @@ def test_the_preset_is_what_the_paper_prints():
     assert 5 <= problem.refine.rounds <= 10
     assert np.isfinite(problem.energy.weights.sigma_cont)
     # E is printed with the factor 1 of E_arap, here 1 / alpha1 times as much: a pixel costs 1
-    own = problem.energy.weights
-    assert (own.arap, own.proj, own.cont, own.orient) == (500.0, 1.0, 15.0, 0.1)
+    weights = problem.energy.weights
+    assert (weights.arap, weights.proj, weights.cont, weights.orient) == (500.0, 1.0, 15.0, 0.1)
 
 
 def test_every_option_of_the_preset_is_in_the_problem():
     problem = make_problem({"input": STREET, "preset": "paper"})
     for key, wanted in leaves(PRESETS["paper"]):
-        found = value(problem, key)
-        assert (list(found) if isinstance(found, tuple) else found) == wanted, key
+        actual = value(problem, key)
+        assert (list(actual) if isinstance(actual, tuple) else actual) == wanted, key
     assert problem == make_problem({"input": STREET, "preset": "paper"}, overrides_of("paper"))
 
 
@@ -170,16 +170,16 @@ def test_a_homography_has_its_own_motion_among_its_decompositions():
     grid = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 5), np.linspace(0, 0.2, 5)), axis=-1)
     ray = np.column_stack([grid.reshape(-1, 2), np.ones(25)])
     target = ray @ R.T + (ray @ m)[:, None] * t
-    own = Matches(ray, target / target[:, 2:], np.ones(25))
-    H = fit_homography(own)
-    found = in_front(H, ray)
-    assert 1 <= len(found) <= 2
-    off = [np.abs(p.motion.R - R).max() + np.abs(p.motion.t - t).max() for p in found]
-    best = found[int(np.argmin(off))]
+    matched = Matches(ray, target / target[:, 2:], np.ones(25))
+    H = fit_homography(matched)
+    patches = in_front(H, ray)
+    assert 1 <= len(patches) <= 2
+    off = [np.abs(p.motion.R - R).max() + np.abs(p.motion.t - t).max() for p in patches]
+    best = patches[int(np.argmin(off))]
     # OpenCV fits in single precision
     assert min(off) < 1e-3
     assert np.allclose(best.m, m, atol=1e-3)
-    assert np.allclose(plane_of(best.motion, own), m, atol=1e-3)
+    assert np.allclose(plane_of(best.motion, matched), m, atol=1e-3)
     assert fit_homography(Matches(ray[:5], target[:5], np.ones(5))) is None
 
 
@@ -197,8 +197,8 @@ def test_the_unit_of_length_is_the_sum_that_it_names(case, length):
     expected = oracle.continuity(start, bare, weights).sum() * start.distance.mean()
     larger = Soup(2 * start.lam, start.n, start.d, start.R, start.t)
     for soup in (start, larger):
-        found = oracle.continuity(soup, data, weights).sum() * unit
-        assert found == pytest.approx(expected, rel=1e-9)
+        total = oracle.continuity(soup, data, weights).sum() * unit
+        assert total == pytest.approx(expected, rel=1e-9)
 
 
 def test_walks_are_the_only_proposals_of_the_paper(case):

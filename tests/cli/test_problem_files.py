@@ -124,16 +124,16 @@ def test_show_prints_what_users_turn_and_what_differs(capsys):
 def sections(kind: type[Section]) -> list[type[Section]]:
     """A kind of section and all kinds in it that can be left out."""
     inner = [type(f.default) for f in kind.model_fields.values() if isinstance(f.default, Section)]
-    return [kind, *(found for one in inner for found in sections(one))]
+    return [kind, *(section for kind_inside in inner for section in sections(kind_inside))]
 
 
 def test_every_default_is_within_its_bounds():
     street = make_problem({"input": {"kind": "scene", "scene": "street"}}).input
     for section in sections(Problem):
         fields = {k: f for k, f in section.model_fields.items() if not f.is_required()}
-        own = {k: f.get_default(call_default_factory=True) for k, f in fields.items()}
-        made = section(**own, **({"input": street} if section is Problem else {}))
-        assert {k: getattr(made, k) for k in own} == own
+        defaults = {k: f.get_default(call_default_factory=True) for k, f in fields.items()}
+        made = section(**defaults, **({"input": street} if section is Problem else {}))
+        assert {k: getattr(made, k) for k in defaults} == defaults
 
 
 # --- what a new user meets first ------------------------------------------------------------------

@@ -77,8 +77,8 @@ def test_depth_is_scored_from_run_array_or_stored_result(run, tmp_path):
     run.save(tmp_path / "out")
     stored = soup_nlp.load(tmp_path / "out")
     for result in (run, run.reconstruction.depth_ref, stored, tmp_path / "out"):
-        found = soup_nlp.evaluate(result, truth)
-        assert found["solution"].mre == pytest.approx(run.metrics["solution"].mre, rel=1e-12)
+        scores = soup_nlp.evaluate(result, truth)
+        assert scores["solution"].mre == pytest.approx(run.metrics["solution"].mre, rel=1e-12)
     assert soup_nlp.evaluate(run, truth.astype(np.float32)).keys() == {
         "solution", "start", "rigid", "constant",
     }  # fmt: skip
@@ -92,8 +92,8 @@ def test_a_stored_result_has_what_its_run_has(run, tmp_path):
     run.save(tmp_path / "out")
     stored = soup_nlp.load(str(tmp_path / "out"))
     for name in ("depth_ref", "depth_next", "points_next", "sigma_ref"):
-        own, other = (getattr(x.reconstruction, name) for x in (run, stored))
-        np.testing.assert_allclose(other, own, rtol=1e-9)
+        computed, loaded = (getattr(x.reconstruction, name) for x in (run, stored))
+        np.testing.assert_allclose(loaded, computed, rtol=1e-9)
     np.testing.assert_allclose(stored.camera.matrix, run.camera.matrix, atol=1e-12)
     assert stored.metrics["solution"] == run.metrics["solution"]
     assert stored.summary["converged"] == run.solution.converged

@@ -50,17 +50,17 @@ def rendered(scene: str) -> Pair:
 
 @cache
 def case(scene: str, *overrides: str) -> Case:
-    own = problem(scene, *overrides)
+    chosen = problem(scene, *overrides)
     if not overrides or any(
         key.startswith(("start.", "segmentation.", "flow.", UNORDERED.split("=")[0]))
         for key in overrides
     ):
-        return prepare(own, pair=rendered(scene))
+        return prepare(chosen, pair=rendered(scene))
     # superpixels and start are those of the defaults
     c = case(scene)
-    data, weights = build_energy(own, c.pair, c.segmentation, c.start)
-    options = solver_options(own, c.start)
-    return replace(c, problem=own, data=data, weights=weights, options=options)
+    data, weights = build_energy(chosen, c.pair, c.segmentation, c.start)
+    options = solver_options(chosen, c.start)
+    return replace(c, problem=chosen, data=data, weights=weights, options=options)
 
 
 @pytest.mark.parametrize("scene", ["street", "room", "orbit"])
@@ -98,15 +98,15 @@ def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least,
 @pytest.mark.parametrize("seed", [1, 5])
 def test_a_rigid_room_does_not_bend_with_its_banner(seed):
     # surfaces without the cuts at smaller jumps: all of the image bends
-    own = problem("banner", f"input.seed={seed}")
-    start = prepare(own, pair=own.load_pair()).start
+    banner = problem("banner", f"input.seed={seed}")
+    start = prepare(banner, pair=banner.load_pair()).start
     assert 0.3 < start.bends.mean() < 0.4
 
 
 def test_a_banner_without_a_jump_along_its_outline_bends_by_itself():
-    # its outline has no discontinuity, and a motion between both has more inliers than the room's
-    own = problem("banner", "input.seed=3")
-    start = prepare(own, pair=own.load_pair()).start
+    # its outline has no discontinuity: a compromise motion has more inliers than that of the room
+    banner = problem("banner", "input.seed=3")
+    start = prepare(banner, pair=banner.load_pair()).start
     assert 0.25 < start.bends.mean() < 0.4
 
 
@@ -137,15 +137,15 @@ def test_what_bends_is_found_beside_rigid_surfaces():
 
 def test_regions_that_bend_have_their_own_weights_in_one_energy():
     c, rigid = case("banner"), case("banner", "start.bending=false")
-    own, bends = c.weights, c.start.bends
-    assert own == rigid.weights
+    weights, bends = c.weights, c.start.bends
+    assert weights == rigid.weights
     assert c.data.arap_at_anchors
     focal = float(c.data.K_next[0, 0])
     any_end = bends[c.data.edges].any(axis=1)
     np.testing.assert_allclose(c.data.rotation_scale, np.where(any_end, 1e-3, focal))
     both = bends[c.data.pairs].all(axis=1)
-    more = 4.0 * len(c) / 1000 / own.orient
-    np.testing.assert_allclose(c.data.orient_weight, np.where(both, 2.0 * more, 2.0))
+    orient_ratio = 4.0 * len(c) / 1000 / weights.orient
+    np.testing.assert_allclose(c.data.orient_weight, np.where(both, 2.0 * orient_ratio, 2.0))
     # elsewhere the weights are those of a scene without bending
     outside = ~bends[c.data.pairs].any(axis=1)
     np.testing.assert_array_equal(c.data.pair_weight[outside], c.segmentation.pair_weight[outside])
@@ -159,8 +159,8 @@ def test_both_kinds_of_regions_are_reconstructed_in_one_image():
     z = z * depth_metrics(z, truth.depth_ref).scale
     bends = truth.components == 1
     for mask, most in ((bends, 0.12), (~bends, 0.04)):
-        own = np.where(mask, truth.depth_ref, np.nan)
-        assert 1e-4 < depth_metrics(z, own, scale="none").mre < most
+        true_depth = np.where(mask, truth.depth_ref, np.nan)
+        assert 1e-4 < depth_metrics(z, true_depth, scale="none").mre < most
     assert depth_metrics(np.ones_like(z), truth.depth_ref).mre > 0.15
 
 
@@ -189,8 +189,8 @@ def test_a_turn_is_found_despite_wrong_focal_length_and_movers(turn, longer):
     target = target / target[..., 2:]
     moves = np.arange(len(target)) % 5 == 0
     target[moves, :, 0] += 20.0 / views.focal[0]
-    found, error = fit_turn(replace(views, target=target))
-    np.testing.assert_allclose(found, R, atol=2e-4)
+    R_fitted, error = fit_turn(replace(views, target=target))
+    np.testing.assert_allclose(R_fitted, R, atol=2e-4)
     assert error[~moves].max() < 0.1
     assert error[moves].min() > 15.0
     # no translation is made of it
@@ -254,10 +254,15 @@ def test_sheet_is_better_than_a_constant_depth():
 
 
 def test_weights_where_surfaces_bend_follow_those_that_are_set():
-    own = case("sheet").weights
-    assert (own.cont, own.prior, own.sigma_arap, own.leak_arap) == (0.05, 4.0, 1.0, 0.05)
+    weights = case("sheet").weights
+    assert (weights.cont, weights.prior, weights.sigma_arap, weights.leak_arap) == (
+        0.05,
+        4.0,
+        1.0,
+        0.05,
+    )
     half = case("sheet", "energy.weights.orient=2.5e-3").weights
-    assert half == own.replace(orient=0.5 * own.orient)
+    assert half == weights.replace(orient=0.5 * weights.orient)
     assert case("sheet", "energy.weights.leak_arap=0.5").weights.leak_arap == 1.0
 
 
@@ -278,25 +283,25 @@ def with_factors(c: Case, monkeypatch: pytest.MonkeyPatch, **factors: float) -> 
 )
 def test_little_holds_surfaces_together_across_discontinuities(ratio, graph, column, monkeypatch):
     c = case("sheet")
-    # no two alike
+    # no two factors are equal
     other = with_factors(c, monkeypatch, arap=1.0, cont=0.5, orient=0.75)
     i, k = getattr(c.data, graph).T
-    apart = c.start.surface[i] != c.start.surface[k]
-    assert 0 < apart.sum() < 0.3 * len(apart)
-    expected = np.where(apart, ratio, 1.0) * getattr(other.data, column)
+    across = c.start.surface[i] != c.start.surface[k]
+    assert 0 < across.sum() < 0.3 * len(across)
+    expected = np.where(across, ratio, 1.0) * getattr(other.data, column)
     np.testing.assert_allclose(getattr(c.data, column), expected, rtol=1e-12)
     # the discontinuities are the outline of the sheet
     component = majority(c.pair.truth, c.segmentation)[0]
-    assert (component[i] != component[k])[apart].mean() > 0.9
+    assert (component[i] != component[k])[across].mean() > 0.9
 
 
 def test_the_wall_behind_a_sheet_leaves_it_its_relief(monkeypatch):
     # without E_prior, which flattens what these factors leave free
     c = case("sheet", "energy.weights.prior=0.0", UNORDERED)
-    held = with_factors(c, monkeypatch, arap=1.0, cont=0.01, orient=1.0)
-    assert own_relief(c) < 0.7 * own_relief(held)
+    without_factors = with_factors(c, monkeypatch, arap=1.0, cont=0.01, orient=1.0)
+    assert own_relief(c) < 0.7 * own_relief(without_factors)
     # nor does the order that occlusion shows flatten it
-    assert own_relief(case("sheet", "energy.weights.prior=0.0")) < 0.7 * own_relief(held)
+    assert own_relief(case("sheet", "energy.weights.prior=0.0")) < 0.7 * own_relief(without_factors)
 
 
 def own_relief(c: Case) -> float:
@@ -336,9 +341,9 @@ def jumps(seg: Segmentation, column: float, size: np.ndarray, noise: float) -> n
 def test_a_gap_in_a_discontinuity_does_not_join_two_surfaces():
     seg = strip(10)
     left = seg.anchors[:, 0] < 40
-    apart = surfaces(jumps(seg, 40, np.array([2.0, 0.6]), 0.01), seg, 1.0)
+    surface = surfaces(jumps(seg, 40, np.array([2.0, 0.6]), 0.01), seg, 1.0)
     # one of two rows is whole at 1 px: half of the outline is a discontinuity
-    np.testing.assert_array_equal(apart == apart[0], left)
+    np.testing.assert_array_equal(surface == surface[0], left)
     whole = surfaces(jumps(seg, 40, np.array([0.9, 0.6]), 0.01), seg, 1.0)
     assert (whole == whole[0]).all()
 
@@ -349,5 +354,5 @@ def test_noise_does_not_cut_a_surface():
     jump = np.where(rng.random(len(seg.pairs)) < 0.3, 0.9, 0.4)
     assert (surfaces(jump, seg, 1.0) == surfaces(jump, seg, 1.0)[0]).all()
     # and it does not hide a discontinuity
-    apart = surfaces(np.maximum(jump, jumps(seg, 40, np.array([3.0, 2.0]), 0.0)), seg, 1.0)
-    np.testing.assert_array_equal(apart == apart[0], seg.anchors[:, 0] < 40)
+    surface = surfaces(np.maximum(jump, jumps(seg, 40, np.array([3.0, 2.0]), 0.0)), seg, 1.0)
+    np.testing.assert_array_equal(surface == surface[0], seg.anchors[:, 0] < 40)

@@ -75,16 +75,16 @@ def test_the_prior_holds_the_relief_over_the_ground(world):
     assert not both.all()
     rng = np.random.default_rng(0)
     rough = replace(soup, d=soup.d * rng.uniform(0.5, 2, 8))
-    held = over_ground(data, rough, grounded, 5 * data.prior_weight)
+    weighted = over_ground(data, rough, grounded, 5 * data.prior_weight)
     expected = np.where(both, 5.0, 1.0) * data.prior_weight
-    np.testing.assert_allclose(held.prior_weight, expected, rtol=1e-15)
-    np.testing.assert_allclose(oracle.prior(rough, held)[both], 0.0, atol=1e-12)
+    np.testing.assert_allclose(weighted.prior_weight, expected, rtol=1e-15)
+    np.testing.assert_allclose(oracle.prior(rough, weighted)[both], 0.0, atol=1e-12)
     np.testing.assert_array_equal(
-        oracle.prior(rough, held)[~both], oracle.prior(rough, data)[~both]
+        oracle.prior(rough, weighted)[~both], oracle.prior(rough, data)[~both]
     )
     # in another unit of length the same relief costs nothing either
     far = replace(rough, d=3.0 * rough.d)
-    np.testing.assert_allclose(oracle.prior(far, held)[both], 0.0, atol=1e-12)
+    np.testing.assert_allclose(oracle.prior(far, weighted)[both], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("factor", [10.0, 1e4])
@@ -129,11 +129,11 @@ def test_pairs_across_an_occlusion_weigh_less(world):
         np.testing.assert_array_equal(one.pair_weight, data.pair_weight, err_msg=why)
 
 
-def scales(z, own, far=0.01, **options):
-    """Scales found for fronto-parallel squares at depths z (r, c), of which `own` are a component.
+def scales(z, component, far=0.01, **options):
+    """Scales found for fronto-parallel squares at depths z (r, c) with a `component` (r, c).
 
-    Its own unit says 1, and that it moves by `far` where the scene moves by 1; everything else is
-    at its true depth.
+    In its own unit of length the component moves by `far` where the scene moves by 1; everything
+    else is at its true depth.
     """
     rows, columns = np.shape(z)
     v, u = np.mgrid[0 : 8 * rows, 0 : 8 * columns]
@@ -142,10 +142,10 @@ def scales(z, own, far=0.01, **options):
     seg = build_segmentation(labels, image, neighbours=4)
     n = rows * columns
     facing, still = np.tile([0, 0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
-    moved = np.where(np.ravel(own), far, 1.0)[:, None] * [n, 0.0, 0.0]
+    moved = np.where(np.ravel(component), far, 1.0)[:, None] * [n, 0.0, 0.0]
     soup = Soup(np.full(n, 1 / n), facing, n * np.ravel(z), still, moved)
-    found, _ = contact_scales(soup, np.ravel(own).astype(np.int64), seg, K, **options)
-    return found.reshape(rows, columns)
+    scale_found, _ = contact_scales(soup, np.ravel(component).astype(np.int64), seg, K, **options)
+    return scale_found.reshape(rows, columns)
 
 
 def thrice(cells):
@@ -180,27 +180,27 @@ CONTACTS = {
 }
 
 
-@pytest.mark.parametrize(("z", "own", "scale"), CONTACTS.values(), ids=CONTACTS)
-def test_a_component_has_the_depth_of_what_it_touches(z, own, scale):
-    own = thrice(own)
-    found = scales(thrice(z), own)
-    np.testing.assert_allclose(found, np.where(own > 0, scale, 1.0), rtol=1e-12)
+@pytest.mark.parametrize(("z", "component", "scale"), CONTACTS.values(), ids=CONTACTS)
+def test_a_component_has_the_depth_of_what_it_touches(z, component, scale):
+    component = thrice(component)
+    scale_found = scales(thrice(z), component)
+    np.testing.assert_allclose(scale_found, np.where(component > 0, scale, 1.0), rtol=1e-12)
 
 
 def test_without_a_vertical_the_longest_contact_comes_first():
-    # which way is down is not known: the wall, which the tall one touches first
-    own = thrice(TOWER_OF)
-    found = scales(thrice(TOWER), own, upright=False)
-    np.testing.assert_allclose(found[own == 2], 8.0, rtol=1e-12)
-    z, own, _ = CONTACTS["ground"]
-    np.testing.assert_allclose(scales(thrice(z), thrice(own), upright=False), 1.0, rtol=1e-12)
+    # the vertical is not known: the tall component touches the wall first
+    component = thrice(TOWER_OF)
+    scale_found = scales(thrice(TOWER), component, upright=False)
+    np.testing.assert_allclose(scale_found[component == 2], 8.0, rtol=1e-12)
+    z, component, _ = CONTACTS["ground"]
+    np.testing.assert_allclose(scales(thrice(z), thrice(component), upright=False), 1.0, rtol=1e-12)
 
 
 def test_a_car_has_room_between_its_wheels():
-    """Of what lies below the lowest counts most: the wheels' ground, not what is seen under it."""
+    """The lowest contact counts most: the ground at the wheels, not what is seen under the car."""
     z = np.array([[9.0] * 5, [9, 1, 1, 1, 9], [9, 1, 3, 1, 9], [2] * 5])
-    own = z == 1
-    np.testing.assert_allclose(scales(z, own), np.where(own, 2.0, 1.0), rtol=1e-12)
+    component = z == 1
+    np.testing.assert_allclose(scales(z, component), np.where(component, 2.0, 1.0), rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -212,26 +212,28 @@ def test_a_car_has_room_between_its_wheels():
 def test_components_at_the_lower_edge_are_nearer_when_faster(far, scale):
     """Half way, in logarithms, to where it moves as far as the scene."""
     z = thrice([[4.0, 6, 4], [3, 1, 3.5]])
-    own = z == 1
-    found = scales(z, own, far)
-    np.testing.assert_allclose(found, np.where(own, scale, 1.0), rtol=1e-9)
-    # which way is down is not known, or more of the ground is seen than not
-    assert scales(z, own, far, upright=False)[own] == pytest.approx(3.0)
+    component = z == 1
+    scale_found = scales(z, component, far)
+    np.testing.assert_allclose(scale_found, np.where(component, scale, 1.0), rtol=1e-9)
+    # the vertical is not known, or most of the ground is seen
+    assert scales(z, component, far, upright=False)[component] == pytest.approx(3.0)
     on_ground = thrice([[4.0, 6, 4], [3, 1, 3.5], [3, 3, 3]])
-    own = on_ground == 1
-    assert scales(on_ground, own, far)[own] == pytest.approx(3.0)
+    component = on_ground == 1
+    assert scales(on_ground, component, far)[component] == pytest.approx(3.0)
     # without flow, what is below it may be a part of it
-    lost = np.arange(own.size).reshape(own.shape) >= 2 * own.size // 3
-    assert scales(on_ground, own, far, usable=~lost.ravel())[own] == pytest.approx(scale)
+    lost = np.arange(component.size).reshape(component.shape) >= 2 * component.size // 3
+    assert scales(on_ground, component, far, usable=~lost.ravel())[component] == pytest.approx(
+        scale
+    )
 
 
 def test_pieces_of_what_is_cut_off_are_nearer_together():
     """The upper one, which moves by itself, keeps its contact with the lower."""
-    own = thrice([[0, 0, 0], [0, 2, 0], [0, 1, 0]])
+    component = thrice([[0, 0, 0], [0, 2, 0], [0, 1, 0]])
     z = thrice([[8.0, 8, 8], [4, 1, 4], [4, 1, 4]])
-    found = scales(z, own, np.where(np.ravel(own) == 1, 4.0, 0.5))
-    low, high = found[own == 1], found[own == 2]
-    assert np.ptp(found[own > 0]) == pytest.approx(0.0, abs=1e-12)
+    scale_found = scales(z, component, np.where(np.ravel(component) == 1, 4.0, 0.5))
+    low, high = scale_found[component == 1], scale_found[component == 2]
+    assert np.ptp(scale_found[component > 0]) == pytest.approx(0.0, abs=1e-12)
     assert 1.0 < low[0] < 4.0
     assert high[0] == pytest.approx(low[0])
 
@@ -260,8 +262,8 @@ def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, mon
     with monkeypatch.context() as context:
         context.setattr(components_module, "nearer_where_cut_off", lambda *_: 0.0)
         options = SeededStart(**dict(problem.start), seed=problem.seed)
-        own = case.segmentation, case.pair.flow, pair.K_ref, pair.K_next
-        contact = cut_errors(case, propose(*own, options).soup)
+        data = case.segmentation, case.pair.flow, pair.K_ref, pair.K_next
+        contact = cut_errors(case, propose(*data, options).soup)
     moved = contact != shipped
     assert shipped[moved].mean() < 0.7 * contact[moved].mean()
 
@@ -284,9 +286,9 @@ def test_depths_across_pairs_are_those_of_both_planes(world):
     seg, soup, _, _ = world
     ray = camera.rays(K, seg.boundary.mean(axis=1))
     for side, z in enumerate(soup.depth_across(seg.pairs, ray)):
-        who = seg.pairs[:, side]
-        own = [soup.depth_at(np.tile(r, (len(soup), 1)))[w] for r, w in zip(ray, who)]
-        np.testing.assert_allclose(z, own, rtol=1e-14)
+        superpixel = seg.pairs[:, side]
+        expected = [soup.depth_at(np.tile(r, (len(soup), 1)))[i] for r, i in zip(ray, superpixel)]
+        np.testing.assert_allclose(z, expected, rtol=1e-14)
     edge_on = replace(soup, n=np.tile([0, 1.0, 0], (len(soup), 1)))
     z = edge_on.depth_across(seg.pairs, np.tile([0, 1.0, 1], (len(seg.pairs), 1)))
     np.testing.assert_allclose(z, edge_on.distance[seg.pairs.T] / 1e-3, rtol=1e-14)
@@ -295,15 +297,15 @@ def test_depths_across_pairs_are_those_of_both_planes(world):
 def test_blurred_outlines_are_seen_through(world):
     """Superpixels on both sides of an outline have wrong depths, those behind them right ones."""
     z = np.full((9, 9), 4.0)
-    own = np.zeros((9, 9), bool)
-    own[2:7, 2:7] = True
-    z[own] = 1.0
-    grown = np.pad(own, 1)
+    component = np.zeros((9, 9), bool)
+    component[2:7, 2:7] = True
+    z[component] = 1.0
+    grown = np.pad(component, 1)
     near = sum(np.roll(grown, s, axis) for s in (-1, 1) for axis in (0, 1))[1:-1, 1:-1]
     # nothing is behind the corners
-    z[own & (near == 3)] = 1.6
-    z[~own & (near > 0)] = 2.0
-    np.testing.assert_allclose(scales(z, own), np.where(own, 4.0, 1.0), rtol=1e-12)
+    z[component & (near == 3)] = 1.6
+    z[~component & (near > 0)] = 2.0
+    np.testing.assert_allclose(scales(z, component), np.where(component, 4.0, 1.0), rtol=1e-12)
 
 
 def test_depths_from_inside_follow_slanted_planes(world):

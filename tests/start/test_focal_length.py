@@ -28,8 +28,8 @@ def correspondences(turn, shift, wrong, noise=0.05):
 
 @pytest.mark.parametrize("wrong", [0.7, 1.25])
 def test_a_turn_with_parallax_determines_the_focal_length(wrong):
-    found = correspondences((0.05, 0.1, 0.02), (0.4, 0.1, 0.2), wrong)
-    factor, sigma = focal_length(*found, GUESS_SIGMA)
+    matched = correspondences((0.05, 0.1, 0.02), (0.4, 0.1, 0.2), wrong)
+    factor, sigma = focal_length(*matched, GUESS_SIGMA)
     assert abs(np.log(factor * wrong)) < 0.08
     assert sigma < 0.15
 
@@ -50,7 +50,7 @@ def test_only_a_guess_is_corrected():
     kept = prepare(problem, pair=wrong).pair
     np.testing.assert_array_equal(kept.K_ref, wrong.K_ref)
     assert kept.focal_sigma == 0
-    found = prepare(problem, pair=replace(wrong, focal_sigma=GUESS_SIGMA)).pair
-    np.testing.assert_allclose(found.K_ref, right.K_ref, rtol=0.08)
-    np.testing.assert_array_equal(found.K_ref[:2, 2], right.K_ref[:2, 2])
-    assert found.focal_sigma < 0.15
+    corrected = prepare(problem, pair=replace(wrong, focal_sigma=GUESS_SIGMA)).pair
+    np.testing.assert_allclose(corrected.K_ref, right.K_ref, rtol=0.08)
+    np.testing.assert_array_equal(corrected.K_ref[:2, 2], right.K_ref[:2, 2])
+    assert corrected.focal_sigma < 0.15

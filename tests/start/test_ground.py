@@ -30,36 +30,36 @@ def facing(Z: np.ndarray) -> Soup:
     return Soup(Z, n, np.ones(len(Z)), R, np.array([0.0, 0.0, -1.0]) / Z[:, None])
 
 
-def lift(ray, Z, known, component):
-    known = known & (component == 0)
-    floor = ground(1 / Z, ray, np.ones(len(Z)), known, 0)
-    return above_ground(facing(Z), ray, np.ones(len(Z)), known, component, floor)
+def lift(ray, Z, reliable, component):
+    reliable = reliable & (component == 0)
+    floor = ground(1 / Z, ray, np.ones(len(Z)), reliable, 0)
+    return above_ground(facing(Z), ray, np.ones(len(Z)), reliable, component, floor)
 
 
-def test_what_is_not_known_comes_up_to_the_road(scene):
+def test_unknown_depth_comes_up_to_the_road(scene):
     ray, Z = scene
     lost = (ray[:, 1] > 0.2) & (ray[:, 0] > 0.5)
     assert 0.02 < lost.mean() < 0.2
-    given = np.where(lost, 40.0, Z)
-    soup, lifted = lift(ray, given, ~lost, np.zeros(len(Z), int))
+    depth = np.where(lost, 40.0, Z)
+    soup, lifted = lift(ray, depth, ~lost, np.zeros(len(Z), int))
     np.testing.assert_allclose(soup.depth_at(ray), Z, rtol=1e-9)
     # the scene keeps its motion
-    np.testing.assert_allclose(soup.translation, facing(given).translation, rtol=1e-12)
+    np.testing.assert_allclose(soup.translation, facing(depth).translation, rtol=1e-12)
     assert not lifted.any()
 
 
 def test_a_component_is_lifted_as_one(scene):
-    """Its shape stays, and so does what its flow says: translation and depth change alike."""
+    """Its shape stays, and its flow too: translation and depth change by the same factor."""
     ray, Z = scene
     car = (ray[:, 1] > 0.2) & (ray[:, 0] > 0.5)
-    given = np.where(car, 40.0 + ray[:, 0], Z)
-    soup, lifted = lift(ray, given, ~car, car.astype(int))
+    depth = np.where(car, 40.0 + ray[:, 0], Z)
+    soup, lifted = lift(ray, depth, ~car, car.astype(int))
     np.testing.assert_array_equal(lifted, car)
-    ratio = soup.depth_at(ray) / given
-    translation = soup.translation[:, 2] / facing(given).translation[:, 2]
+    ratio = soup.depth_at(ray) / depth
+    translation = soup.translation[:, 2] / facing(depth).translation[:, 2]
     np.testing.assert_allclose(ratio, translation, rtol=1e-9)
-    # one factor, but for what would still lie below
-    common = np.median(Z[car] / given[car])
+    # one factor, except for parts that would still lie below
+    common = np.median(Z[car] / depth[car])
     assert np.isclose(ratio[car], common).mean() > 0.5
     assert (soup.depth_at(ray)[car] < Z[car] / 0.8 * (1 + 1e-9)).all()
 
@@ -67,25 +67,25 @@ def test_a_component_is_lifted_as_one(scene):
 @pytest.mark.parametrize("why", ["below", "steep", "nothing level"])
 def test_without_a_ground_nothing_moves(scene, why):
     ray, Z = scene
-    known = np.ones(len(Z), bool)
+    reliable = np.ones(len(Z), bool)
     if why == "below":
-        # a table: an eighth of what is well known is the floor beside it
+        # a table: an eighth of the reliable area is the floor beside it
         Z = np.where((ray[:, 1] > 0.1) & (ray[:, 0] > 0.4), 2 * Z, Z)
     elif why == "steep":
         Z = 5 / (1 + 0.8 * ray[:, 1])
     else:
         Z = np.random.default_rng(0).uniform(3, 30, len(Z))
-    assert (ground(1 / Z, ray, np.ones(len(Z)), known, 0) == 0).all()
+    assert (ground(1 / Z, ray, np.ones(len(Z)), reliable, 0) == 0).all()
 
 
-def test_what_is_well_known_stays_below(scene):
-    """A ditch that is seen well is believed."""
+def test_reliable_depth_stays_below(scene):
+    """A ditch with reliable depth is kept."""
     ray, Z = scene
     ditch = (ray[:, 1] > 0.3) & (np.abs(ray[:, 0]) < 0.1)
     assert 0 < ditch.mean() < 0.05
-    given = np.where(ditch, 1.5 * Z, Z)
-    soup, _ = lift(ray, given, np.ones(len(Z), bool), np.zeros(len(Z), int))
-    np.testing.assert_allclose(soup.depth_at(ray), given, rtol=1e-12)
+    depth = np.where(ditch, 1.5 * Z, Z)
+    soup, _ = lift(ray, depth, np.ones(len(Z), bool), np.zeros(len(Z), int))
+    np.testing.assert_allclose(soup.depth_at(ray), depth, rtol=1e-12)
 
 
 def street(car: float) -> tuple[Segmentation, np.ndarray, np.ndarray, np.ndarray]:
@@ -107,18 +107,18 @@ def street(car: float) -> tuple[Segmentation, np.ndarray, np.ndarray, np.ndarray
 
 
 @pytest.mark.parametrize("car", [0.5, 1.0])
-def test_what_floats_is_found_with_its_distance(car):
+def test_a_floating_region_is_found_with_its_distance(car):
     seg, K, ray, Z = street(car)
     body = np.isclose(Z, Z[13 * 30 + 12])
     floor = ground(1 / Z, ray, np.ones(len(Z)), ~body, 0)
     assert floor.any()
-    found = floating(facing(Z), seg, K, floor, np.zeros(len(Z), int))
+    regions = floating(facing(Z), seg, K, floor, np.zeros(len(Z), int))
     if car == 1.0:
         # it stands where it is, and so does the wall
-        assert found == []
+        assert regions == []
         return
-    assert len(found) == 1
-    region, farther = found[0]
+    assert len(regions) == 1
+    region, farther = regions[0]
     np.testing.assert_array_equal(region, body)
-    # within what the boundary's sampled rows leave open
+    # up to the spacing of the sampled rows of the boundary
     assert farther == pytest.approx(1 / car, rel=0.1)

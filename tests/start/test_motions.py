@@ -55,46 +55,46 @@ def test_groups_of_one_motion_are_one_component():
     group = np.array([0, 0, 0, 0, 0, 0, 5, 5, 0, 0, 0, 7])
     soup = soup_of([CAR if g == 5 else CAMERA for g in group])
     guess = group == 7
-    found = find_components(soup, seg, group, K, K, guess)
-    assert len(found) == 2
-    np.testing.assert_array_equal(found.of_superpixel, group == 5)
-    np.testing.assert_array_equal(found.of_pixel, (group == 5)[seg.labels])
-    np.testing.assert_allclose(found.camera.matrix, CAMERA.matrix, atol=ROUNDING)
-    np.testing.assert_allclose(found[1].motion.matrix, CAR.matrix, atol=ROUNDING)
-    np.testing.assert_allclose(found.own_motion(0).matrix, np.eye(4), atol=ROUNDING)
-    still = found.own_motion(1)(np.ones(3))
+    components = find_components(soup, seg, group, K, K, guess)
+    assert len(components) == 2
+    np.testing.assert_array_equal(components.of_superpixel, group == 5)
+    np.testing.assert_array_equal(components.of_pixel, (group == 5)[seg.labels])
+    np.testing.assert_allclose(components.camera.matrix, CAMERA.matrix, atol=ROUNDING)
+    np.testing.assert_allclose(components[1].motion.matrix, CAR.matrix, atol=ROUNDING)
+    np.testing.assert_allclose(components.own_motion(0).matrix, np.eye(4), atol=ROUNDING)
+    still = components.own_motion(1)(np.ones(3))
     np.testing.assert_allclose(CAMERA(still), CAR(np.ones(3)), atol=ROUNDING)
-    assert [c.superpixels for c in found] == [10, 2]
-    assert [c.pixels for c in found] == [4000, 800]
-    assert found[0].borrowed == pytest.approx(0.1)
-    assert max(c.residual_px for c in found) < 1e-6
-    assert found[1].centre[2] == pytest.approx(2)
+    assert [c.superpixels for c in components] == [10, 2]
+    assert [c.pixels for c in components] == [4000, 800]
+    assert components[0].borrowed == pytest.approx(0.1)
+    assert max(c.residual_px for c in components) < 1e-6
+    assert components[1].centre[2] == pytest.approx(2)
 
 
 def test_one_stray_superpixel_keeps_its_components_motion():
     seg = tiles()
     soup = soup_of([*[CAMERA] * 11, CAR])
-    found = find_components(soup, seg, np.zeros(12, int), K, K)
-    assert len(found) == 1
-    # where most agree the re-weighted fit is theirs, up to its least distance of 0.05 px
-    np.testing.assert_allclose(found.camera.matrix, CAMERA.matrix, atol=1e-3)
+    components = find_components(soup, seg, np.zeros(12, int), K, K)
+    assert len(components) == 1
+    # the re-weighted fit is that of the majority, up to its least distance of 0.05 px
+    np.testing.assert_allclose(components.camera.matrix, CAMERA.matrix, atol=1e-3)
 
 
-def test_what_is_not_rigid_says_so():
+def test_a_component_that_is_not_rigid_has_a_large_residual():
     rng = np.random.default_rng(1)
     motions = [RigidMotion(np.eye(3), t) for t in rng.normal(0, 0.1, (12, 3))]
-    found = find_components(soup_of(motions), tiles(), np.zeros(12, int), K, K)
+    components = find_components(soup_of(motions), tiles(), np.zeros(12, int), K, K)
     # translations of 0.1 at depth 2 are 5 pixels
-    assert 1 < found[0].residual_px < 15
+    assert 1 < components[0].residual_px < 15
 
 
 def test_a_component_behind_the_camera_takes_its_first_motion():
     seg = tiles()
     group = np.r_[np.zeros(11, int), 1]
     back = RigidMotion(np.eye(3), np.array([0.0, 0.0, -5.0]))
-    found = find_components(soup_of([*[CAMERA] * 11, back]), seg, group, K, K)
-    np.testing.assert_allclose(found[1].motion.matrix, back.matrix)
-    assert np.isnan(found[1].residual_px)
+    components = find_components(soup_of([*[CAMERA] * 11, back]), seg, group, K, K)
+    np.testing.assert_allclose(components[1].motion.matrix, back.matrix)
+    assert np.isnan(components[1].residual_px)
 
 
 @pytest.mark.slow
@@ -103,13 +103,15 @@ def test_the_near_car_of_a_street_is_a_component():
     raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 150}}
     case = prepare(make_problem(raw))
     pair, start = case.pair, case.start
-    found = find_components(
+    components = find_components(
         start.soup, case.segmentation, start.component, pair.K_ref, pair.K_next, start.borrowed
     )
     for label, true in ((0, 0), (1, 1)):
-        a, b = found.of_pixel == label, pair.truth.components == true
+        a, b = components.of_pixel == label, pair.truth.components == true
         # superpixels of 420 pixels, the car has 5,000
         assert (a & b).sum() / (a | b).sum() > 0.85
         # the rotation has no scale
-        turn = RigidMotion(found[label].motion.R.T @ pair.truth.motions[true][:3, :3], np.zeros(3))
+        turn = RigidMotion(
+            components[label].motion.R.T @ pair.truth.motions[true][:3, :3], np.zeros(3)
+        )
         assert turn.angle < 0.5

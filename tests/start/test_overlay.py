@@ -41,8 +41,8 @@ def scene_flow(turn=TURN, shift=AHEAD):
 
 
 def start_of(seg, flow, **options):
-    every = np.ones(flow.shape[:2], np.float32)
-    return propose(seg, Flow(flow, every, "made"), K, K, SeededStart(**options))
+    confidence = np.ones(flow.shape[:2], np.float32)
+    return propose(seg, Flow(flow, confidence, "made"), K, K, SeededStart(**options))
 
 
 def share(start, seg, mask):
@@ -57,13 +57,13 @@ def test_a_region_that_stands_still_while_the_camera_turns_is_fixed(seg, where):
     mask[where] = True
     flow[mask] = 0.0
     start = start_of(seg, flow)
-    found, false = share(start, seg, mask)
-    assert found > 0.9
+    fixed_share, false = share(start, seg, mask)
+    assert fixed_share > 0.9
     assert false < 0.02
     at = start.tie == FIXED
     np.testing.assert_array_equal(start.soup.t[at], 0.0)
     assert not set(start.component[at]) & set(start.component[~at])
-    # the rest is as it would be without
+    # other superpixels are as without the region
     clean = start_of(seg, scene_flow())
     ray = camera.rays(K, seg.anchors)
     log = np.log(start.soup.depth_at(ray) / clean.soup.depth_at(ray))[~at & ~clean.borrowed]
@@ -75,8 +75,8 @@ def test_a_bonnet_stands_still_before_a_camera_that_drives_straight(seg):
     flow, mask = scene_flow(np.zeros(3)), np.zeros((H, W), bool)
     mask[100:] = True
     flow[mask] = 0.0
-    found, false = share(start_of(seg, flow), seg, mask)
-    assert found > 0.9
+    fixed_share, false = share(start_of(seg, flow), seg, mask)
+    assert fixed_share > 0.9
     assert false < 0.02
 
 

@@ -106,13 +106,13 @@ def test_a_small_motion_counts_where_the_flow_is_exact(error, kept):
 
 @pytest.mark.parametrize("missing", [0, 1])
 def test_a_motion_needs_a_piece_of_superpixels(missing):
-    own = np.arange(30) < PIECE_SIZE - missing
-    cost = np.where(np.stack([own, ~own], axis=1), 2.0, 0.0)
+    members = np.arange(30) < PIECE_SIZE - missing
+    cost = np.where(np.stack([members, ~members], axis=1), 2.0, 0.0)
     assert select(cost, 0.05) == ([0] if missing else [0, 1])
 
 
-@pytest.mark.parametrize(("confidence", "found"), [(1.0, True), (0.1, False)])
-def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, found):
+@pytest.mark.parametrize(("confidence", "trusted"), [(1.0, True), (0.1, False)])
+def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, trusted):
     seg = cells(4, 6)
     odd = seg.anchors[:, 0] > 24
     views = Turns(np.zeros(24), np.where(odd[:, None], confidence, 1.0) * np.ones((24, 4)))
@@ -122,17 +122,17 @@ def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, found)
     )
     cost = np.where(odd, 3.0, 0.0)[:, None]
     main = [Motion(np.eye(3), np.array([1.0, 0, 0]))]
-    assert bool(of_pieces(views, seg, main, cost, 0.05, OPTIONS)) == found
+    assert bool(of_pieces(views, seg, main, cost, 0.05, OPTIONS)) == trusted
 
 
 # --- components
 # --------------------------------------------------------------------------------------
 
 
-def across(seg: Segmentation, own: np.ndarray) -> np.ndarray:
+def across(seg: Segmentation, label: np.ndarray) -> np.ndarray:
     """(P,) whether two neighbours lie on both sides of an outline."""
     i, k = seg.pairs.T
-    return own[i] != own[k]
+    return label[i] != label[k]
 
 
 def offered(monkeypatch, *angles: float) -> None:
@@ -260,20 +260,20 @@ def test_one_wild_plane_behind_an_outline_does_not_decide():
     np.testing.assert_allclose(depth[:, below[0]], [1.0, 4.0], rtol=1e-12)
 
 
-def test_what_is_lowest_in_a_component_places_it():
-    """Two wheels stand on the ground; the wider gap between them shows something nearer."""
+def test_the_lowest_part_of_a_component_places_it():
+    """Two wheels stand on the ground; a nearer surface is seen in the wider gap between them."""
     gap = [9.0, 1, 1.2, 1.2, 1.2, 1, 9]
     ground = [2.0, 2, 1.2, 1.2, 1.2, 2, 2]
     z = np.array([[9.0] * 7, [9, 1, 1, 1, 1, 1, 9], gap, ground, ground])
-    own = z == 1
-    found, tie = contact_scales(facing(z.ravel()), own.ravel().astype(int), cells(5, 7), K)
-    np.testing.assert_allclose(found.reshape(z.shape), np.where(own, 2.0, 1.0), rtol=1e-12)
+    component = z == 1
+    scale, tie = contact_scales(facing(z.ravel()), component.ravel().astype(int), cells(5, 7), K)
+    np.testing.assert_allclose(scale.reshape(z.shape), np.where(component, 2.0, 1.0), rtol=1e-12)
     named = np.array(TIES)[tie].reshape(z.shape)
-    assert (named == np.where(own, "contact below", "reference")).all()
+    assert (named == np.where(component, "contact below", "reference")).all()
 
 
 def test_superpixels_of_hardly_any_confidence_borrow():
-    """Their flow is right here, but nothing says so."""
+    """Their flow is right here, but its confidence is low."""
     move = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
     pair = plane_world(plane_pose(3.0, yaw=20), move, 96, 72)
     seg = build_segmentation(segment(pair.image_ref, 30, "grid"), pair.image_ref, neighbours=8)
@@ -285,7 +285,7 @@ def test_superpixels_of_hardly_any_confidence_borrow():
 
 
 def test_motions_that_are_hardly_different_do_not_mix(monkeypatch):
-    """One misses by a hundredth of a pixel: whatever the order, all take the exact one."""
+    """One motion is off by a hundredth of a pixel: in any order, all take the exact motion."""
     move = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
     pair = plane_world(plane_pose(3.0, yaw=20), move, 96, 72)
     seg = build_segmentation(segment(pair.image_ref, 30, "grid"), pair.image_ref, neighbours=8)
@@ -295,8 +295,8 @@ def test_motions_that_are_hardly_different_do_not_mix(monkeypatch):
     monkeypatch.setattr(proposing, "settle", lambda views, choice, *a: choice)
 
     def taken(motion: Motion, *motions: Motion) -> np.ndarray:
-        given = list(motions), np.zeros(len(seg), bool)
-        monkeypatch.setattr(proposing, "surface_motions", lambda *a: given)
+        result = list(motions), np.zeros(len(seg), bool)
+        monkeypatch.setattr(proposing, "surface_motions", lambda *a: result)
         start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
         return np.abs(start.soup.R - motion.R).max(axis=(1, 2)) < 1e-9
 
@@ -323,7 +323,7 @@ def test_only_a_piece_with_usable_flow_moves():
 
 
 @pytest.mark.parametrize(
-    ("shift", "own", "size", "mixed"),
+    ("shift", "own_error", "size", "mixed"),
     [
         (2.0, 0.0, 2, True),  # between the flows of both sides
         (5.0, 0.0, 2, False),  # beyond them
@@ -332,21 +332,21 @@ def test_only_a_piece_with_usable_flow_moves():
         (2.0, 0.0, 12, False),  # too large
     ],
 )
-def test_a_mixture_of_two_flows_does_not_move(shift, own, size, mixed):
+def test_a_mixture_of_two_flows_does_not_move(shift, own_error, size, mixed):
     """Eight rows move by 0, eight by 4 px; a piece in the middle column turns by itself."""
     seg = cells(16, 32)
     row, column = (seg.anchors // 8).astype(int).T[::-1]
     piece = np.isin(row, (7, 8)) & (abs(column - 16) < size / 4)
     views = Turns(np.where(piece, 0.1, 0.0))
-    choice = taken(views, np.where(piece, 0.1 - own / PER_RADIAN, 0.0))
+    choice = taken(views, np.where(piece, 0.1 - own_error / PER_RADIAN, 0.0))
     flow = np.zeros((len(seg), 2))
     flow[:, 0] = np.where(piece, shift, np.where(row < 8, 0.0, 4.0))
-    found = gathering.unmoved(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
-    np.testing.assert_array_equal(found, piece & mixed)
+    still = gathering.unmoved(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
+    np.testing.assert_array_equal(still, piece & mixed)
 
 
 @pytest.mark.parametrize(("gain", "moves"), [(0.04, False), (0.06, True)])
-def test_a_motion_that_explains_little_more_is_none(gain, moves):
+def test_a_motion_that_explains_little_more_is_dropped(gain, moves):
     """The noise of the flow is 0.05 px."""
     seg = cells(16, 32)
     row, column = (seg.anchors // 8).astype(int).T[::-1]
@@ -354,13 +354,13 @@ def test_a_motion_that_explains_little_more_is_none(gain, moves):
     views = Turns(np.where(piece, gain / PER_RADIAN, 0.0))
     choice = taken(views, np.where(piece, gain / PER_RADIAN, 0.0))
     flow = np.where(piece, 9.0, 0.0)[:, None] * [1.0, 0.0]
-    found = gathering.unmoved(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
-    np.testing.assert_array_equal(found, piece & (not moves))
+    still = gathering.unmoved(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
+    np.testing.assert_array_equal(still, piece & (not moves))
 
 
-def test_what_contact_makes_too_fast_comes_a_third_nearer():
+def test_a_component_too_fast_by_contact_comes_a_third_nearer():
     label = np.repeat([0, 1, 2, 3], [6, 3, 3, 3])
     far = np.array([1.0, np.exp(0.9 * FAST), np.exp(2.0 * FAST), 1e3])[label]
-    # beyond a hundredfold the camera is at rest, and nothing is known
+    # beyond a ratio of 100 the camera is taken to be at rest
     np.testing.assert_allclose(nearer_where_fast(far, label), [0, 0, 2 * FAST / 3, 0])
     assert not nearer_where_fast(np.where(label == 0, 0.0, far), label).any()

@@ -64,15 +64,15 @@ def test_refinement_finds_the_motion_of_exact_rays(seed):
     ("wrong", "priors", "weight"),
     [((0.01, 0.0), (1e-4, 1e-6), 10.0), ((0.0, 0.05), (1e-6, 1e-3), 0.1)],
 )
-def test_a_prior_holds_what_the_pixels_hardly_determine(wrong, priors, weight):
-    """It pulls towards where the refinement began, however many steps are made."""
+def test_a_prior_holds_directions_that_pixels_hardly_determine(wrong, priors, weight):
+    """The prior pulls towards the initial motion, however many steps are made."""
     m, r, q = rigid(200)
     begin = perturbed(m, *wrong)
     prior, moved = np.repeat(priors, (3, 2)), []
     for rounds in (30, 600):
-        found = refine_near(begin, r, q, np.full(200, weight), FOCAL, 5.0, prior, rounds)
-        moved.append(sum(off(begin, found)) / sum(wrong))
-    # the pixels' pull is there, and is not added up
+        motion = refine_near(begin, r, q, np.full(200, weight), FOCAL, 5.0, prior, rounds)
+        moved.append(sum(off(begin, motion)) / sum(wrong))
+    # the pull of the pixels is not zero, and does not add up over rounds
     assert 1e-4 < moved[1] < 0.2
     assert moved[1] == pytest.approx(moved[0], rel=0.1)
 
@@ -112,23 +112,23 @@ def test_what_is_not_confident_does_not_bend_a_motion():
     wrong = np.arange(200) % 2 == 0
     q = q + np.where(wrong[:, None], [0.0, 0.5 / FOCAL, 0.0], 0.0)
     weight = np.where(wrong, 1e-12, 1.0)
-    found = epipolar.refine(perturbed(m, 0.002, 0.01), r, q, weight, FOCAL)
-    turn, tilt = off(m, found)
+    motion = epipolar.refine(perturbed(m, 0.002, 0.01), r, q, weight, FOCAL)
+    turn, tilt = off(m, motion)
     assert turn < 1e-6
     assert tilt < 1e-5
 
 
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_the_essential_matrix_that_explains_most_is_taken(monkeypatch, place):
+@pytest.mark.parametrize("position", [0, 1, 2])
+def test_the_essential_matrix_that_explains_most_is_taken(monkeypatch, position):
     m, r, q = rigid(100)
     others = [perturbed(m, 0.3, 0.8, seed).essential() for seed in (5, 6)]
-    stack = np.concatenate(np.insert(np.stack(others), place, m.essential(), axis=0))
+    stack = np.concatenate(np.insert(np.stack(others), position, m.essential(), axis=0))
     monkeypatch.setattr(epipolar.cv2, "findEssentialMat", lambda *a, **k: (stack, None))
     monkeypatch.setattr(epipolar, "refine", lambda motion, *a: motion)
-    found = estimate(r, q, np.ones(100), FOCAL)
-    assert found is not None
-    assert np.abs(sampson(found.essential(), r, q, FOCAL)).max() < 1e-6
-    assert max(off(m, found)) < 1e-6
+    motion = estimate(r, q, np.ones(100), FOCAL)
+    assert motion is not None
+    assert np.abs(sampson(motion.essential(), r, q, FOCAL)).max() < 1e-6
+    assert max(off(m, motion)) < 1e-6
 
 
 def test_slopes_of_the_sampson_distance_are_its_differences():
@@ -172,9 +172,9 @@ def test_a_translation_with_points_in_front_is_cheaper():
 def flat_views(target: np.ndarray, off_centre: np.ndarray, weight: np.ndarray) -> Views:
     """One superpixel around the optical axis, offsets and targets (S, 2) in ray units."""
     one = np.ones((len(target), 1))
-    ray, there = np.hstack([off_centre, one]), np.hstack([target, one])
+    ray, targets = np.hstack([off_centre, one]), np.hstack([target, one])
     anchor, radius = np.array([[0.0, 0.0, 1.0]]), np.array([0.1])
-    return Views(ray[None], there[None], weight[None], anchor, radius, (FOCAL, FOCAL))
+    return Views(ray[None], targets[None], weight[None], anchor, radius, (FOCAL, FOCAL))
 
 
 def test_constant_depth_turns_with_the_image():
