@@ -184,7 +184,7 @@ def calibrated(
     """Calibrated standard deviation of log depth.
 
     Where surfaces bend every superpixel has a motion of its own, which fits nearly any flow. There
-    the spread says little about errors, and the misfit says much.
+    errors depend little on the spread and strongly on the misfit.
 
     Args:
         spread: Standard deviation of log depth by the marginals.
@@ -192,7 +192,7 @@ def calibrated(
         misfit: Misfit of the superpixel, pixels; where it is larger than the noise, the geometric
             mean of both replaces the noise.
         prior: Standard deviation without the flow; its information is added.
-        bends: Where regions bend; of the same shape, or one for all.
+        bends: True where regions bend; of the same shape, or one value.
         added: Standard deviation of log depth that does not depend on the flow's random noise, by
             scales from contact and undetermined motions; added in squares.
     """

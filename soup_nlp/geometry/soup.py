@@ -1,4 +1,4 @@
-"""The soup: scale, plane and rigid motion of every superpixel, and what follows from them."""
+"""The soup: scale, plane and rigid motion of every superpixel, and derived quantities."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LEAST_FACING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Soup:
-    """State of N superpixels: what every stage takes and returns.
+    """State of N superpixels, the input and output of every stage.
 
     Plane i is `n_i . X + D_i = 0` with `D_i = lam_i d_i` and n facing the camera; motion i is
     `X' = R_i X + lam_i t_i` (next_from_ref). Lengths are free up to one global scale.
@@ -137,7 +137,7 @@ class Reconstruction:
         points_next: (H, W, 3) the same material points in the next frame.
         flow: (H, W, 2) flow that the soup induces, pixels.
         depth_next: (H', W') z of the next frame (nearest surface wins), NaN where nothing lands.
-        soup: The state that it is made of.
+        soup: State of the reconstruction.
         labels: (H, W) superpixel of every pixel.
         source_next: (H', W') reference pixel that the next frame shows there, in row order; -1
             where nothing lands.

@@ -18,7 +18,7 @@ ENOUGH = 0.5
 """Share of the wanted number below which texture has broken the clusters into fragments."""
 NEAR = 0.03
 """Largest share by which the number of superpixels differs from the wanted one."""
-ASKED = 4
+MORE_CALLS = 4
 """Largest number of further calls of SLIC for more superpixels."""
 COMPACTNESS = 10.0
 """SLIC's balance of colour and distance; scikit-image's default."""
@@ -86,17 +86,17 @@ def _slic(image: Image, clusters: int, sigma: float) -> Labels:
 def _as_many(image: Image, labels: Labels, count: int, sigma: float) -> Labels:
     """Superpixels whose number is near `count`.
 
-    SLIC's clusters start on a grid, of which few sizes exist, and how many of them vanish depends
-    on the image. Where there are too few superpixels, SLIC is asked for more clusters; where there
-    are too many, the smallest join their neighbours.
+    SLIC's clusters start on a grid of few possible sizes, and the number that vanishes depends on
+    the image. With too few superpixels, SLIC is called with more clusters; with too many, the
+    smallest join their neighbours.
     """
-    near, asked = max(1.0, NEAR * count), count
-    for _ in range(ASKED):
+    near, clusters = max(1.0, NEAR * count), count
+    for _ in range(MORE_CALLS):
         n = int(labels.max()) + 1
         if n >= count - near:
             break
-        asked = min(image.shape[0] * image.shape[1] // 4, math.ceil(asked * 1.03 * count / n))
-        labels = _slic(image, asked, sigma)
+        clusters = min(image.shape[0] * image.shape[1] // 4, math.ceil(clusters * 1.03 * count / n))
+        labels = _slic(image, clusters, sigma)
     if labels.max() + 1 <= count + near:
         return labels
     sizes = np.sort(np.bincount(labels.ravel()))

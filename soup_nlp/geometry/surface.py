@@ -1,4 +1,4 @@
-"""The surface of a reconstruction: where it is connected, what is hidden, its triangles."""
+"""The surface of a reconstruction: its connected parts, hidden pixels and triangles."""
 
 from __future__ import annotations
 

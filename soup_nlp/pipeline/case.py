@@ -152,7 +152,7 @@ def prepare(
 def _begin(
     problem: Problem, pair: Pair, seg: Segmentation, fitted: FlowFit, options: SeededStart
 ) -> Start:
-    """The start on given superpixels, whatever a depth prior says."""
+    """The start on given superpixels, without a depth prior."""
     flow = pair.flow
     assert flow is not None
     start = propose(seg, flow, pair.K_ref, pair.K_next, options, fitted)

@@ -1,4 +1,4 @@
-"""E_photo: how far the images contradict what a superpixel's homography predicts; plane sweep.
+"""E_photo, the difference between the images and superpixels' homographies; plane sweep.
 
     E_photo = sum_i mean_s min(c_is, tau)
 

@@ -48,13 +48,13 @@ def info(small_room):
 
 @pytest.fixture(scope="module")
 def dense(small_room, info):
-    """Covariance where the mean log depth of all pixels is held, by a dense pseudo-inverse."""
+    """Covariance with the mean log depth of all pixels fixed, by a dense inverse."""
     sizes = small_room.segmentation.sizes
     mean = np.zeros(len(info.growth))
     mean[::9] = -sizes / sizes.sum() / info.plane[:, 0]
     scale = 1 / np.sqrt(info.matrix.diagonal())
     scaled = info.matrix.toarray() * np.outer(scale, scale)
-    # holding the mean is a constraint: its KKT matrix is regular
+    # the fixed mean is a constraint: the KKT matrix is regular
     row = mean * scale
     row /= np.linalg.norm(row)
     kkt = np.block([[scaled, row[:, None]], [row[None], np.zeros((1, 1))]])
@@ -114,7 +114,7 @@ def test_all_depths_growing_alike_costs_nothing(info):
 
 
 def test_the_variance_of_a_pixel_is_of_log_depth(small_room, info, dense):
-    """By the derivative of the log depth of a plane, by differences."""
+    """Against finite differences of the log depth of a plane."""
     seg, K = small_room.segmentation, small_room.pair.K_ref
     variances = marginals(info, seg.sizes, np.zeros(len(small_room), int))
     sigma = spread_in_image(info, variances.plane, seg.labels, K)
@@ -271,7 +271,7 @@ def test_other_components_are_less_sure_than_the_reference(small_room):
     scale = scale_by_contact(sure.marginals, start, sizes, np.ones(len(sizes)))
     reference = start.tie == TIES.index("reference")
     assert 0 < reference.sum() < len(reference)
-    # the scales of the others move the mean, to which the reference component refers
+    # the other scales move the mean, to which the reference component refers
     mean = np.sum(sizes[~reference] * scale[~reference]) / sizes.sum()
     np.testing.assert_allclose(scale[reference], mean, rtol=0.2)
     assert scale[~reference].min() > np.hypot(CONTACT, scale[reference][0]) * (1 - 1e-9)
@@ -323,6 +323,6 @@ def test_an_energy_that_sees_no_plane_leaves_everything_a_guess(small_room):
 
 
 def test_what_the_flow_adds_to_the_terms_on_shape():
-    """Information 4 with the flow, 3 without: the flow's is 1."""
+    """The information is 4 with the flow and 3 without: the flow adds 1."""
     assert learned(np.array([1 / 4]), np.array([1 / 3]))[0] == pytest.approx(1.0)
     assert learned(np.array([2.0]), np.array([2.0]))[0] > 1e3

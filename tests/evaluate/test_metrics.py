@@ -83,7 +83,7 @@ def test_as_dict_keys_are_stable():
 def test_a_preset_finds_no_error_in_a_scaled_truth():
     truth = np.random.default_rng(0).uniform(1.0, 15.0, (40, 60))
     assert {"paper", "sintel70", "kitti", "eigen80", "best"} <= set(PRESETS)
-    # what is not the usual scale says so
+    # a preset states where its scale is not that of the convention
     for name in ("sintel70", "eigen80"):
         assert "median of z_gt / z, not median z_gt over median z" in PRESETS[name].text
     for name, convention in PRESETS.items():

@@ -1,4 +1,4 @@
-"""Large images: a pair made smaller stays the same scene, and depth comes back along edges."""
+"""Large images: a resized pair shows the same scene; depth at full size follows image edges."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_what_is_small_enough_is_not_touched():
 def test_labels_grow_to_the_edges_of_the_image():
     height, width = 120, 160
     v, u = np.mgrid[0:height, 0:width]
-    # a disc whose border is nowhere that of the small image
+    # a disc whose border nowhere coincides with pixel borders of the small image
     inside = np.hypot(u - 71.3, v - 63.7) < 37.2
     image = np.where(inside[..., None], [200, 90, 40], [60, 120, 180]).astype(np.uint8)
     size = (width // 4, height // 4)

@@ -200,7 +200,7 @@ def test_normalised_knows_no_gauge_and_no_scale(seed, scale):
     np.testing.assert_allclose(a.lam.sum(), 1.0, rtol=1e-14)
     for name in ("lam", "d", "n", "R", "t"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-11, atol=1e-12)
-    # the same shape: depth ratios and motions relative to depth are untouched
+    # the same shape: depth ratios and motions relative to depth do not change
     ray = np.tile(GRID[3], (5, 1))
     ratio = a.depth_at(ray) / soup.depth_at(ray)
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-12)
@@ -269,10 +269,10 @@ def test_the_nearest_surface_wins_the_splat():
     target = np.array([[[2.0, 1.0], [2.2, 1.1], [2.0, 1.0], [0.0, 3.0]]])
     depth = splat_depth(target, np.array([[5.0, 3.0, 4.0, -1.0]]), (4, 5))
     assert depth[1, 2] == 3.0
-    # a point behind the camera leaves no mark, and nothing lands far away
+    # a point behind the camera is not drawn, and no point lands far away
     assert np.isnan(depth[3, 0])
     assert np.isnan(depth[0]).all()
-    # nor what is outside or not finite
+    # points outside or not finite are not drawn
     target = np.array([[[-5.0, 0.0], [np.nan, 1.0], [100.0, 1.0], [1.0, 1.0]]])
     depth = splat_depth(target, np.ones((1, 4)), (3, 3))
     assert np.isfinite(depth).sum() == 4

@@ -90,7 +90,7 @@ def test_split_components_leaves_connected_pieces(labels, min_size):
 
 @pytest.mark.parametrize("seed", [11, 923, 2041])
 def test_filled_pieces_that_end_up_cut_off_become_their_own(seed):
-    """In these images the nearest piece that stays does not touch all that it is given."""
+    """In these images the nearest remaining piece does not touch all pixels that join it."""
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, 2, (10, 12)).astype(np.int32)
     assert_partition(split_components(labels, int(rng.integers(2, 20))))

@@ -1,4 +1,4 @@
-"""What TRW-S takes and when it ends: forms of tables, options, interruption, infinite costs."""
+"""Inputs and ends of TRW-S: forms of tables, options, interruption, infinite costs."""
 
 from __future__ import annotations
 
@@ -86,13 +86,13 @@ def test_never_worse_than_the_initial_labels():
 
 
 def test_initial_labels_return_where_rounding_misled():
-    """In float32 the three costs are one, below the exact cost of the initial label."""
+    """In float32 the three costs are equal, and below the exact cost of the initial label."""
     unary = np.array([[3.5, 3.0, 3.9]]) + 1e8
     result = solve_trws(unary, NO_EDGES, NO_TABLES, init_labels=np.array([1]), dtype=np.float32)
     assert result.energy == 1e8 + 3.0
     assert result.labels.tolist() == [1]
     assert result.ties == 0
-    # where float32 does tell them apart it is the best that is taken
+    # where float32 distinguishes the costs, the best label is chosen
     result = solve_trws(
         unary - 1e8, NO_EDGES, NO_TABLES, init_labels=np.array([2]), dtype=np.float32
     )
@@ -100,7 +100,7 @@ def test_initial_labels_return_where_rounding_misled():
 
 
 def test_as_long_as_the_best_energy_falls_nothing_stagnates():
-    """Whatever the bound does."""
+    """The bound has no influence, because any rise of it is within the limit."""
     late = 0
     for seed in range(6):
         unary, edges, tables = dense(np.random.default_rng(seed), 15, 80, 4)

@@ -44,7 +44,7 @@ def proposer(data: EnergyData, seed: int = 0) -> Proposer:
 
 
 def anchor_targets(p: Particles, data: EnergyData) -> np.ndarray:
-    """(N, L, 2) where anchors go, pixels."""
+    """(N, L, 2) positions of moved anchors in the next image, pixels."""
     X = anchor_depth(p, data.anchor_ray)[..., None] * data.anchor_ray[:, None]
     return camera.project(data.K_next, np.einsum("nlij,nlj->nli", p.R, X) + p.T)
 

@@ -128,7 +128,7 @@ def test_without_the_nlp_the_start_is_refined(tmp_path, capsys):
     assert r["end"]["total"] < r["begin"]["total"]
     assert "nlp" not in summary["metrics"]
     assert check_folder(tmp_path).ok
-    # what was done can be done again from the folder alone, see test_cli
+    # the solve can be repeated from the folder alone, see test_cli
     again = load_problem(tmp_path / "config.yaml")
     assert again.digest() == summary["problem_hash"]
     assert again.refine.from_start

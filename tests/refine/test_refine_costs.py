@@ -128,9 +128,8 @@ def test_the_length_slope_is_the_derivative_of_the_energy():
     tiny = Tiny("paper")
     weights = weights_for("paper", truncated=False)
     h = 1e-5
-    scaled = [
-        replace(tiny.data, share=tiny.data.share * (1 + s * h)) for s in (1, -1)
-    ]  # the unit is sum(share D)
+    # the unit is sum(share D)
+    scaled = [replace(tiny.data, share=tiny.data.share * (1 + s * h)) for s in (1, -1)]
     up, down = (oracle.energy(tiny.soup, d, weights)["total"] for d in scaled)
     assert length_slope(tiny.soup, tiny.data, weights) == pytest.approx(
         (down - up) / (2 * h), rel=1e-5
