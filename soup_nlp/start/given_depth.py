@@ -1,6 +1,6 @@
 """A start by a depth prior: the depths, slopes and scales that it decides.
 
-See docs/depth_prior.md. What flow and image say of it is found before (`start.prior_evidence`).
+See docs/depth_prior.md. `start.prior_evidence` gives the evidence of flow and image for it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STANDS = {"contact below": 0.7, "ground": 0.7, "outline": 0.4, "cut off below": 
 RIGHT, WRONG = 0.05, 0.5
 """Standard deviation of the log of such a scale if it is right, and if it is not."""
 HELD, NEAR = 4.0, 15
-"""Weight of the whole component's error beside the residuals of so many neighbours."""
+"""Weight of the whole component's error beside the residuals of NEAR neighbours."""
 REACH, STEEPEST = 4, 0.5
 """Pixels to either side between which a prior's slope is a difference, and the largest change of
 relative inverse depth from the middle of a superpixel to its border."""
@@ -41,9 +41,9 @@ class Given:
     """A depth prior as the start uses it.
 
     Attributes:
-        evidence: What flow and image say of it.
+        evidence: Evidence of flow and image for it.
         log_depth: (N,) log depth at the anchors, up to a common scale.
-        sigma: (N,) standard deviation of it, estimated from the flow; inf where it does not decide.
+        sigma: (N,) its standard deviation, estimated from the flow; inf where it decides nothing.
         opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
         error: (N,) standard deviation of log depth by which E_depth weighs the prior.
         held: (N,) True where depth or scale of the start are the prior's.
@@ -57,10 +57,10 @@ class Given:
     held: Mask
 
     def as_dict(self) -> dict[str, Any]:
-        """Numbers for summary.json; NaN for the ratio where the flow says nothing."""
+        """Numbers for summary.json; NaN for the ratio where the flow is no evidence."""
         e = self.evidence
-        own = {"used": e.used, "kind": e.kind, "ratio": e.ratio, "overall": e.sigma}
-        return {**own, "held": float(self.held.mean())}
+        numbers = {"used": e.used, "kind": e.kind, "ratio": e.ratio, "overall": e.sigma}
+        return {**numbers, "held": float(self.held.mean())}
 
 
 def by_prior(
@@ -73,10 +73,10 @@ def by_prior(
         seg: Superpixels and graphs.
         pair: Images and depth prior.
         fitted: The flow as affine maps.
-        evidence: What flow and image say of the prior.
+        evidence: Evidence of flow and image for the prior.
     """
     n, sigma = len(seg), evidence.sigma
-    value, known, whole = without_gaps(pair, seg)
+    value, with_value, whole = without_gaps(pair, seg)
     prior = evidence.log_depth(value)
     if not evidence.used:
         never = np.full(n, np.inf)
@@ -85,10 +85,10 @@ def by_prior(
     soup, anchor = start.soup, fitted.views.anchor
     before = np.log(soup.depth_at(anchor)) - prior
     contact = np.median(before[start.component == main])
-    # what is fixed in the image stays where it is relative to the scene
+    # components that are fixed in the image keep their depth relative to the scene
     fixed = start.tie == FIXED
-    held, opened, strong = np.zeros(n, bool), np.ones(n), fixed.copy()
-    own = np.where(fixed | ~known, np.inf, sigma)
+    from_prior, opened, strong = np.zeros(n, bool), np.ones(n), fixed.copy()
+    sigmas = np.where(fixed | ~with_value, np.inf, sigma)
     # surfaces that bend have a motion for every superpixel, which grows with its depth
     off = np.where(start.bends, before, np.where(fixed, contact, 0.0))
     for c in np.unique(start.component[~start.bends & ~fixed]):
@@ -101,19 +101,19 @@ def by_prior(
         residual = np.log(soup.depth_at(anchor)[firm]) - prior[firm]
         off[at] = np.median(residual)
         local = _local(anchor[at, :2], strong[at], residual - off[firm], sigma)
-        own[at] = np.where(known[at], local, np.inf)
+        sigmas[at] = np.where(with_value[at], local, np.inf)
         flow = (start.noise / np.maximum(fitted.views.parallax(soup)[at], 1e-3)) ** 2
         opened[at] = np.where(strong[at], flow / (flow + local**2), 1.0)
         if c != main:
             gap = float(np.median(before[at])) - contact
-            # a contact says nothing where depths of the scene are the prior's
+            # a contact is no evidence where depths of the scene are the prior's
             stands = STANDS.get(TIES[start.tie[at[0]]], 0.0) if evidence.determined else 0.0
             keep = _kept(gap, sigma, stands)
             off[at] -= keep * gap
             prior[at] += keep * gap
-            held[at] = keep < 0.5
-    held |= ~strong
-    # a translation is that of its component, whatever the depth of a superpixel
+            from_prior[at] = keep < 0.5
+    from_prior |= ~strong
+    # a superpixel has the translation of its component, whatever its depth
     scaled = replace(soup, lam=soup.lam * np.exp(-off))
     planes = about_anchor(
         np.exp(prior), _slopes(np.exp(-evidence.log_depth(whole)), pair, seg), anchor
@@ -121,11 +121,13 @@ def by_prior(
     normal, D = normal_and_distance(planes)
     tilted = Soup(D, normal, np.ones(n), soup.R, scaled.translation / D[:, None])
     soup = scaled.taking(tilted, ~strong).normalised()
-    tie = np.where(held & (start.component != main), TIES.index("given depth"), start.tie)
+    tie = np.where(from_prior & (start.component != main), TIES.index("given depth"), start.tie)
     # without a flow to weigh it against, terms on shape must not undo the prior
-    error = own if evidence.determined else np.where(np.isfinite(own), LEAST_SIGMA, np.inf)
-    decides = np.where(held, own, np.inf)
-    return replace(start, soup=soup, tie=tie), Given(evidence, prior, decides, opened, error, held)
+    error = sigmas if evidence.determined else np.where(np.isfinite(sigmas), LEAST_SIGMA, np.inf)
+    decides = np.where(from_prior, sigmas, np.inf)
+    return replace(start, soup=soup, tie=tie), Given(
+        evidence, prior, decides, opened, error, from_prior
+    )
 
 
 def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:
@@ -151,8 +153,8 @@ def _settled(
 ) -> tuple[Soup, Mask]:
     """Soup with the planes and the motion of a rigid component by flow and prior.
 
-    Of the motions that explain the flow about as well, it takes that which agrees with the prior.
-    Where any depth explains the flow, it takes the motion that belongs to the prior's.
+    Of the motions that explain the flow about as well, it takes the one that agrees with the prior.
+    Where any depth explains the flow, it takes the motion that fits the depths of the prior.
 
     Args:
         seen: The start and its flow.
@@ -170,45 +172,45 @@ def _settled(
     at, use = np.flatnonzero(mask), seen.members(c)
     T = soup.translation[at[0]]
     length, rigid = float(np.linalg.norm(T)), np.ptp(soup.R[at], axis=0).max() < 1e-9
-    every = np.ones(len(at), bool)
+    all_members = np.ones(len(at), bool)
     if len(use) < FEWEST or not rigid or not length > 0:
-        return soup, every if start.borrowed[at].all() else ~start.borrowed[at]
+        return soup, all_members if start.borrowed[at].all() else ~start.borrowed[at]
     _, R, T_prior, _ = seen.motion(use, np.exp(-prior[use]))
     flat = np.zeros((len(prior), 2))
     if not determined:
-        return soup.taking(views.soup(np.exp(-prior), flat, R, T_prior), mask), ~every
+        return soup.taking(views.soup(np.exp(-prior), flat, R, T_prior), mask), ~all_members
     error = min(SYSTEMATIC * start.noise, MOST_SYSTEMATIC_PX)
-    rest = views.anchor[use], seen.fitted.centre[use], np.ones(len(use)), views.focal[0], error
+    flow_data = views.anchor[use], seen.fitted.centre[use], np.ones(len(use)), views.focal[0], error
     tried = Motion(soup.R[at[0]], T / length), Motion(R, T_prior / np.linalg.norm(T_prior))
-    best = most_probable(tried, *rest, prior[use], sigma)
+    best = most_probable(tried, *flow_data, prior[use], sigma)
     planes = views.fit([best])
     mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
     strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP)
     strong &= seen.usable & mask
     if strong.sum() < PIECE_SIZE:
-        return soup, every
+        return soup, all_members
     mu, slope = np.where(strong, mu, 1.0), np.where(strong[:, None], planes.slope[:, 0], flat)
     return soup.taking(views.soup(mu, slope, best.R, best.t), mask), strong[at]
 
 
 def _kept(gap: float, sigma: float, stands: float) -> float:
-    """Share of the scale by contact in that of a component, the rest is the prior's.
+    """Weight of the scale by contact in a component's scale, beside the scale by the prior.
 
-    With the probability `stands` it is right (`RIGHT`), else not (`WRONG`); the gap of its log to
-    the prior, which has the deviation `sigma`, tells which.
+    The scale by contact is right (`RIGHT`) with the probability `stands`, else wrong (`WRONG`); the
+    gap of its log to the prior, which has the deviation `sigma`, updates these odds.
     """
     spread = np.hypot(sigma, [RIGHT, WRONG])
     odds = np.array([stands, 1 - stands]) * np.exp(-0.5 * (gap / spread) ** 2) / spread
     return float(odds[0] / odds.sum() * sigma**2 / spread[0] ** 2)
 
 
-def _local(place: Float, strong: Mask, residual: Float, sigma: float) -> Float:
+def _local(position: Float, strong: Mask, residual: Float, sigma: float) -> Float:
     """(K,) standard deviation of a prior by its residuals in log depth at the nearest known depths.
 
-    `place` (K, 2) are a component's anchors, `strong` (K,) marks known depths, to which residuals
-    belong, and `sigma` is the deviation in the whole component.
+    `position` (K, 2) are a component's anchors, `strong` (K,) marks the known depths, which have
+    residuals, and `sigma` is the deviation in the whole component.
     """
     near = min(NEAR, len(residual))
-    index = cKDTree(place[strong]).query(place, k=near)[1].reshape(len(place), near)
+    index = cKDTree(position[strong]).query(position, k=near)[1].reshape(len(position), near)
     squared = np.minimum(residual**2, 1.0)[index].sum(axis=1)
     return np.maximum(np.sqrt((HELD * sigma**2 + squared) / (HELD + near)), LEAST_SIGMA)

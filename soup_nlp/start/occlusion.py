@@ -2,8 +2,8 @@
 
 Where two regions move differently, one covers the other along their outline. If they close in on
 each other, pixels of the farther region are covered in the next frame: followed with the flow of
-their own region they do not look as before. If they part, what appears between them belongs to the
-farther region, and looks like the pixels of that region beside the outline.
+their own region they do not look as before. If they part, the area that appears between them
+belongs to the farther region, and looks like the pixels of that region beside the outline.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ LEAST_STEP, IN_FRONT = 0.1, 0.35
 not agree with the order; the region is then placed so that the step is the second, a guess. True
 steps along such outlines have medians of 0.2 to 1.9."""
 STANDING = 0.23
-"""What stands on another region has no step where it touches it. From this median step along its
+"""A region that stands on another one has no step at their contact. From this median step along its
 upper outline it agrees with the order."""
 
 
@@ -93,19 +93,19 @@ def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
     share = (np.arange(WIDEST) + 0.5)[:, None] / WIDEST
     between = landed[0][:, :, None] + (landed[1] - landed[0])[:, :, None] * share
     gap = _colours(after, between)
-    covered, alike = np.full((2, len(rows), 2), np.nan)
+    covered, uncovered = np.full((2, len(rows), 2), np.nan)
     for e, side in ((0, -1.0), (1, 1.0)):
         at = edge[:, :, None] + side * normal[:, None, None] * step[:, None]
         u, v = np.moveaxis(np.rint(at).astype(int), -1, 0)
-        own = inside & (
+        members = inside & (
             seg.labels.take(v * seg.labels.shape[1] + u, mode="clip") == ends[:, e, None, None]
         )
-        strip = np.where(own.reshape(len(own), -1, 1), _colours(before, at), np.nan)
+        strip = np.where(members.reshape(len(members), -1, 1), _colours(before, at), np.nan)
         covered[:, e] = _cost(np.abs(strip - _colours(after, target(ends[:, e], at))).mean(axis=-1))
         off = np.abs(gap[:, :, None] - strip[:, None]).mean(axis=-1)
         enough = np.isfinite(strip[..., 0]).sum(axis=1) >= FEWEST
-        alike[enough, e] = _cost(np.fmin.reduce(off[enough], axis=2))
-    contrast = np.where(closing > 0, covered @ [1.0, -1.0], alike @ [-1.0, 1.0])
+        uncovered[enough, e] = _cost(np.fmin.reduce(off[enough], axis=2))
+    contrast = np.where(closing > 0, covered @ [1.0, -1.0], uncovered @ [-1.0, 1.0])
     out[rows] = np.where(np.abs(closing) > CLOSING_PX, np.nan_to_num(contrast), 0.0)
     return out
 
@@ -121,19 +121,19 @@ def _normals(edge: Float, way: Float) -> Float:
 
 
 def _colours(image: Image, at: Float) -> Float:
-    """(M, B T, 3) values of an image between its pixels, at (M, B, T, 2); NaN outside."""
+    """(M, B T, 3) interpolated values of an image at (M, B, T, 2); NaN outside."""
     u, v = np.moveaxis(at.astype(np.float32).reshape(len(at), -1, 2), -1, 0)
-    found = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    colours = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     rows, columns = image.shape[:2]
-    there = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
-    return np.where(there[..., None], found, np.nan)
+    visible = (u >= 0) & (v >= 0) & (u <= columns - 1) & (v <= rows - 1)
+    return np.where(visible[..., None], colours, np.nan)
 
 
 def _cost(change: Float) -> Float:
     """(M,) mean of limited changes (M, T), which are NaN where unknown; NaN for too few."""
-    known = np.isfinite(change)
-    count = known.sum(axis=1)
-    total = np.where(known, np.minimum(change, MOST_GREY), 0.0).sum(axis=1)
+    valid = np.isfinite(change)
+    count = valid.sum(axis=1)
+    total = np.where(valid, np.minimum(change, MOST_GREY), 0.0).sum(axis=1)
     return np.where(count >= FEWEST, total / np.maximum(count, 1), np.nan)
 
 
@@ -153,12 +153,12 @@ def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
     ends = region[seg.pairs]
     a, b = ends.min(axis=1), ends.max(axis=1)
     turned = np.where(ends[:, 0] == a, 1.0, -1.0)
-    says = np.where((a != b) & (np.abs(contrast) > CONTRAST), np.sign(contrast) * turned, 0.0)
+    votes = np.where((a != b) & (np.abs(contrast) > CONTRAST), np.sign(contrast) * turned, 0.0)
     outline = np.unique(a * (int(region.max()) + 1) + b, return_inverse=True)[1].ravel()
-    total = np.bincount(outline, np.abs(says))
-    lead = np.bincount(outline, says)
+    total = np.bincount(outline, np.abs(votes))
+    lead = np.bincount(outline, votes)
     sure = ((total + np.abs(lead)) / 2 + 1) / (total + 2)
-    holds = (a != b) & (says * lead[outline] >= 0) & (sure[outline] > SURE)
+    holds = (a != b) & (votes * lead[outline] >= 0) & (sure[outline] > SURE)
     return np.where(holds, np.sign(lead[outline]) * turned * sure[outline], 0.0)
 
 
@@ -186,13 +186,13 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, o: Se
     order = np.where(np.abs(contrast) > CONTRAST, whole, 0.0)
     factor = placed(start.soup, region, order, start.tie, seg, pair.K_ref)
     moved = factor != 1
-    # the scale of what is placed is held along its whole outline
-    held = moved[seg.pairs].any(axis=1) & (fitted.jump >= CLOSING_PX)
-    order = np.where(held, whole, order)
+    # the scale of a placed region is held along its whole outline
+    beside_moved = moved[seg.pairs].any(axis=1) & (fitted.jump >= CLOSING_PX)
+    order = np.where(beside_moved, whole, order)
     soup = replace(start.soup, lam=start.soup.lam * factor).normalised()
     tie = np.where(moved, TIES.index("occlusion"), start.tie)
-    own = np.where(moved & start.bends, len(seg) + region, start.component)
-    component = np.unique(own, return_inverse=True)[1].ravel()
+    grouped = np.where(moved & start.bends, len(seg) + region, start.component)
+    component = np.unique(grouped, return_inverse=True)[1].ravel()
     part = np.where(start.bends.all(), component, start.part)
     return replace(start, soup=soup, tie=tie, component=component, part=part, order=order)
 
@@ -200,15 +200,15 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, o: Se
 def regions(start: Start, fitted: FlowFit, seg: Segmentation, o: SeededStart) -> Int:
     """(N,) regions with one scale each: rigid components, and surfaces in components that bend.
 
-    Before a camera at rest one region is everything that does not move; the others are connected
-    pieces of what does.
+    Before a camera at rest everything that does not move is one region; the others are connected
+    pieces of moving superpixels.
     """
     if not start.at_rest:
         return np.where(start.bends, len(seg) + start.surface, start.component)
     still = fit_turn(fitted.views)[1] < o.discontinuity_px
     i, k = seg.pairs.T
-    alike = (still[i] == still[k]) & (fitted.jump < o.discontinuity_px)
-    return np.where(still, 0, 1 + connected_labels(alike, seg))
+    continuous = (still[i] == still[k]) & (fitted.jump < o.discontinuity_px)
+    return np.where(still, 0, 1 + connected_labels(continuous, seg))
 
 
 def placed(
@@ -216,10 +216,10 @@ def placed(
 ) -> Float:
     """(N,) factor by which the scale of every superpixel is multiplied to bring regions in order.
 
-    The largest region stays, and so does what is fixed in the image. The others follow one after
-    the other, the one with the most votes against placed regions first. Where the median step of
+    The largest region and those fixed in the image stay. The others are placed one after the
+    other, the one with the most votes against placed regions first. Where the median step of
     log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
-    that step is `IN_FRONT`. What stands on a region that it covers stays if the step across its
+    that step is `IN_FRONT`. A region that stands on one it covers stays if the step across its
     upper outline is `STANDING`. A region without an order moves with the one that it touches most.
 
     Args:
@@ -235,9 +235,9 @@ def placed(
     shift, done = np.zeros(count), np.zeros(count, bool)
     done[[largest(region), *region[tie == FIXED]]] = True
     across = region[seg.pairs[:, 0]] != region[seg.pairs[:, 1]]
-    ends, says = region[seg.pairs[across]], order[across]
+    ends, order_across = region[seg.pairs[across]], order[across]
     a, b = np.concatenate([ends, ends[:, ::-1]]).T
-    behind = np.concatenate([says, -says])
+    behind = np.concatenate([order_across, -order_across])
     step = np.log(depth_from_inside(soup, region, seg, K_ref))
     step = np.concatenate([step[0] - step[1], step[1] - step[0]])
     length = np.tile(seg.boundary_length[across], 2).astype(float)
@@ -251,12 +251,12 @@ def placed(
     free[a[behind != 0]] = False
     while (use := ~done[a] & done[b] & (behind != 0)).any():
         c = int(np.argmax(np.bincount(a[use], np.abs(behind[use]), minlength=count)))
-        # c recedes behind what covers it, and comes in front of what it covers
+        # c recedes behind regions that cover it, and comes in front of those that it covers
         for sign in (1.0, -1.0):
-            some = use & (a == c) & (sign * behind > 0)
+            counted = use & (a == c) & (sign * behind > 0)
             now = sign * (step - shift[b])
-            gap = quantile(now[some], length[some], 0.5) if some.any() else IN_FRONT
-            if sign < 0 and (high := some & upper).any():
+            gap = quantile(now[counted], length[counted], 0.5) if counted.any() else IN_FRONT
+            if sign < 0 and (high := counted & upper).any():
                 gap = IN_FRONT if quantile(now[high], length[high], 0.5) >= STANDING else gap
             shift[c] += sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0
         done[c] = True

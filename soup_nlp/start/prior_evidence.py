@@ -1,9 +1,9 @@
 """Whether a depth prior belongs to a pair: by the flow, and by the edges of the image.
 
 The best rigid motion of a component at the depths of the right map explains its flow better than
-that at one depth. Where the camera rests or turns, the flow says nothing. A map of another scene
-then differs from the right one in one thing: shifted or mirrored, it follows the edges of the image
-as well as it does as it is.
+the best one at equal depths. Where the camera rests or turns, the flow is no evidence. A map of
+another scene then differs from the right map in one way: shifted or mirrored, it follows the edges
+of the image as well as in its own place.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ CONFIRMED, POSSIBLE = 0.6, 0.85
 """Error of the flow at the prior's depths relative to that at one depth, above the noise: up to the
 first the flow confirms the prior, above the second it contradicts it."""
 TELLS_PX, TELLS = 0.5, 3.0
-"""Pixels, and multiples of the flow's noise, by which depth must explain the flow of a component
-better than one depth does to be determined; a third of it confirms or contradicts a prior."""
+"""Pixels, and multiples of the flow's noise, by which the depths of a component must explain its
+flow better than one depth, so that it determines them; a third confirms or contradicts a prior."""
 LEAST_SIGMA, UNCONFIRMED = 0.12, 0.35
-"""Standard deviation of log depth of a prior: the least, and that of one that no flow confirms."""
+"""Standard deviation of log depth of a prior: the least, and that of an unconfirmed one."""
 FEWEST = 8
 """Least number of superpixels whose flow is compared with a prior."""
 DEEPEST = 50.0
@@ -54,22 +54,22 @@ TRIALS, FARTHEST, NEAREST = 60, 1 / 3, 0.1
 """Shifted maps, every other one mirrored; the largest shift relative to the side, and the least one
 of a map that is not mirrored, relative to the width."""
 WITHIN = 0.5
-"""Largest share of a map's variance within superpixels: one of independent pixels has nearly 1."""
+"""Largest share of a map's variance within superpixels: that of independent pixels is nearly 1."""
 LEAST = 3.0
 """Standard deviations by which a right map follows superpixels (counted twice) and edges better
-than the shifted ones. Where no flow confirms them right maps have 3.2 and more, those of other
+than the shifted ones. Where no flow confirms them right maps have 3.2 and more, maps of other
 scenes 2.8 and less."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What flow and image say of a depth prior.
+    """Evidence of flow and image for a depth prior.
 
     Attributes:
-        kind: What its values are taken for.
+        kind: Kind of its values.
         log_depth: Log depth, up to a common scale, as a function of its values.
         ratio: Error of the flow of the largest component at the prior's depths relative to that at
-            one depth, above the noise; NaN where the flow says nothing.
+            one depth, above the noise; NaN where the flow is no evidence.
         sigma: Standard deviation of its log depth in the whole image; inf where it is not used.
         determined: Whether the flow determines the depth of the largest component.
     """
@@ -107,7 +107,7 @@ class Seen(NamedTuple):
 
     @property
     def usable(self) -> Mask:
-        """(N,) True where the flow is known and not that of a surface that bends."""
+        """(N,) True where the flow is known and the surface does not bend."""
         start, fitted = self
         return fitted.views.usable & ~start.wrong & ~start.bends & ~fitted.poor
 
@@ -153,41 +153,41 @@ class Seen(NamedTuple):
 
 
 def without_gaps(pair: Pair, seg: Segmentation) -> tuple[Float, Mask, Float]:
-    """Values of a pair's depth prior: (N,) medians, (N,) whether most is known there, and (H, W).
+    """Values of a pair's depth prior: (N,) medians, (N,) True if most pixels have one, and (H, W).
 
-    Where most is unknown they are those of the nearest known superpixel; 1 if there is none.
+    Other superpixels have the median of the nearest one with values; 1 if there is none.
     """
     prior = pair.depth_prior
     assert prior is not None
-    there = np.isfinite(prior)
-    known = np.bincount(seg.labels[there], minlength=len(seg)) > 0.5 * seg.sizes
+    valid = np.isfinite(prior)
+    with_value = np.bincount(seg.labels[valid], minlength=len(seg)) > 0.5 * seg.sizes
     value = np.ones(len(seg))
-    if known.any():
-        labels = np.where(there, seg.labels, -1)
+    if with_value.any():
+        labels = np.where(valid, seg.labels, -1)
         middle = np.asarray(ndimage.median(np.nan_to_num(prior), labels, np.arange(len(seg))))
-        value = middle[known][cKDTree(seg.anchors[known]).query(seg.anchors)[1]]
-    return value, known, np.where(there, prior, value[seg.labels])
+        value = middle[with_value][cKDTree(seg.anchors[with_value]).query(seg.anchors)[1]]
+    return value, with_value, np.where(valid, prior, value[seg.labels])
 
 
 def judged(
     start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, kind: Kind | None
 ) -> Evidence:
-    """What flow and image say of the depth prior of a pair.
+    """Evidence of flow and image for the depth prior of a pair.
 
     Args:
         start: Start without the prior, with about `PIECES` superpixels.
         seg: Superpixels and graphs.
         pair: Images and depth prior.
         fitted: The flow as affine maps.
-        kind: What the values of the prior are; None to find out.
+        kind: Kind of the prior's values; None to choose it by the flow.
     """
     seen, main = Seen(start, fitted), largest(start.component)
-    value, known, whole = without_gaps(pair, seg)
+    value, with_value, whole = without_gaps(pair, seg)
     if np.ptp(value) < 1e-6 * value.max():
         return Evidence(kind or "relative", np.log, np.nan, np.inf, False)
     relief, floor = seen.relief(main)
     at = seen.members(main)
-    kind, log_depth, ratio = calibrated(seen, at[known[at]], value, relief, floor, kind)
+    kind, log_depth, ratio = calibrated(seen, at[with_value[at]], value, relief, floor, kind)
     determined = relief > seen.tells
     if ratio <= CONFIRMED:
         # the share of the relief that is wrong
@@ -211,7 +211,7 @@ def calibrated(
         value: (N,) values of the prior.
         relief: Error of their flow at one depth, above the noise, pixels.
         floor: The noise, pixels.
-        kind: What the values are; None for the one that explains the flow better.
+        kind: Kind of the values; None for the kind that explains the flow better.
     """
     rank = stats.rankdata(value) / (len(value) + 1)
     rises = np.argsort(value)
@@ -227,7 +227,7 @@ def calibrated(
         "ordinal": lambda v: RELIEF * stats.norm.ppf(np.interp(v, value[rises], rank[rises])),
     }
     if len(at) < FEWEST or not relief > seen.tells / 3:
-        # what is lower in an image is mostly nearer
+        # lower parts of an image are mostly nearer
         below = np.corrcoef(rank, seen.fitted.views.anchor[:, 1])[0, 1] > 0
         kind = kind or ("inverse" if below else "relative")
         return kind, logs[kind], np.nan
@@ -238,7 +238,7 @@ def calibrated(
         if name == "inverse":
             depth = partial(inverse, shift=shift)
         tried.append(((error - floor) / relief, name, depth))
-    ratio, name, log_depth = min(tried, key=lambda one: one[0])
+    ratio, name, log_depth = min(tried, key=lambda trial: trial[0])
     # where neither explains the flow a shift lowers the error of any map
     return (name, log_depth, ratio) if ratio <= POSSIBLE else (tried[0][1], tried[0][2], ratio)
 
@@ -252,29 +252,29 @@ def follows_edges(values: Float, image: Image) -> bool:
     """
     rows, columns = (max(8, round(n * SIDE / max(values.shape))) for n in values.shape)
 
-    def resized(one: Any) -> Any:
-        return cv2.resize(one, (columns, rows), interpolation=cv2.INTER_AREA)
+    def resized(values: Any) -> Any:
+        return cv2.resize(values, (columns, rows), interpolation=cv2.INTER_AREA)
 
     small = ndimage.median_filter(resized(values).astype(float), 3)
     if np.ptp(small) < 1e-9:
         return False
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(float), (0, 0), 1.5)
     edges, steps = _ranks(resized(_gradient(grey))), _ranks(_gradient(small))
-    own = segment(resized(image), PIECES)
-    count = np.maximum(np.bincount(own.ravel()), 1)
+    superpixel = segment(resized(image), PIECES)
+    count = np.maximum(np.bincount(superpixel.ravel()), 1)
 
     def scores(mirrored: int, right: float, down: float) -> tuple[float, float]:
         # share of the variance within superpixels, and agreement with the edges
         sign, first = (-1.0, columns - 1.0) if mirrored else (1.0, 0.0)
         move = np.array([[sign, 0.0, first + right], [0.0, 1.0, down]])
-        one, step = (
+        shifted, step = (
             cv2.warpAffine(
                 m, move, (columns, rows), flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REFLECT_101
             )
             for m in (small, steps)
         )
-        inside = one - (np.bincount(own.ravel(), one.ravel()) / count)[own]
-        return float(np.mean(inside**2) / max(one.var(), 1e-30)), float(np.mean(step * edges))
+        inside = shifted - (np.bincount(superpixel.ravel(), shifted.ravel()) / count)[superpixel]
+        return float(np.mean(inside**2) / max(shifted.var(), 1e-30)), float(np.mean(step * edges))
 
     rng = np.random.default_rng(0)
     trials: list[tuple[float, float]] = []
@@ -284,9 +284,9 @@ def follows_edges(values: Float, image: Image) -> bool:
         if mirrored or abs(down) + abs(right) >= NEAREST * columns:
             trials.append(scores(mirrored, -right, -down))
     chance = np.array(trials)
-    found = np.array(scores(0, 0.0, 0.0))
-    better = (found - chance.mean(axis=0)) / np.maximum(chance.std(axis=0), 1e-12)
-    return bool(found[0] <= WITHIN and better @ [-2.0, 1.0] > LEAST)
+    unshifted = np.array(scores(0, 0.0, 0.0))
+    better = (unshifted - chance.mean(axis=0)) / np.maximum(chance.std(axis=0), 1e-12)
+    return bool(unshifted[0] <= WITHIN and better @ [-2.0, 1.0] > LEAST)
 
 
 def _gradient(values: Float) -> Float:

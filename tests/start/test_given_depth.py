@@ -31,7 +31,7 @@ from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
 
 WAVE = np.sin(np.mgrid[0:240, 0:320] / 40.0).prod(axis=0)
-"""A smooth map that has nothing to do with a scene."""
+"""A smooth map that is independent of the scene."""
 
 
 class Seen:
@@ -41,16 +41,16 @@ class Seen:
         pair = render_scene(scene, seed, 320, 240)
         self.pair = pair.with_flow(flow_from_truth(pair))
         self.seg = build_segmentation(segment(pair.image_ref, 150), pair.image_ref)
-        own = self.pair.flow, pair.K_ref, pair.K_next
-        self.start: Start = propose(self.seg, *own, SeededStart())
+        flow_data = self.pair.flow, pair.K_ref, pair.K_next
+        self.start: Start = propose(self.seg, *flow_data, SeededStart())
         self.depth = pair.truth.depth_ref
         self.anchor = rays(pair.K_ref, self.seg.anchors)
 
     def by(self, prior: np.ndarray, kind: str | None = None) -> tuple[Start, Given]:
         pair = replace(self.pair, depth_prior=prior)
         fitted = FlowFit.of(self.seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
-        own = self.start, self.seg, pair, fitted
-        return by_prior(*own, judged(*own, kind))
+        start_data = self.start, self.seg, pair, fitted
+        return by_prior(*start_data, judged(*start_data, kind))
 
     def error(self, start: Start) -> np.ndarray:
         """(N,) log depth of the anchors less the true one, one scale left out."""
@@ -85,7 +85,7 @@ def test_inverse_depth_with_a_shift_is_found(swing):
 
 
 def test_planes_lean_as_the_given_depth_does_inside_superpixels(pan):
-    """Twice as near to it as planes of one depth; a step inside a superpixel tilts none."""
+    """They are twice as near to it as level planes; a step inside a superpixel tilts none."""
     labels, K = pan.seg.labels, pan.pair.K_ref
     start, given = pan.by(pan.depth)
     planes = reconstruct(start.soup, labels, K, K, labels.shape).depth_ref / pan.depth
@@ -116,17 +116,19 @@ def test_orientation_is_held_inside_a_plane_and_released_at_creases(pan):
     pair, seg = pan.pair, pan.seg
     data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 4, 0, True)
     free, stiffer = np.ones(len(data.edges)), np.full(len(seg), 100.0)
-    known = given.log_depth, given.opened, given.error, start.component, free, stiffer
-    gain = with_prior(data, start.soup, *known, creased=True).orient_weight / data.orient_weight
+    prior_data = given.log_depth, given.opened, given.error, start.component, free, stiffer
+    gain = (
+        with_prior(data, start.soup, *prior_data, creased=True).orient_weight / data.orient_weight
+    )
     a, b = start.soup.n[data.pairs.T]
     angle = np.degrees(np.arccos(np.clip((a * b).sum(axis=1), -1, 1)))
     assert gain[angle < 1].min() > 90
     assert gain[angle > 30].max() < 10
-    plain = with_prior(data, start.soup, *known, creased=False).orient_weight
+    plain = with_prior(data, start.soup, *prior_data, creased=False).orient_weight
     np.testing.assert_allclose(plain, 100 * data.orient_weight)
     # where the flow determines the slopes nothing changes
-    known = given.log_depth, np.zeros(len(seg)), *known[2:]
-    flat = with_prior(data, start.soup, *known, creased=True).orient_weight
+    prior_data = given.log_depth, np.zeros(len(seg)), *prior_data[2:]
+    flat = with_prior(data, start.soup, *prior_data, creased=True).orient_weight
     np.testing.assert_array_equal(flat, data.orient_weight)
 
 
@@ -150,14 +152,14 @@ def test_superpixels_end_at_steps_of_a_prior_that_no_flow_confirms(pan, swing):
 
 
 def test_the_number_of_superpixels_does_not_change_what_a_prior_is_found_to_be(swing):
-    found = []
+    numbers = []
     for count in (300, 450):
         raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": count}}
         pair = replace(swing.pair, depth_prior=swing.depth * np.exp(0.2 * WAVE))
         given = prepare(make_problem(raw), pair=pair).given
-        found.append(given.as_dict() | {"held": None})
+        numbers.append(given.as_dict() | {"held": None})
         assert len(given.held) > 0.9 * count
-    assert found[0] == found[1]
+    assert numbers[0] == numbers[1]
 
 
 @pytest.mark.parametrize("wrong", ["constant", "smooth", "upside down", "unknown", "pixels"])
@@ -186,8 +188,8 @@ def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
     assert np.abs(pan.error(start)).mean() < 0.1 < np.abs(pan.error(pan.start)).mean()
     # whatever the depth, the flow stays
     moved = [s.soup.moved(s.soup.points(pan.anchor)) for s in (start, pan.start)]
-    one, two = (m[:, :2] / m[:, 2:] for m in moved)
-    np.testing.assert_allclose(one, two, atol=1e-9)
+    first, second = (m[:, :2] / m[:, 2:] for m in moved)
+    np.testing.assert_allclose(first, second, atol=1e-9)
 
 
 def test_steps_on_the_edges_of_the_image_tell_a_map_of_it():

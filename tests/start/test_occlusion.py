@@ -129,9 +129,9 @@ def test_what_swings_comes_before_the_wall(swing):
     start = ordered(before, seg, pair)
     u, v = np.rint(seg.anchors).astype(int).T
     truth = np.log(pair.truth.depth_ref[v, u])
-    known = start.order != 0
-    i, k = np.where(start.order > 0, seg.pairs.T, seg.pairs.T[::-1])[:, known]
-    assert known.sum() > 10
+    ordered_pairs = start.order != 0
+    i, k = np.where(start.order > 0, seg.pairs.T, seg.pairs.T[::-1])[:, ordered_pairs]
+    assert ordered_pairs.sum() > 10
     assert np.mean(truth[i] > truth[k]) > 0.9
 
     def right(s) -> float:
@@ -195,9 +195,9 @@ def test_the_nlp_keeps_the_order_and_marks_it_a_guess(covers):
     case = prepare(problem, pair=pair)
     assert (case.start.tie == TIES.index("occlusion")).any()
     done = run(problem, pair=pair)
-    known = case.start.order != 0
+    ordered_pairs = case.start.order != 0
     z = done.soup.depth_across(done.segmentation.pairs, case.data.boundary_ray.mean(axis=1))
-    step = (np.log(z[0] / z[1]) * np.sign(case.start.order))[known]
+    step = (np.log(z[0] / z[1]) * np.sign(case.start.order))[ordered_pairs]
     assert np.median(step) > 0.2
     assert done.energy["order"] >= 0
     assert (done.reconstruction.sigma_ref > MOST_SIGMA).all()
