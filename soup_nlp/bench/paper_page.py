@@ -46,7 +46,7 @@ WITHOUT_TRUTH = {
 def write_paper(
     page: Path, frame: pd.DataFrame, plan: pd.DataFrame, command: str, note: str
 ) -> None:
-    """Write the page and its figures beside it; `note` says the sizes of the rows."""
+    """Write the page and its figures beside it; `note` gives the sizes of the rows."""
     folder = page.parent
     rows = plan.join(frame.set_index("key").drop(columns="variant"), on="key")
     sections = dict(list(rows.groupby("section", sort=False)))

@@ -1,4 +1,4 @@
-"""Search for better default options by Optuna; every family judges what the others choose.
+"""Search for better default options by Optuna; every family tests what all others choose.
 
 Trial t000 is the default. The same pairs and code give the same trials, and an interrupted
 search can be continued.

@@ -35,7 +35,7 @@ class Study:
     Attributes:
         text: The question.
         variants: Overrides by name of a variant, in the order of the tables.
-        published: What the paper says on it.
+        published: Result in the paper.
     """
 
     text: str

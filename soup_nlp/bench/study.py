@@ -196,7 +196,7 @@ def pivot(
 
 
 def show(value: Any, form: str = ".4f") -> str:
-    """A value as text: numbers in a format, a dash for what is not known."""
+    """A value as text: numbers in a format, a dash for an unknown value."""
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return "-"
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)

@@ -1,1 +1,1 @@
-"""The command line: the verbs and what they share."""
+"""The command line: its commands and their common parts."""

@@ -60,7 +60,7 @@ def chain(
 
     def begin(sequence: Frames, pairs: int) -> None:
         count = len(sequence)
-        names = ", ".join(Path(one).name for one in sequence.names)
+        names = ", ".join(Path(file).name for file in sequence.names)
         spacing = f", far enough apart: {names}" if stride == AUTO else ""
         if not quiet:
             print(f"{count} frames{spacing}; {pairs} pairs to solve", file=sys.stderr)

@@ -80,10 +80,10 @@ def report_bug(error: BaseException) -> int:
         handle, path = tempfile.mkstemp(prefix="soup_nlp_bug_", suffix=".txt")
         with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
             file.write(text)
-    said = printable(f"{type(error).__name__}: {error}", 200)
+    summary = printable(f"{type(error).__name__}: {error}", 200)
     print(
         f"error: this is a bug of soup-nlp, please report it with the file below\n"
-        f"  found: {said}\n  where: {path}",
+        f"  found: {summary}\n  where: {path}",
         file=sys.stderr,
     )
     return BUG
@@ -167,7 +167,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 raise KeyboardInterrupt
         sys.stdout.flush()
     except BrokenPipeError:
-        # the rest of the output has no reader
+        # nothing reads the output any more
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
@@ -183,15 +183,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _explained(error: Exception) -> int:
     """Print the message of an exception for the user; returns the exit code."""
-    said: object = error if isinstance(error, SoupError) else refusal(error)
-    if said is None and hasattr(error, "format_message"):
+    explanation: object = error if isinstance(error, SoupError) else refusal(error)
+    if explanation is None and hasattr(error, "format_message"):
         # a usage error; its message is empty for a bare command, whose help is printed
-        said = printable(error.format_message())
-    if said is None:
+        explanation = printable(error.format_message())
+    if explanation is None:
         return report_bug(error)
-    stopped = isinstance(said, StoppedError)
-    if said:
-        print(said if stopped else f"error: {said}", file=sys.stderr)
+    stopped = isinstance(explanation, StoppedError)
+    if explanation:
+        print(explanation if stopped else f"error: {explanation}", file=sys.stderr)
     return ABORTED if stopped else 2
 
 

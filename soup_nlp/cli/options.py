@@ -162,7 +162,7 @@ def camera(text: str | None, option: str) -> list[float] | str | None:
 
 @contextmanager
 def resumable(kept: str, where: object) -> Iterator[None]:
-    """Have Ctrl-C end the block with a message on what is kept.
+    """Context in which Ctrl-C ends the block with a message on the results that are kept.
 
     Raises:
         StoppedError: there was a Ctrl-C.

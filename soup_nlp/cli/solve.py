@@ -217,7 +217,7 @@ def solve_problem(
                 raise KeyboardInterrupt
         except BaseException as error:
             log.lines.append(f"failed: {str(error) or type(error).__name__}")
-            # the message says everything about input that cannot be used
+            # for input that cannot be used the message is enough
             if not isinstance(error, ConfigError | DataError):
                 with suppress(SoupError):
                     write_failure(folder, "\n".join(log.lines) + "\n", ipopt_log)
@@ -227,19 +227,19 @@ def solve_problem(
 
         code, why = exit_code(run, mre_at_most)
 
-        said = []
+        verdicts = []
 
         def log_text(files: list[str]) -> str:
             log.stage("files")
             for details in (log.verbose, True):
-                told = verdict(run, folder, files, mre_at_most, details)
-                said.append(f"{told}\nexit code   {code}: {why}")
-            log.lines.append(said[-1])
+                text = verdict(run, folder, files, mre_at_most, details)
+                verdicts.append(f"{text}\nexit code   {code}: {why}")
+            log.lines.append(verdicts[-1])
             return "\n".join(log.lines) + "\n"
 
         write_folder(folder, run, dump_problem(chosen), log_text, ipopt_log=ipopt_log)
     summary = folder / "summary.json"
-    print(summary.read_text(encoding="utf-8") if as_json else said[0])
+    print(summary.read_text(encoding="utf-8") if as_json else verdicts[0])
     return code
 
 

@@ -62,8 +62,8 @@ def borrow(
 
 
 OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6
-"""Quantiles of the depth ratios: along the outline of a component, along its contact with what lies
-below it, and along the outline as the upper limit of a scale by contact below."""
+"""Quantiles of the depth ratios: along the outline of a component, along its contact with lower
+neighbours, and along the outline as the upper limit of a scale by contact below."""
 BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 UNKNOWN = np.log(100.0)
@@ -86,7 +86,7 @@ TIES = (
 )
 """What gives a component its scale. reference: it is the largest component and defines the scale.
 contact below: it stands on its lower neighbours. outline: it touches its neighbours. cut off below:
-the lower image border hides what it stands on. nothing: it has no neighbour with a scale. ground:
+the lower image border hides its support. nothing: it has no neighbour with a scale. ground:
 it was lifted to the ground. fixed in the image: it stands still there, though the camera moves,
 and is placed by its outline. given depth: a depth prior gives it. occlusion: it covers its
 background, and is placed in front of the background by a guess."""
@@ -144,7 +144,7 @@ def contact_scales(
     fixed: Mask | None = None,
     usable: Mask | None = None,
 ) -> tuple[Float, Int]:
-    """Relative scale of every component, such that components touch what is around them.
+    """Relative scale of every component, such that components touch their surroundings.
 
     In an upright image a component stands on its lower neighbours. Its scale is then the quantile
     GROUND of the depth ratios to them, weighted by `Outlines.weight`. A component occludes what is

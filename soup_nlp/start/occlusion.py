@@ -226,7 +226,7 @@ def placed(
         soup: Planes.
         region: (N,) region of every superpixel.
         order: (P,) see `vote`.
-        tie: (N,) what gives every superpixel its scale, see `components.TIES`.
+        tie: (N,) origin of every superpixel's scale, see `components.TIES`.
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
     """

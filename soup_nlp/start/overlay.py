@@ -1,9 +1,9 @@
 """Regions that stand still in the image of a moving camera: bonnet, logo, text, dirt on the lens.
 
-They are fixed to the camera, or move as it does, so that their flow says nothing about depth, and
-nothing about the camera's motion either. A distant region stands still as well, but its depth
-under the camera's motion explains that. The flow of a fixed region contradicts every depth from the
-ground, where there is one, to infinity.
+They are fixed to the camera, or move as it does, so that their flow shows neither depth nor the
+camera's motion. A distant region stands still as well, but its depth under the camera's motion
+explains that. The flow of a fixed region contradicts every depth from the ground, where there is
+one, to infinity.
 """
 
 from __future__ import annotations

@@ -121,8 +121,8 @@ class Seen(NamedTuple):
         """The rigid motion of superpixels (M,) with inverse depths (M,), and their shift.
 
         Returns:
-            Error in pixels without the largest tenth, R and T of `X' = R X + T`, and what is added
-            to all inverse depths, 0 unless `shifted`.
+            Error in pixels without the largest tenth, R and T of `X' = R X + T`, and the shift
+            added to all inverse depths, 0 unless `shifted`.
         """
         views, target = self.fitted.views, self.fitted.centre[at]
         ray, middle = views.anchor[at], float(np.median(np.abs(inverse)))

@@ -56,12 +56,12 @@ class Start:
         motions: The dominant motions.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
             where a region bends, discontinuities make up most of its outline.
-        tie: (N,) what gives the component of every superpixel its scale, an index of `TIES`.
+        tie: (N,) origin of the scale of every superpixel's component, an index of `TIES`.
         grounded: (N,) True where the depth is borrowed and the ground is known below the horizon.
         bends: (N,) True where the energy for bending surfaces is used. Its connected regions are
             components that start at a constant depth, each superpixel with a motion of its own. If
-            the rest is small or has no parallax, or the camera is at rest, it is the whole image
-            and one component.
+            the rigid part is small or has no parallax, or the camera is at rest, the whole image is
+            one such component.
         wrong: (N,) True where no accepted motion (`earned`) explains the flow, which then counts as
             wrong.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
@@ -143,7 +143,7 @@ def propose(
         return _constant(views, surface, choice, limited_noise(residual), turn)
     free = constant_depth(views)
     if bends.any():
-        # the flow of bending regions says nothing about the motions of the rest
+        # the flow of bending regions is no evidence of the motions of rigid ones
         views, poor = views.without(bends), poor | bends
         choice, noise = rigid_motions(views, seg, jump, motions, o)
     else:

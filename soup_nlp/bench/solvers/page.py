@@ -118,16 +118,16 @@ def of_family(frame: pd.DataFrame) -> pd.DataFrame:
 def conclusion(frame: pd.DataFrame) -> list[str]:
     """Conclusion in two sentences."""
     solved = np.isfinite(cost_table(frame, "seconds")).sum()
-    some = solved[solved > 0].sort_values(ascending=False, kind="stable")
+    successes = solved[solved > 0].sort_values(ascending=False, kind="stable")
     problems = frame.groupby(PROBLEM).ngroups
-    told = ", ".join(f"{name} {count}" for name, count in some.items()) or "none"
+    counts = ", ".join(f"{name} {count}" for name, count in successes.items()) or "none"
     claims = frame[frame["claimed"]]
     false = sorted(claims.loc[~claims["verified"], "solver"].unique())
-    more = f"; not always those of {', '.join(false)}" if false else ""
-    true = f"{int(claims['verified'].sum())} of {len(claims)}{more}"
+    exceptions = f"; not always those of {', '.join(false)}" if false else ""
+    true = f"{int(claims['verified'].sum())} of {len(claims)}{exceptions}"
     return [
         f"**{problems} problems, {len(solved)} solvers, {len(frame)} runs:"
-        f" {int(frame['verified'].sum())} verified.** Verified problems by solver: {told}.",
+        f" {int(frame['verified'].sum())} verified.** Verified problems by solver: {counts}.",
         *([f"Claims of an optimum that were true: {true}."] if len(claims) else []),
     ]
 
@@ -301,7 +301,7 @@ def summary(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Solvers that tried and that reached the best known point, by problem (name without start).
 
     "runs" has objective, CPU seconds, their limit and whether the point is verified, by start and
-    solver: what `records/published.json` takes for the README of the set.
+    solver, as `records/published.json` has them for the README of the set.
     """
 
     def entry(row: pd.Series) -> list[Any]:

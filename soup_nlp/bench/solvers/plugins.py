@@ -159,7 +159,7 @@ PLUGINS: Mapping[str, Plugin] = {
     "fatrop-tuned": Plugin("fatrop", TWO_LIMITS, {**QUIET, "mu_init": NEAR_START["mu_init"]}),
     "bonmin-tuned": Plugin("bonmin", TWO_LIMITS, {**QUIET, **NEAR_START}),
 }
-""""ipopt" has the default options of Ipopt. "ipopt-soup" has those that `solve` uses for a start
+""""ipopt" has the default options of Ipopt. "ipopt-soup" has the options of `solve` for a start
 that is no KKT point, and "ipopt-tuned" the same with the exact Hessian. Other names with "-tuned"
 have the options for a start near the minimum. blocksqp is left out, since it needs a linear solver
 (ma27) that the wheel of CasADi lacks."""
@@ -207,7 +207,7 @@ def plugin(name: str, task: Task) -> Answer:
     watch = _Watch(begin + task.limits.seconds)
     # parameters are replaced by numbers, since bonmin has no parameters
     x, functions = ca.MX.sym("x", nlp.nx), Functions(nlp)
-    # these differentiate f and g when they are made, in spite of cached derivatives
+    # these libraries differentiate f and g at set-up, in spite of cached derivatives
     symbolic = library in ("bonmin", "uno")
     f, g = nlp.oracle(x, nlp.p) if symbolic else functions.oracle(x, nlp.thetas())
     common: dict[str, Any] = {
@@ -246,7 +246,7 @@ def _derivatives(
     f, grad = functions.grad_f(x, theta)
     g, jac = functions.jac_g(x, theta)
     upper = functions.hess_lag(x, theta, lam_f, lam_g)
-    known = {
+    derivatives = {
         "f": f,
         "grad_f_x": grad,
         "g": g,
@@ -260,6 +260,6 @@ def _derivatives(
     out = {}
     for name, outputs in wanted.items():
         words = ["x", "p"] if name.startswith(FIRST) else list(inputs)
-        values = [known[k] for k in outputs]
+        values = [derivatives[k] for k in outputs]
         out[name] = ca.Function(name, [inputs[w] for w in words], values, words, list(outputs))
     return out

@@ -62,9 +62,9 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
 
 def _find(name: str) -> str | None:
     """Absolute path of an executable on the PATH or beside Python; None if there is none."""
-    found = shutil.which(name) or shutil.which(str(Path(sys.executable).parent / name))
+    path = shutil.which(name) or shutil.which(str(Path(sys.executable).parent / name))
     # absolute, since it runs in another folder
-    return None if found is None else str(Path(found).absolute())
+    return None if path is None else str(Path(path).absolute())
 
 
 def pounce(command: str, task: Task, near: bool = False) -> Answer:
@@ -107,7 +107,7 @@ def package(task: Task) -> Answer:
     seconds = clock() - begin
     ended = stage.status, stage.converged, iterations, seconds
     if task.form.coordinates == "tangent":
-        # it solves the program in matrices, whose multipliers are others
+        # the package solves the program in matrices, whose multipliers differ
         return Answer(task.point(answer.soup), None, *ended)
     return Answer(stage.x, stage.lam_g, *ended)
 
@@ -130,11 +130,11 @@ def find_solver(name: str) -> Solver:
     """The solver of a name, or the executable of that name (AMPL convention).
 
     Raises:
-        SolverError: there is neither.
+        SolverError: there is neither a solver nor an executable.
     """
-    known = available()
-    if name in known:
-        return known[name]
+    installed = available()
+    if name in installed:
+        return installed[name]
     # options may follow the name of the program, whose path may have spaces
     command, options = _find(name), list[str]()
     if command is None:
@@ -145,6 +145,6 @@ def find_solver(name: str) -> Solver:
             "solver is not here",
             where="--solvers",
             found=name,
-            expected=", ".join(known) + ", or a program that reads .nl",
+            expected=", ".join(installed) + ", or a program that reads .nl",
         )
     return partial(executable, command, options=options)

@@ -158,7 +158,7 @@ def compare(
     """Run every solver on every task; runs that the file holds already are not repeated.
 
     `path` is a JSON-lines file; `say` is called with a line before and after each run, `after` with
-    all rows so far after each.
+    all rows so far after each run.
     """
 
     def run(label: Label, make: Maker, solver: str) -> Row:
