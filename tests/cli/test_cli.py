@@ -225,7 +225,7 @@ def test_one_superpixel_is_one_plane(images, tmp_path):
         ("check missing", "summary.json is missing"),
     ],
 )
-def test_what_is_no_pair_and_no_result_is_refused(words, part, capsys):
+def test_arguments_that_are_no_pair_and_no_result_are_refused(words, part, capsys):
     assert main(words.split()) == 2
     assert part in capsys.readouterr().err
 

@@ -168,7 +168,7 @@ def test_a_version_has_its_changelog_and_citation():
 
 
 @pytest.mark.parametrize("home", [*COMMANDS.values(), *BENCH.values()])
-def test_help_says_what_the_command_says_of_itself(home):
+def test_help_has_the_first_line_of_the_docstring(home):
     module, _, function = home.partition(":")
     text = inspect.getdoc(getattr(import_module(f"soup_nlp.cli.{module}"), function))
     assert text.splitlines()[0] == first_line(home)

@@ -88,7 +88,7 @@ def test_depth_is_scored_from_run_array_or_stored_result(run, tmp_path):
         soup_nlp.evaluate(run, truth[1:])
 
 
-def test_a_stored_result_has_what_its_run_has(run, tmp_path):
+def test_a_stored_result_has_the_arrays_of_its_run(run, tmp_path):
     run.save(tmp_path / "out")
     stored = soup_nlp.load(str(tmp_path / "out"))
     for name in ("depth_ref", "depth_next", "points_next", "sigma_ref"):

@@ -97,7 +97,7 @@ def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least,
 
 @pytest.mark.parametrize("seed", [1, 5])
 def test_a_rigid_room_does_not_bend_with_its_banner(seed):
-    # surfaces without the cuts at smaller jumps: all of the image bends
+    # without cuts at smaller jumps the whole image would bend
     banner = problem("banner", f"input.seed={seed}")
     start = prepare(banner, pair=banner.load_pair()).start
     assert 0.3 < start.bends.mean() < 0.4
@@ -115,19 +115,19 @@ def test_small_surfaces_join_the_neighbour_with_the_longest_outline():
     column = (seg.anchors[:, 0] // 8).astype(int)
     surface = np.where(column < 10, 0, np.where(column == 10, 1, 2))
     usable = np.ones(len(seg), bool)
-    # two superpixels of sixty: one side has as long an outline as the other, the first is taken
+    # two superpixels of sixty: both outlines are equally long, so the first neighbour is taken
     np.testing.assert_array_equal(joined(surface, usable, seg), np.where(column < 11, 0, 2))
     # without usable flow a surface is small, however many superpixels it has
     np.testing.assert_array_equal(joined(surface, column >= 11, seg), 2)
     np.testing.assert_array_equal(joined(surface, ~usable, seg), joined(surface, ~usable, seg)[0])
 
 
-def test_what_bends_is_found_beside_rigid_surfaces():
+def test_a_bending_surface_is_found_beside_rigid_ones():
     c = case("banner")
     start, true = c.start, majority(c.pair.truth, c.segmentation)[0]
     assert 0.2 < start.bends.mean() < 0.5
     np.testing.assert_array_less(0.93, np.mean(start.bends == (true == 1)))
-    # it is one component without shared motions; the rest has those of a rigid scene
+    # it is one component without shared motions; other superpixels have those of a rigid scene
     assert len(np.unique(start.component[start.bends])) == 1
     assert not np.isin(start.component[~start.bends], start.component[start.bends]).any()
     assert (start.motion[start.bends] == -1).all()
@@ -165,12 +165,12 @@ def test_both_kinds_of_regions_are_reconstructed_in_one_image():
 
 
 def test_depth_starts_constant_where_the_camera_is_at_rest():
-    """Its background could as well be far: what moves before it would be given a depth."""
+    """The background could as well be far: a depth of moving parts before it would be arbitrary."""
     c = case("still", UNORDERED)
     assert c.start.at_rest
     assert c.start.bending
     np.testing.assert_allclose(c.soup.depth_at(c.data.anchor_ray), 1.0, rtol=1e-9)
-    # what occlusion shows before the background comes nearer than its constant depth
+    # parts that occlude the background come nearer than its constant depth
     ordered = case("still")
     z = ordered.soup.depth_at(ordered.data.anchor_ray)
     background = ordered.start.component == 0
@@ -232,7 +232,7 @@ def test_noise_where_surfaces_bend_is_that_of_affine_flows():
 
 
 def test_where_surfaces_bend_the_presolve_begins_with_narrower_norms():
-    """Also with more widths than that: those above the limit are one stage."""
+    """With more widths too: all widths above the limit are one stage."""
     assert case("sheet").options.presolve_eps == (0.1, 0.03, 0.01)
     assert case("room").options.presolve_eps == (0.3, 0.03, 0.01)
     assert case("sheet", "solver.presolve_eps=[1.0, 0.3, 0.02]").options.presolve_eps == (0.1, 0.02)
@@ -267,7 +267,7 @@ def test_weights_where_surfaces_bend_follow_those_that_are_set():
 
 
 def with_factors(c: Case, monkeypatch: pytest.MonkeyPatch, **factors: float) -> Case:
-    """A case with other factors of what holds surfaces together across a discontinuity."""
+    """A case with other factors of the terms that join surfaces across a discontinuity."""
     monkeypatch.setattr(pipeline_case, "ACROSS_DISCONTINUITIES", factors)
     data, weights = build_energy(c.problem, c.pair, c.segmentation, c.start)
     return replace(c, data=data, weights=weights)
@@ -296,11 +296,11 @@ def test_little_holds_surfaces_together_across_discontinuities(ratio, graph, col
 
 
 def test_the_wall_behind_a_sheet_leaves_it_its_relief(monkeypatch):
-    # without E_prior, which flattens what these factors leave free
+    # without E_prior, which flattens the relief that these factors leave free
     c = case("sheet", "energy.weights.prior=0.0", UNORDERED)
     without_factors = with_factors(c, monkeypatch, arap=1.0, cont=0.01, orient=1.0)
     assert own_relief(c) < 0.7 * own_relief(without_factors)
-    # nor does the order that occlusion shows flatten it
+    # the order by occlusion does not flatten the relief either
     assert own_relief(case("sheet", "energy.weights.prior=0.0")) < 0.7 * own_relief(without_factors)
 
 
@@ -342,7 +342,7 @@ def test_a_gap_in_a_discontinuity_does_not_join_two_surfaces():
     seg = strip(10)
     left = seg.anchors[:, 0] < 40
     surface = surfaces(jumps(seg, 40, np.array([2.0, 0.6]), 0.01), seg, 1.0)
-    # one of two rows is whole at 1 px: half of the outline is a discontinuity
+    # one of two rows jumps by more than 1 px: half of the outline is a discontinuity
     np.testing.assert_array_equal(surface == surface[0], left)
     whole = surfaces(jumps(seg, 40, np.array([0.9, 0.6]), 0.01), seg, 1.0)
     assert (whole == whole[0]).all()

@@ -149,7 +149,7 @@ def scales(z, component, far=0.01, **options):
 
 
 def thrice(cells):
-    """Three superpixels of each, both ways: all have some behind them."""
+    """Every entry as 3 x 3 superpixels, so that every boundary has inner neighbours."""
     return np.repeat(np.repeat(cells, 3, axis=0), 3, axis=1)
 
 
@@ -157,23 +157,23 @@ TOWER = [[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]]
 TOWER_OF = [[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]]
 CORNER = [[0, 0, 0], [0, 1, 0], [0, 0, 0]]
 CONTACTS = {
-    # a tall piece before a far wall, with the longer outline, on a low one on the ground
+    # a tall piece with a long outline to a far wall, on a low piece that stands on the ground
     "pieces": (TOWER, TOWER_OF, 2.0),
-    # what stands on nothing in the image, cut off by its lower edge, waits for nothing
+    # a component cut off by the lower image border, without a visible support, does not wait
     "cut off": (
         [[8.0] * 5, [8, 1, 1, 8, 8], [8, 8, 1, 2, 2], *[[2, 2, 1, 2, 2]] * 2],
         [[0, 0, 0, 0, 0], [0, 2, 2, 0, 0], *[[0, 0, 1, 0, 0]] * 3],
         2.0,
     ),
-    # all that is below the arch is a component that touches nothing else: neither can wait
+    # the component below the arch touches nothing else: neither of them can wait
     "arch": (
         [[4.0] * 5, [4, 1, 1, 1, 4], [4, 1, 1, 1, 4]],
         [[0, 0, 0, 0, 0], [0, 2, 2, 2, 0], [0, 2, 1, 2, 0]],
         4.0,
     ),
-    # amid a wall, on the ground, half behind a near thing
+    # before a wall, on the ground, half behind a near object
     "ground": ([[1.0, 4, 4], [1, 1, 4], [1, 2.0, 2.0]], CORNER, 2.0),
-    # a ground that is beyond most of what the component hides is none
+    # a ground farther than most of the outline does not count
     "far ground": ([[1.0, 4, 4], [1, 1, 4], [1, 40.0, 40.0]], CORNER, 4.0),
     # the lower edge of the image cuts it off: a low quantile of the depth ratios around it
     "outline": ([[4.0, 6, 4], [3, 1, 3.5]], [[0, 0, 0], [0, 1, 0]], 3.0),
@@ -205,12 +205,12 @@ def test_a_car_has_room_between_its_wheels():
 
 @pytest.mark.parametrize(
     ("far", "scale"),
-    # at the outline's 3 it moves 3 far: as far as the scene, less, four times as far, and farther
-    # than what a camera at rest could tell anything about
+    # at the outline's depth 3 it moves by 3 far: as far as the scene, less, four times as far, and
+    # so far that the camera is taken to be at rest
     [(1 / 3, 3.0), (0.1, 3.0), (4 / 3, 1.5), (1e3, 3.0)],
 )
 def test_components_at_the_lower_edge_are_nearer_when_faster(far, scale):
-    """Half way, in logarithms, to where it moves as far as the scene."""
+    """The component comes half way, in logarithms, to where it moves like the scene."""
     z = thrice([[4.0, 6, 4], [3, 1, 3.5]])
     component = z == 1
     scale_found = scales(z, component, far)
@@ -227,8 +227,8 @@ def test_components_at_the_lower_edge_are_nearer_when_faster(far, scale):
     )
 
 
-def test_pieces_of_what_is_cut_off_are_nearer_together():
-    """The upper one, which moves by itself, keeps its contact with the lower."""
+def test_pieces_of_a_cut_off_object_come_nearer_together():
+    """The upper piece, which moves by itself, keeps its contact with the lower one."""
     component = thrice([[0, 0, 0], [0, 2, 0], [0, 1, 0]])
     z = thrice([[8.0, 8, 8], [4, 1, 4], [4, 1, 4]])
     scale_found = scales(z, component, np.where(np.ravel(component) == 1, 4.0, 0.5))
@@ -252,7 +252,7 @@ def test_pieces_of_what_is_cut_off_are_nearer_together():
     ],
 )
 def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, monkeypatch):
-    """Rendered pairs whose lower part is cropped: contact alone puts what is cut too far."""
+    """Rendered pairs whose lower part is cropped: contact alone puts cut-off components too far."""
     what = {"kind": "scene", "scene": scene, "seed": seed, "width": 512, "height": 218}
     problem = make_problem({"input": what, "segmentation": {"superpixels": count}})
     pair = problem.load_pair()
@@ -302,7 +302,7 @@ def test_blurred_outlines_are_seen_through(world):
     z[component] = 1.0
     grown = np.pad(component, 1)
     near = sum(np.roll(grown, s, axis) for s in (-1, 1) for axis in (0, 1))[1:-1, 1:-1]
-    # nothing is behind the corners
+    # corners have no inner neighbours
     z[component & (near == 3)] = 1.6
     z[~component & (near > 0)] = 2.0
     np.testing.assert_allclose(scales(z, component), np.where(component, 4.0, 1.0), rtol=1e-12)
@@ -319,7 +319,7 @@ def test_depths_from_inside_follow_slanted_planes(world):
     exact = one.depth_across(seg.pairs[across], ray)
     assert np.ptp(exact) > 0
     np.testing.assert_allclose(depth_from_inside(one, component, seg, K), exact, rtol=1e-12)
-    # one superpixel of an outline off its plane changes nothing: its neighbours inside answer
+    # one wrong superpixel on an outline changes nothing: its inner neighbours decide
     off = one.lam.copy()
     off[np.flatnonzero(component == 1)[0]] *= 3
     assert np.isin(np.flatnonzero(component == 1)[0], seg.pairs[across])

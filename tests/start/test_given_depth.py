@@ -69,7 +69,7 @@ def pan() -> Seen:
     return Seen("pan")
 
 
-def test_a_confirmed_prior_gives_what_swings_its_scale(swing):
+def test_a_confirmed_prior_gives_a_swinging_object_its_scale(swing):
     before = np.abs(swing.error(swing.start)).mean()
     start, given = swing.by(swing.depth * np.exp(0.1 * WAVE))
     assert given.evidence.kind == "relative"
@@ -151,7 +151,7 @@ def test_superpixels_end_at_steps_of_a_prior_that_no_flow_confirms(pan, swing):
     np.testing.assert_array_equal(cut(swing, swing.depth).labels, cut(swing, None).labels)
 
 
-def test_the_number_of_superpixels_does_not_change_what_a_prior_is_found_to_be(swing):
+def test_the_number_of_superpixels_does_not_change_the_evidence_for_a_prior(swing):
     numbers = []
     for count in (300, 450):
         raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": count}}
@@ -186,7 +186,7 @@ def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
     assert given.held.all()
     assert (given.sigma > 0.25).all()
     assert np.abs(pan.error(start)).mean() < 0.1 < np.abs(pan.error(pan.start)).mean()
-    # whatever the depth, the flow stays
+    # the flow is the same at both depths
     moved = [s.soup.moved(s.soup.points(pan.anchor)) for s in (start, pan.start)]
     first, second = (m[:, :2] / m[:, 2:] for m in moved)
     np.testing.assert_allclose(first, second, atol=1e-9)

@@ -114,7 +114,7 @@ def test_a_floating_region_is_found_with_its_distance(car):
     assert floor.any()
     regions = floating(facing(Z), seg, K, floor, np.zeros(len(Z), int))
     if car == 1.0:
-        # it stands where it is, and so does the wall
+        # the car stands on the ground, and so does the wall
         assert regions == []
         return
     assert len(regions) == 1

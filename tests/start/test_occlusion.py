@@ -111,7 +111,7 @@ def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
         start.soup.homographies(K, K), before.soup.homographies(K, K), atol=1e-9
     )
     assert len(np.unique(start.component)) == 3
-    # held along the whole outline, upper and lower edges included
+    # the order is held along the whole outline, upper and lower edges included
     np.testing.assert_array_equal(start.order != 0, moves[seg.pairs].sum(axis=1) == 1)
 
 
@@ -123,7 +123,7 @@ def swing() -> tuple[Pair, Segmentation]:
     )
 
 
-def test_what_swings_comes_before_the_wall(swing):
+def test_a_swinging_object_comes_before_the_wall(swing):
     pair, seg = swing
     before = propose(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
     start = ordered(before, seg, pair)
@@ -139,7 +139,7 @@ def test_what_swings_comes_before_the_wall(swing):
         return float(np.mean(z[i] > z[k]))
 
     assert right(start) > right(before) + 0.2
-    # what parallax determines keeps its shape
+    # depths determined by parallax keep their shape
     main = start.component == np.argmax(np.bincount(start.component))
     ratio = start.soup.distance[main] / before.soup.distance[main]
     np.testing.assert_allclose(ratio, ratio[0])
@@ -158,7 +158,7 @@ def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
         return int((start.tie == TIES.index("occlusion")).sum())
 
     assert changed() == 0
-    # as much as its depth before the wall behind it could be that of something hanging
+    # without this rule the objects would be placed like hanging ones
     monkeypatch.setattr(occlusion, "STANDING", np.inf)
     assert changed() > 10
 

@@ -104,5 +104,5 @@ def test_the_part_between_still_parts_and_the_border_belongs_to_them(seg):
     inside = towards_border(core, seg)
     assert inside[(y > 100) & (x > 30) & (x < 130)].all()
     assert not inside[y < 80].any()
-    # what does not touch the border stands for itself
+    # a region that does not touch the border is not extended
     assert not towards_border((np.abs(y - 60) < 12) & (np.abs(x - 80) < 20), seg).any()

@@ -32,7 +32,7 @@ CAMERA = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
 
 @dataclass(frozen=True)
 class Errors:
-    """Of every superpixel that lies on one plane: angles in degrees, relative depth ratio."""
+    """Errors of superpixels that lie on one plane: angles in degrees, relative depth ratio."""
 
     component: np.ndarray
     rotation: np.ndarray
@@ -134,13 +134,13 @@ def test_two_motions_are_told_apart():
         assert np.median(e.normal[mine]) < normal
         ratio = e.depth_ratio[mine] / np.median(e.depth_ratio[mine])
         assert np.median(np.abs(ratio - 1)) < depth
-    # explaining the flow is what was asked for
+    # the motions must explain the flow
     assert np.median(start.error[pure]) < 0.1
     assert np.quantile(start.error[pure], 0.95) < 0.5
 
 
 def test_noise_makes_it_worse_but_not_wild():
-    """Two-sided: half a pixel of noise must show, and must not ruin."""
+    """Half a pixel of noise raises the errors, but to a limit."""
     pair, seg, pure = cut(corner_scene(CAMERA))
     noise = np.random.default_rng(99).normal(0, 0.5, pair.flow.uv.shape)
     start = propose(seg, replace(pair.flow, uv=pair.flow.uv + noise), K, K)
@@ -153,7 +153,7 @@ def test_noise_makes_it_worse_but_not_wild():
 
 
 def test_confident_pixels_decide():
-    """Wrong flow of confidence 0 is never looked at."""
+    """Wrong flow with confidence 0 has no effect."""
     pair, seg, pure = cut(corner_scene(CAMERA))
     rng = np.random.default_rng(99)
     bad = rng.random(pair.size) < 0.4
@@ -297,7 +297,7 @@ def test_pure_rotation_is_finite_and_explains_the_flow(turn):
 
 @pytest.mark.parametrize("turn", [(0.0, 2.0, 0.0), pytest.param((1.0, -1.0, 3.0))])
 def test_pure_rotation_is_flagged(turn):
-    """Nothing says how far anything is."""
+    """The flow does not determine any depth."""
     pair, seg, _ = cut(corner_scene(motion(turn, (0, 0, 0))))
     assert propose(seg, pair.flow, K, K).borrowed.mean() > 0.9
 

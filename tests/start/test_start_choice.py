@@ -51,7 +51,7 @@ def cells(rows: int, columns: int) -> Segmentation:
 
 @dataclass
 class Turns:
-    """Stands for views where superpixels turn about the optical axis by known angles (N,)."""
+    """Replaces views; superpixels turn about the optical axis by known angles (N,)."""
 
     true: np.ndarray
     weight: np.ndarray | None = None
@@ -125,8 +125,7 @@ def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, truste
     assert bool(of_pieces(views, seg, main, cost, 0.05, OPTIONS)) == trusted
 
 
-# --- components
-# --------------------------------------------------------------------------------------
+# --- components ----------------------------------------------------------------------------------
 
 
 def across(seg: Segmentation, label: np.ndarray) -> np.ndarray:
@@ -136,7 +135,7 @@ def across(seg: Segmentation, label: np.ndarray) -> np.ndarray:
 
 
 def offered(monkeypatch, *angles: float) -> None:
-    """Let these motions be what superpixels may share."""
+    """Make these turns the candidate motions."""
     monkeypatch.setattr(gathering, "candidates", lambda *a: turning(*angles))
 
 
@@ -188,7 +187,7 @@ def test_components_with_a_gap_in_their_discontinuity_are_parted_there(monkeypat
 
 
 def test_one_of_a_component_goes_with_its_neighbours():
-    """Alone it would rather have the main motion, by less than its outline costs."""
+    """By itself it prefers the main motion, by less than the price of its outline."""
     seg = cells(4, 9)
     right = seg.anchors[:, 0] > 48
     odd = np.argmax(seg.anchors @ [1.0, 0.1])
@@ -207,7 +206,7 @@ def test_one_of_a_component_goes_with_its_neighbours():
 def test_the_main_motion_wins_between_equal_ones():
     seg = cells(4, 9)
     right = seg.anchors[:, 0] > 48
-    # the other is better by a fifth of what would count as unexplained
+    # the other motion is better by a fifth of the least unexplained error
     middle = 0.1 + 0.1 * UNEXPLAINED_PX / PER_RADIAN
     views = Turns(np.where(right, middle, 0.0))
     before = taken(views, np.where(right, 0.2, 0.0))
@@ -250,7 +249,7 @@ def test_one_wild_plane_behind_an_outline_does_not_decide():
     seg = cells(3, 3)
     label = (np.arange(9) == 1).astype(int)
     z = np.full(9, 4.0)
-    # the component is in the middle of the top row; behind the cell below it are three others
+    # the component is the middle cell of the top row; the cell below has three inner neighbours
     z[1], z[4], z[5] = 1.0, 2.0, 40.0
     i, k = seg.pairs.T
     across = seg.pairs[label[i] != label[k]]

@@ -41,7 +41,7 @@ def off(m: Motion, other: Motion) -> tuple[float, float]:
 
 
 def perturbed(m: Motion, turn: float, tilt: float, seed: int = 1) -> Motion:
-    """Off by so many radians."""
+    """The motion, its rotation off by `turn` and its translation by `tilt`, radians."""
     a, b = np.random.default_rng(seed).normal(size=(2, 3))
     side = np.cross(m.t, b)
     t = np.cos(tilt) * m.t + np.sin(tilt) * side / np.linalg.norm(side)
@@ -106,8 +106,8 @@ def test_a_translation_puts_points_in_front():
 # --- motions of the whole image ------------------------------------------------------------------
 
 
-def test_what_is_not_confident_does_not_bend_a_motion():
-    """Errors of half a pixel are within the noise: only confidence can tell them from the rest."""
+def test_flow_without_confidence_does_not_change_a_motion():
+    """Errors of half a pixel are within the noise: only the confidence separates them."""
     m, r, q = rigid(200)
     wrong = np.arange(200) % 2 == 0
     q = q + np.where(wrong[:, None], [0.0, 0.5 / FOCAL, 0.0], 0.0)
@@ -151,9 +151,9 @@ def test_a_plane_behind_the_camera_costs_more_than_its_error():
     cost = fit.penalised()[0]
     assert cost[0] == 0.2
     assert (cost[1:3] >= 0.2 + 0.5).all()
-    # the more pixels it takes to bring it in front the more
+    # the cost grows with the pixels by which the plane is behind the camera
     assert cost[2] > cost[1] + 1.0
-    # what stands still is at infinity, whatever the sign of its rounding
+    # a superpixel that stands still is at infinity, whatever the sign of its rounding
     assert cost[3] == 0.2
 
 
@@ -197,7 +197,7 @@ def test_an_affine_flow_is_not_pulled_by_some_wrong_pixels():
     fit = affine_flow(flat_views(target, at, np.ones(40)))[0][0]
     np.testing.assert_allclose(fit[0], FOCAL * np.array([0.02, 0.01]), atol=0.1)
     np.testing.assert_allclose(fit[1:], 0.1 * FOCAL * M, atol=0.1)
-    # what is not confident does not count at all
+    # pixels without confidence do not count at all
     far = at @ M + [0.02, 0.01] + np.where(wrong[:, None], 0.5, 0.0)
     fit = affine_flow(flat_views(far, at, np.where(wrong, 0.0, 1.0)))[0][0]
     np.testing.assert_allclose(fit[1:], 0.1 * FOCAL * M, atol=1e-3)
