@@ -125,7 +125,7 @@ def test_one_family_at_a_time_is_left_out():
 def test_command_line_of_the_search(tmp_path, capsys, monkeypatch):
     words = ["bench", "search", "--trials", "2", "--width", "128", "--out", str(tmp_path)]
     words += ["--param", "segmentation.neighbours=int:4:19"]
-    # what failed is measured again
+    # failed rows are measured again
     for measure, code in ((broken, 1), (fake, 0)):
         monkeypatch.setattr(searching, "measure_pair", measure)
         assert main(words) == code

@@ -137,7 +137,7 @@ def test_solvers_reach_a_verified_point(name, task, tmp_path):
 
 
 def test_a_claim_with_the_gauss_newton_hessian_is_true(task, tmp_path):
-    # whether it converges in 200 iterations depends on rounding; what it claims must hold
+    # whether it converges in 200 iterations depends on rounding; its claims must hold
     (row,) = run(task, ["ipopt-soup"], tmp_path)
     assert row["how"] == "returned", row["status"]
     assert row["iterations"] > 10

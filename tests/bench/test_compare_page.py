@@ -150,7 +150,7 @@ OF_FAMILY = [
 
 def test_a_minimum_is_reached_when_it_is_verified_and_near():
     assert reached(frame_of_runs(OF_FAMILY)).tolist() == [True, True, False, False, True]
-    # lower than what was known is reached as well
+    # a lower objective than the best known one is reached as well
     assert reached(frame_of_runs([family_row("one", "easy", 3.0)])).all()
     entry = summary(frame_of_runs(OF_FAMILY))[STUB]
     runs = entry.pop("runs")
@@ -169,7 +169,7 @@ def test_rows_belong_to_a_start_and_a_size(tmp_path):
     draw_profiles(tmp_path / "p.png", by_start(frame), ("cpu_seconds", "objective"))
     assert (tmp_path / "p.png").stat().st_size > 5000
     plain = neutral(frame)[0]
-    # what the README of the set asks for
+    # the fields that the README of the set asks for
     assert {"solver", "name", "n", "m", "status", "objective", "iterations", "time"} <= plain.keys()
     assert (plain["time"], plain["wall_time"], plain["reached"]) == (1.0, 9.0, True)
 

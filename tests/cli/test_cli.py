@@ -71,7 +71,7 @@ def test_a_solve_writes_every_file(solved):
     assert summary["residuals"]["normal"] < 1e-8
     assert summary["metrics"]["solution"]["mre"] < summary["metrics"]["constant"]["mre"]
     xyz, rgb, _ = read_ply(solved / "points_ref.ply")
-    # less what is hidden or at jumps of the depth
+    # without pixels that are hidden or at jumps of the depth
     assert 144 * 96 > len(xyz) == len(rgb) > 0.7 * 144 * 96
     with h5py.File(solved / "result.h5") as file:
         assert file["solution/R"].attrs["units"] == "1"

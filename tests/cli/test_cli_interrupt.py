@@ -76,7 +76,7 @@ def test_before_a_start_it_ends_after_the_stage(owner, stage, tmp_path, monkeypa
     assert "interrupted" in (tmp_path / "out" / folders.FAILED).read_text()
 
 
-def test_a_second_one_aborts_and_says_so(tmp_path, monkeypatch, capfd):
+def test_a_second_interrupt_aborts_with_a_message(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(FlowOptions, "load", lambda *args: ctrl_c(2))
     # ignored where the tests run in the background of a shell
     before = signal.getsignal(signal.SIGINT)

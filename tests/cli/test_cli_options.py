@@ -98,7 +98,7 @@ def test_a_result_folder_is_an_output_but_no_input(solved, tmp_path, capsys):
     foreign(tmp_path / "pair")
     assert main([*args, "--out", str(out)]) in (0, 1)
     assert main(["solve", str(out / "config.yaml"), "--out", str(out), "-q"]) in (0, 1)
-    # without the mark nothing says who made the files
+    # without the mark the files have no known origin
     (out / MARK).unlink()
     assert main([*args, "--out", str(out)]) == 2
     assert main([*args, "--out", str(out), "--overwrite"]) in (0, 1)
@@ -160,7 +160,7 @@ def test_a_picture_of_12_bits_names_its_key(white, tmp_path, capsys):
         ("list >&-", 0),
         ("list <&- >&- 2>&-", 0),
         ("show nothing.yaml", 2),
-        # no space for what is printed
+        # no space for the output
         ("--help >/dev/full", 2),
         ("list >/dev/full", 2),
     ],

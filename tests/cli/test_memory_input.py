@@ -100,7 +100,7 @@ def test_a_run_saves_itself_and_is_converted(run, saved, tmp_path, capsys):
     assert main(["convert", str(out), "--to", "npy,motions, glb,colmap", "-o", str(other)]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert f"{other / 'mesh_next.glb'}" in printed
-    # the folder holds what the run held
+    # the folder has the data of the run
     for name in ("motions.json", "trajectory.tum", "depth_ref.npy", "depth_next.npy"):
         assert (other / name).read_bytes() == (out / name).read_bytes(), name
     told = json.loads((out / "motions.json").read_text())

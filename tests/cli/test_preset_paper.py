@@ -33,7 +33,7 @@ PAPER = {
     # "a K in the range of 15-20"
     "segmentation.neighbours": 15,
     "start.method": "homography",
-    # Eq. 1 to 7: factor 1 of E_arap, alike everywhere; rho and rho_n alone truncate; four terms
+    # Eq. 1 to 7: factor 1 of E_arap, the same everywhere; rho and rho_n alone truncate; four terms
     "energy.units": "paper",
     "energy.length": "translation",
     "energy.arap_at_anchors": False,

@@ -198,7 +198,7 @@ def test_problems_are_found_by_name_anywhere(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert set(shipped_problems()) == {p.stem for p in (ROOT / "problems").glob("*.yaml")}
     assert load_problem("street").input.scene == "street"
-    # what such a problem reads is in the user's folder, not in the package's
+    # files that such a problem reads are in the user's folder, not in the package's
     assert load_problem("folder", ["input.path=mine"]).path("mine") == tmp_path / "mine"
     assert main(["list"]) == 0
     out = capsys.readouterr().out
