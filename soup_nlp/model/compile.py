@@ -9,6 +9,7 @@ import os
 import platform
 import resource
 import shutil
+import stat
 import subprocess
 import tempfile
 from collections.abc import Callable
@@ -85,22 +86,40 @@ def _own_folder() -> Path:
     return Path(folder.name)
 
 
+def _ours_alone(path: Path) -> bool:
+    """Whether only this user can write a file or folder."""
+    if not hasattr(os, "geteuid"):
+        return True
+    state = path.stat()
+    return state.st_uid == os.geteuid() and not state.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
 def _folder() -> Path:
-    """The cache; a folder of this process where it cannot be written to."""
+    """The cache; a folder of this process where it cannot be made, or others can write to it.
+
+    Whoever writes a library there decides what this process runs.
+    """
     try:
         folder = cache_dir()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
+            pass
+        if _ours_alone(folder):
             return folder
+        log.warning("kernels are not cached: others can write to %s (chmod go-w)", folder)
     except (OSError, RuntimeError) as error:
         # RuntimeError: there is no home folder
         log.info("kernels are not cached: %s", error)
-        return _own_folder()
+    return _own_folder()
 
 
 def _build(source: Callable[[], str], key: str, compiler: str) -> Path:
     folder = _folder()
     library = folder / f"kernels-{key}.so"
+    if library.exists() and not _ours_alone(library):
+        log.warning("kernels are compiled again: others can write to %s", library)
+        folder = _own_folder()
+        library = folder / library.name
     if not library.exists():
         code = source()
         if len(code) > MOST_SOURCE:
@@ -115,5 +134,6 @@ def _build(source: Callable[[], str], key: str, compiler: str) -> Path:
                 capture_output=True,
                 timeout=600,
             )
+            made.chmod(0o700)
             os.replace(made, library)
     return library

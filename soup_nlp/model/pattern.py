@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import casadi as ca
@@ -33,19 +33,21 @@ class Pattern:
 
     Attributes:
         shape: Of the matrix.
-        sets: Nonzeros of each set of elements.
+        sets: Makes the nonzeros of each set of elements. They take much more memory than their
+            union, and `places` of the constrained NLP are rarely needed.
     """
 
     shape: tuple[int, int]
-    sets: Sequence[Entries] = field(repr=False)
+    sets: Callable[[], Iterable[Entries]] = field(repr=False)
 
     @cached_property
     def _union(self) -> sparse.csc_array:
-        if not self.sets:
-            return sparse.csc_array(self.shape)
-        rows, columns = (np.concatenate([e[k].ravel() for e in self.sets]) for k in (0, 1))
-        union = sparse.coo_array((np.ones(len(rows), bool), (rows, columns)), self.shape).tocsc()
-        union.sum_duplicates()
+        union = sparse.csc_array(self.shape, dtype=bool)
+        for rows, columns in self.sets():
+            ones = np.ones(rows.size, bool)
+            entries = sparse.coo_array((ones, (rows.ravel(), columns.ravel())), self.shape)
+            union = union + entries.tocsc()
+        union.sort_indices()
         return union
 
     @property
@@ -62,8 +64,8 @@ class Pattern:
     def places(self) -> list[NDArray[np.int32]]:
         """(E, k) number of every nonzero of each set of elements."""
         keys = self.columns * self.shape[0] + self.rows
-        every = (e.columns.astype(np.int64) * self.shape[0] + e.rows for e in self.sets)
-        return [np.searchsorted(keys, own).astype(np.int32) for own in every]
+        sets = ((rows, columns.astype(np.int64)) for rows, columns in self.sets())
+        return [np.searchsorted(keys, c * self.shape[0] + r).astype(np.int32) for r, c in sets]
 
     def sparsity(self) -> ca.Sparsity:
         """For CasADi."""
@@ -76,20 +78,24 @@ class Pattern:
 
 def jacobian_pattern(groups: Sequence[Group], ng: int, nx: int) -> Pattern:
     """Pattern of g's Jacobian; one set for every group that has constraints."""
-    sets = []
-    for group in groups:
-        if group.kernel.nc:
-            r, c = group.kernel.jacobian_pattern()
-            sets.append(Entries(group.table.rows[:, r], group.table.index[:, c]))
-    return Pattern((ng, nx), sets)
+    return Pattern((ng, nx), partial(_jacobian_entries, groups))
 
 
 def hessian_pattern(groups: Sequence[Group], nx: int, hessian: str) -> Pattern:
     """Pattern of the upper triangle of the Lagrangian's Hessian; one set for every group."""
-    sets = []
+    return Pattern((nx, nx), partial(_hessian_entries, groups, hessian))
+
+
+def _jacobian_entries(groups: Sequence[Group]) -> Iterator[Entries]:
+    for group in groups:
+        if group.kernel.nc:
+            r, c = group.kernel.jacobian_pattern()
+            yield Entries(group.table.rows[:, r], group.table.index[:, c])
+
+
+def _hessian_entries(groups: Sequence[Group], hessian: str) -> Iterator[Entries]:
     for group in groups:
         # half the bytes sort in half the time
         index = group.table.index.astype(np.int32)
         one, two = (index[:, k] for k in group.kernel.hessian_pattern(hessian))
-        sets.append(Entries(np.minimum(one, two), np.maximum(one, two)))
-    return Pattern((nx, nx), sets)
+        yield Entries(np.minimum(one, two), np.maximum(one, two))

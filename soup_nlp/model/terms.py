@@ -102,7 +102,7 @@ def orientation(a: View, b: View, row: Row, eps: ca.SX, truncated: bool) -> list
 def prior(a: View, b: View, row: Row, eps: ca.SX, with_relief: bool) -> list[Norm]:
     """E_prior of an edge: slope of the inverse depth between two anchors, relative to it.
 
-    With `held`, a given difference `row["relief"]` costs nothing.
+    With `with_relief`, a given difference `row["relief"]` costs nothing.
     """
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
     change = (1 / Xa[2] - 1 / Xb[2]) / _nearness(Xa, Xb)

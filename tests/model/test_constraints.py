@@ -31,6 +31,7 @@ from helpers_model import (
     UNITS,
     disturbed,
     form,
+    random_soup,
     tiny,
     value,
     weights_for,
@@ -160,6 +161,22 @@ def test_every_row_and_every_bound_is_the_specified_one(gauge, norm):
         assert (nlp.ubg[rows(nlp, kind)] == upper).all(), kind
     for name, lower, upper in zip(nlp.x_names(), nlp.lbx, nlp.ubx):
         assert (lower, upper) == BOUNDS[kind_of(name)], name
+
+
+@pytest.mark.parametrize("entry", range(6))
+def test_each_row_of_so3_sees_its_own_entry(entry):
+    nlp, _ = tiny().nlp(PAPER, form())
+    i, k = ENTRIES[entry]
+    gram = np.eye(3)
+    gram[i, k] += 0.1
+    gram[k, i] = gram[i, k]
+    x, names = nlp.x0.copy(), nlp.x_names()
+    place = [names.index(f"R[4,{r},{c}]") for r in (1, 2, 3) for c in (1, 2, 3)]
+    x[place] = (x[place].reshape(3, 3) @ np.linalg.cholesky(gram).T).ravel()
+    expected = np.zeros((12, 6))
+    expected[4, entry] = 0.1
+    so3 = value(nlp, x)[1][rows(nlp, "so3")].reshape(12, 6)
+    np.testing.assert_allclose(so3, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("gauge", GAUGES)
@@ -364,3 +381,18 @@ def test_the_raw_answer_of_a_default_solve_keeps_every_constraint(scene, gauge):
     found = violations(nlp, solution.stages[-1].x, case.data, f)
     assert max(found.values()) <= RAW, found
     assert solution.residuals["nlp_infeasibility"] <= RAW
+
+
+def test_a_random_soup_breaks_what_it_should():
+    """The measure itself: a violated kind is told by its size, the others stay at 0."""
+    problem = tiny("pixels")
+    nlp, layout = problem.nlp(PAPER, form())
+    soup = random_soup(7, 12)
+    x = layout.pack(replace(soup, n=1.1 * soup.n))
+    found = violations(nlp, x, problem.data, form())
+    assert found["normal"] == pytest.approx(0.21)
+    assert found["so3"] <= 1e-12
+    x = layout.pack(replace(soup, R=soup.R @ np.diag([1.0, 1.0, -1.0])))
+    found = violations(nlp, x, problem.data, form())
+    assert found["det"] == pytest.approx(2.0)
+    assert found["so3"] <= 1e-12

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from helpers_model import (
     GAUGES,
+    HEIGHT,
     K_NEXT,
     K_REF,
     PAPER,
     UNITS,
+    WIDTH,
     WORLDS,
     Tiny,
     form,
@@ -68,6 +70,55 @@ def test_energy_knows_no_global_scale_and_no_gauge(units, seed, scale):
         soup.normalised(),
     ):
         np.testing.assert_allclose(energies(twin, problem.data, weights), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("at_anchors", [True, False])
+@pytest.mark.parametrize("units", UNITS)
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000))
+def test_a_motion_of_the_next_camera_changes_only_projection(units, at_anchors, seed):
+    """X'' = Q X' + s: distances of all motions and points of the next frame stay."""
+    problem, weights = tiny(units, at_anchors), weights_for(units).replace(sigma_proj=np.inf)
+    soup = random_soup(seed, 12)
+    rng = np.random.default_rng(seed)
+    Q, s = rotation.exp(rng.normal(0, 0.3, 3)), rng.normal(0, 0.3, 3)
+    moved = replace(soup, R=Q @ soup.R, t=soup.t @ Q.T + s / soup.lam[:, None])
+    before, after = (energies(x, problem.data, weights) for x in (soup, moved))
+    np.testing.assert_allclose(after[[0, 2, 3]], before[[0, 2, 3]], rtol=1e-9)
+    assert after[1] != pytest.approx(before[1], rel=1e-3)
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000))
+def test_turning_the_reference_frame_with_all_its_rays_changes_nothing(seed):
+    """X -> Q X: rays, normals and rotations turn together. Depth along z alone would not stand it,
+    so lengths here are in the paper's unit."""
+    problem, weights = tiny("paper", True), weights_for("paper")
+    soup, data = random_soup(seed, 12), problem.data
+    Q = rotation.exp(np.random.default_rng(seed).normal(0, 0.5, 3))
+    turned = replace(soup, n=soup.n @ Q.T, R=soup.R @ Q.T)
+    rays = {name: getattr(data, name) @ Q.T for name in ("anchor_ray", "pixel_ray", "boundary_ray")}
+    np.testing.assert_allclose(
+        energies(turned, replace(data, **rays), weights),
+        energies(soup, data, weights),
+        rtol=1e-9,
+    )
+
+
+def test_the_order_of_the_superpixels_does_not_matter():
+    # every anchor is a neighbour of every other: fewer would be chosen among equally near ones
+    problem, weights = Tiny(neighbours=11), weights_for("paper")
+    order = np.random.default_rng(0).permutation(12)
+    rank = np.argsort(order).astype(np.int32)
+    seg = build_segmentation(
+        rank[problem.seg.labels], problem.image, neighbours=11, boundary_samples=2
+    )
+    data = build_energy_data(seg, problem.flow, K_REF, K_NEXT, 3, 0)
+    none = 0 * problem.data.prior_relief
+    s, own = problem.soup, replace(problem.data, prior_relief=none, depth_weight=none)
+    own = replace(own, order_weight=0 * own.order_weight)
+    soup = Soup(s.lam[order], s.n[order], s.d[order], s.R[order], s.t[order])
+    np.testing.assert_allclose(energies(soup, data, weights), energies(s, own, weights), rtol=1e-12)
 
 
 def test_local_units_make_every_edge_blind_to_its_own_scale():
@@ -222,6 +273,16 @@ def test_superpixels_without_flow_take_no_pixels_and_have_no_projection():
     error = oracle.reprojection(problem.soup, data, PAPER)
     assert error[5] == 0
     nlp, _ = build_matrix_nlp(problem.soup, data, PAPER, form())
+    assert np.isfinite(value(nlp, nlp.x0)[0])
+
+
+def test_confidence_zero_everywhere_leaves_a_valid_problem():
+    problem = tiny()
+    flow = Flow(problem.flow.uv, np.zeros((HEIGHT, WIDTH), np.float32), "nothing")
+    data = build_energy_data(problem.seg, flow, K_REF, K_NEXT, 6)
+    nlp, _ = build_matrix_nlp(problem.soup, data, PAPER, form())
+    e = oracle.energy(problem.soup, data, PAPER)
+    assert e["proj"] == 0
     assert np.isfinite(value(nlp, nlp.x0)[0])
 
 

@@ -97,6 +97,16 @@ def test_names_are_unique_and_as_many_as_there_are_numbers(gauge, norm):
     assert {"so3", "normal", "visible", "simplex"} <= kinds
 
 
+def test_names_of_the_presolve():
+    problem = tiny()
+    nlp, _ = build_tangent_nlp(problem.soup, problem.data, PAPER, form())
+    assert len(set(nlp.x_names())) == nlp.nx == 9 * 12
+    names = nlp.g_names()
+    assert len(set(names)) == nlp.ng
+    assert {re.sub(r"\[.*", "", name) for name in names} == {"simplex", "visible"}
+    assert nlp.x_names()[9:12] == ["lam[1]", "s1[1]", "s2[1]"]
+
+
 def test_sizes_are_those_of_the_formulation():
     problem, n = tiny(), 12
     nlp, _ = problem.nlp(PAPER, form())
@@ -199,3 +209,16 @@ def test_the_length_unit_of_a_variable_offset_weighs_distances_by_share():
     # with equal shares the unit would be the mean distance, which is another one
     soup = layout.unpack(nlp.x0[: layout.size])
     assert abs(float(np.mean(soup.distance)) - 1) > 0.01
+
+
+def test_the_presolve_starts_feasible_on_inverse_depth_too():
+    problem = tiny("pixels")
+    own = problem.soup, problem.data, weights_for("pixels"), form()
+    nlp, layout = build_tangent_nlp(*own, chart="inverse-depth")
+    assert nlp.x_names()[:3] == layout.names()[:3] == ["rho[0]", "g1[0]", "g2[0]"]
+    # away from the base of the chart, where rho is 1 and 1 / rho too
+    x = nlp.x0.copy()
+    x[::9] *= np.linspace(0.8, 1.25, layout.count)
+    row = nlp.g_names().index("simplex[0]")
+    share = problem.soup.normalised(layout.share).lam
+    assert nlp.constraints(x)[row] == pytest.approx((share / x[::9]).sum(), rel=1e-12)

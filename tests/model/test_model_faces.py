@@ -147,6 +147,30 @@ def test_derivatives_equal_finite_differences(coordinates, norm, units, at_ancho
     assert_derivatives(nlp, wiggle(nlp, layout.size, 3, 0.05), 4)
 
 
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_every_entry_of_jacobian_and_hessian(gauge):
+    """Column by column, with the name of the entry that disagrees."""
+    nlp, layout = program(gauge, "smooth", "pixels", True)
+    x = wiggle(nlp, layout.size, 7, 0.03)
+    lam_g = np.random.default_rng(8).normal(size=nlp.ng)
+    J, H = nlp.jacobian(x).toarray(), nlp.hessian(x, lam_g).toarray()
+    names, rows = nlp.x_names(), nlp.g_names()
+    scale = 1 + np.abs(H).max()
+
+    def both(y: np.ndarray) -> np.ndarray:
+        """Constraints, then the gradient of the Lagrangian."""
+        return np.append(nlp.constraints(y), lagrangian_gradient(nlp, y, 1.0, lam_g))
+
+    for j in range(0, nlp.nx, 3):
+        v = np.zeros(nlp.nx)
+        v[j] = 1.0
+        column, slope = np.split(directional(both, x, v), [nlp.ng])
+        wrong = np.flatnonzero(np.abs(column - J[:, j]) > 1e-8)
+        assert not len(wrong), f"d {rows[wrong[0]]} / d {names[j]}"
+        wrong = np.flatnonzero(np.abs(slope - H[:, j]) > 1e-8 * scale)
+        assert not len(wrong), f"d2 / d {names[wrong[0]]} d {names[j]}"
+
+
 # --- kinds of Hessian ----------------------------------------------------------------------------
 
 
@@ -235,6 +259,3 @@ def test_machine_code_equals_numpy(coordinates, norm, kind):
     ):
         one, two = nlp_numbers(fast), nlp_numbers(slow)
         np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12 * np.abs(two).max())
-
-
-# --- views ---------------------------------------------------------------------------------------

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
 from helpers_model import GAUGES, NORMS, PAPER, UNITS, WORLDS, form, tiny, value, weights_for, world
 
+from soup_nlp.geometry import rotation
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import TERMS
 from soup_nlp.model.matrix import build_matrix_nlp
@@ -150,6 +153,13 @@ def test_the_epigraph_at_its_optimum_is_the_smooth_form(units):
     np.testing.assert_allclose(one.x0, optimal_slacks(one), rtol=1e-12)
 
 
+def test_orientation_can_do_without_truncation():
+    problem, weights = tiny(), PAPER.replace(sigma_orient=np.inf)
+    nlp, _ = problem.nlp(weights, form())
+    exact = oracle.energy(problem.soup, problem.data, weights)["orient"]
+    assert by_term(nlp, nlp.x0)["orient"] == pytest.approx(exact, rel=1e-12)
+
+
 @pytest.mark.parametrize("name", TERMS)
 def test_a_weight_scales_its_term_alone(name):
     nlp, _ = tiny().nlp(PAPER, form())
@@ -188,3 +198,26 @@ def test_a_rigid_planes_truth_is_stationary_in_every_form(name, gauge, norm):
     assert nlp.value(x) <= 1e-9
     if norm == "smooth":
         assert np.abs(nlp.gradient(x)[: layout.size]).max() <= 1e-5
+
+
+def test_energy_is_positive_off_the_truth_and_each_term_reacts():
+    soup, data = world("slanted", "paper", False)
+    rng = np.random.default_rng(0)
+
+    def terms(**change) -> dict[str, float]:
+        return oracle.energy(replace(soup, **change), data, PAPER)
+
+    turned = rotation.exp(rng.normal(0, 0.01, (12, 3))) @ soup.R
+    e = terms(R=turned)
+    assert min(e["arap"], e["proj"], e["cont"]) > 1e-3
+    assert e["orient"] <= 1e-12
+    n = soup.n + rng.normal(0, 0.05, (12, 3))
+    e = terms(n=n / np.linalg.norm(n, axis=1, keepdims=True))
+    assert min(e["proj"], e["cont"], e["orient"]) > 1e-3
+    # one rigid motion stays rigid, whatever the shape
+    assert e["arap"] <= 1e-12
+    # scale alone does not change the flow (the homography knows t / d only), but all gaps
+    e = terms(lam=soup.lam * rng.uniform(0.8, 1.2, 12))
+    assert e["proj"] <= 1e-10
+    assert e["orient"] <= 1e-12
+    assert min(e["arap"], e["cont"]) > 1e-3

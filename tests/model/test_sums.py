@@ -248,6 +248,22 @@ def test_a_library_is_compiled_once(own_cache):
 
 
 @needs_compiler
+@pytest.mark.parametrize("mode", [0o720, 0o702])
+@pytest.mark.parametrize("what", ["library", "folder"])
+def test_what_others_can_write_is_not_used(what, mode, own_cache, caplog):
+    own_cache.mkdir(mode=0o700)
+    blocked = own_cache
+    if what == "library":
+        blocked = compiling.shared_library("key", lambda: SOURCE)
+    blocked.chmod(mode)
+    other = compiling.shared_library("key", lambda: SOURCE)
+    assert other.is_file()
+    assert other.parent != own_cache
+    assert what == "library" or not list(own_cache.iterdir())
+    assert "others can write" in caplog.text
+
+
+@needs_compiler
 def test_a_source_that_would_take_minutes_is_not_compiled(own_cache, caplog, monkeypatch):
     monkeypatch.setattr(compiling, "MOST_SOURCE", len(SOURCE) - 1)
     assert compiling.shared_library("key", lambda: SOURCE) is None

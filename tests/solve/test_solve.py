@@ -209,6 +209,13 @@ def test_the_claimed_multipliers_balance_the_gradient(room, solved):
     assert np.abs(nlp.gradient(x)).max() > near
 
 
+def test_without_presolve_the_exact_hessian_converges(room, cold):
+    assert [s.name for s in cold.stages] == ["constrained NLP"]
+    assert cold.converged, cold.status
+    assert_constraints(cold, room.data)
+    assert cold.energy["total"] < cold.energy_start["total"]
+
+
 def test_the_presolve_narrows_the_smoothing(room, cold):
     options = COLD.replace(presolve=True, presolve_eps=(1.0, 0.3), stagnation=3e-3)
     solution = room.solve(options, form(hessian="exact"))
