@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from soup_nlp.errors import ConfigError, DataError, SoupError, StoppedError, printable
 from soup_nlp.storage.system import handling
@@ -171,8 +171,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
-    except typer.Exit as done:
-        return int(done.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted: no result is written", file=sys.stderr)
         return ABORTED
@@ -195,7 +193,23 @@ def _explained(error: Exception) -> int:
     return ABORTED if stopped else 2
 
 
-class LazyGroup(TyperGroup):
+class _Flags:
+    """A command whose flags show no type in its help, as they take no value."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Options and arguments, `--help` included."""
+        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for param in params:
+            if getattr(param, "is_flag", False):
+                param.metavar = ""
+        return params
+
+
+class Command(_Flags, TyperCommand):
+    """A command of the program."""
+
+
+class LazyGroup(_Flags, TyperGroup):
     """A group that imports a command only when it is called, which makes `--help` fast."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
@@ -219,7 +233,7 @@ def _load(name: str, home: str) -> Any:
     module, _, function = home.partition(":")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     function_of = getattr(import_module(f"soup_nlp.cli.{module}"), function)
-    alone.command(name=name)(function_of)
+    alone.command(name=name, cls=Command)(function_of)
     return typer.main.get_command(alone)
 
 
