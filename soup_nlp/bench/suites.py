@@ -291,10 +291,16 @@ SUITES: Mapping[str, Suite] = MappingProxyType({s.name: s for s in _ALL})
 """Suites by name."""
 
 
-def list_suite(name: str, data: Path | None = None, options: Options | None = None) -> list[Item]:
+def list_suite(
+    name: str,
+    data: Path | None = None,
+    options: Options | None = None,
+    say: Callable[[str], object] | None = None,
+) -> list[Item]:
     """The available pairs of a suite, each with every flow.
 
-    `data` is the root folder of the dataset, or a folder that holds it.
+    `data` is the root folder of the dataset, or a folder that holds it. `say` is called with a line
+    on the number of pairs, and of those of the list that are not in the folder.
 
     Raises:
         DataError: the suite is unknown, or none of its pairs is in the folder; the message names
@@ -309,6 +315,11 @@ def list_suite(name: str, data: Path | None = None, options: Options | None = No
         listed = list(suite.items(Path(os.path.realpath(root / folder)), o))
         here = [i for i in listed if all(is_file(f) for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):
+            if say:
+                pairs = len({i.name for i in here})
+                missing = len({i.name for i in listed}) - pairs
+                lack = f", {missing} of the list are not in the folder" if missing else ""
+                say(f"suite {name}: {pairs} pairs{lack}")
             return here
     if o.only and not listed and (not suite.layout or is_folder(root)):
         raise DataError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -72,7 +73,7 @@ def _study(
         write: See Write.
         quiet: Print no progress.
         overwrite: Also over files of the user.
-        files: Further files that are written.
+        files: Further files that `write` may write.
         result_of: Text of a row for the progress line; by default its MRE.
         options: Further options of `measure_all`.
     """
@@ -81,8 +82,9 @@ def _study(
     frame = measured(page.with_suffix(".jsonl"), partial(measure_all, say=say, **options))
     with staged(page.parent) as new:
         write(new / page.name, frame)
+        written = [name for name in (page.name, *files) if (new / name).is_file()]
     print(page.read_text(encoding="utf-8"))
-    print(f"files       {page.parent}/: {', '.join([page.name, *files])}")
+    print(f"files       {page.parent}/: {', '.join(written)}")
     return int(frame["ok"].ne(True).any())
 
 
@@ -132,8 +134,9 @@ def accuracy(
     if name and len(suite) > 1:
         raise ConfigError("one name for several suites", where="--name", found=", ".join(suite))
     wanted, changes = _wanted(flow, width, seeds, only), tuple(overrides or ())
+    say = None if quiet else partial(print, file=sys.stderr)
     cells = {
-        suite_name: [Cell(i, changes) for i in list_suite(suite_name, data, wanted)]
+        suite_name: [Cell(i, changes) for i in list_suite(suite_name, data, wanted, say)]
         for suite_name in suite
     }
     # check all names before the first suite is measured

@@ -143,7 +143,8 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     words += [w for o in QUICK for w in ("--set", o)]
     assert main(words) == 0
     out = capsys.readouterr()
-    assert "1/1  rendered/orbit-s0-128x54/truth  MRE 0." in out.err
+    assert out.err.startswith("suite rendered: 1 pairs\n1/1  rendered/orbit-s0-128x54/truth  MRE 0")
+    assert f"{tmp_path}/: rendered.md, rendered.png\n" in out.out
     assert "one median scale per image, no cap" in out.out
     assert (tmp_path / "rendered.md").read_text() in out.out
     # nothing is measured twice

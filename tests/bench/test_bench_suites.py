@@ -9,6 +9,10 @@ from soup_nlp.cli.main import main
 
 
 def test_suites_list_the_papers_pairs(tmp_path):
+    assert set(SUITES) == {
+        *("rendered", "everyday", "shared", "sintel", "kitti2012", "kitti2015", "vkitti"),
+        *("kinect_paper", "kinect_tshirt"),
+    }
     for name, size in (("rendered", (320, 136)), ("everyday", (200, 150))):
         items = list_suite(name, None, Options(width=320, seeds=(0, 3), flows=("dis",)))
         assert len({i.key for i in items}) == len(items) == (12 if name == "rendered" else 14)
@@ -31,7 +35,9 @@ def test_a_suite_lists_the_pairs_whose_files_exist(tmp_path):
     for frame in frames:
         (base / f"frame_{frame:04d}.png").touch()
     (base / f"frame_{frames[0] + 1:04d}.png").touch()
-    listed = list_suite("sintel", tmp_path / "data")
+    told = []
+    listed = list_suite("sintel", tmp_path / "data", say=told.append)
+    assert told == ["suite sintel: 1 pairs, 119 of the list are not in the folder"]
     assert [(i.input["frame"], i.presets[0]) for i in listed] == [(frames[0], "sintel70")]
 
 
