@@ -255,7 +255,8 @@ class Rounds:
             add(swept(self.best, self.data, self.photo, SWEPT, rng), "swept")
         shares = WALKS if self.options.proposals == "walks" else {**WALKS, **NEIGHBOURS}
         remaining = max(0, self.options.particles - len(kinds))
-        for kind, count in counts(shares, remaining).items():
+        near = self.proposer.near.shape[1]
+        for kind, count in counts(shares, remaining, near).items():
             if count:
                 add(self.proposer.propose(self.best, kind, count), kind)
         return parts[0].joined(*parts[1:]), kinds

@@ -122,11 +122,17 @@ def neighbours(edges: Int, anchor_ray: Float) -> Int:
     return neighbour[order][start[:, None] + np.arange(k)].astype(np.int64)
 
 
-def counts(shares: Mapping[str, float], total: int) -> dict[str, int]:
-    """`total` proposals split by shares."""
+def counts(shares: Mapping[str, float], total: int, near: int) -> dict[str, int]:
+    """`total` proposals split by shares.
+
+    At most `near` neighbours can be taken over; random steps replace the proposals beyond.
+    """
     share = np.cumsum(list(shares.values()))
     ends = np.rint(total * share / share[-1]).astype(int)
-    return dict(zip(shares, np.diff(ends, prepend=0).tolist(), strict=True))
+    split = dict(zip(shares, np.diff(ends, prepend=0).tolist(), strict=True))
+    split = {k: min(n, near) if k in NEIGHBOURS else n for k, n in split.items()}
+    split["walk_all"] += total - sum(split.values())
+    return split
 
 
 class Proposer:
@@ -144,7 +150,7 @@ class Proposer:
         self.focal = float(data.K_next[0, 0])
 
     def propose(self, soup: Soup, kind: str, count: int) -> Particles:
-        """`count` particles of a kind around a soup, or fewer if there are fewer neighbours."""
+        """`count` particles of a kind around a soup; at most K of a kind of `NEIGHBOURS`."""
         if kind in WALKS:
             return self._walk(soup, kind, count)
         sources = self._random_neighbours(count)
@@ -198,7 +204,7 @@ class Proposer:
         n, k = self.near.shape
         rank = np.arange(k) + 1.0
         key = self.rng.exponential(size=(n, k)) * rank
-        order = np.argsort(key, axis=1)[:, : min(count, k)]
+        order = np.argsort(key, axis=1)[:, :count]
         return np.take_along_axis(self.near, order, axis=1)
 
     def _extrapolated(self, soup: Soup, sources: Int) -> tuple[Float, Float]:

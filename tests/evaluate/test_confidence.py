@@ -11,6 +11,7 @@ from scipy import sparse
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow
+from soup_nlp.evaluate import information as information_module
 from soup_nlp.evaluate.confidence import (
     BENDING_FACTOR,
     BENDING_SIGMA,
@@ -33,6 +34,8 @@ from soup_nlp.evaluate.confidence import (
 from soup_nlp.evaluate.information import information, learned, marginals, spread_in_image
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.nlp import NLP
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.selected_inverse import BlockCholesky, layers
 from soup_nlp.start.choice import LEAST_NOISE
@@ -168,6 +171,84 @@ def test_calibration_is_capped_where_nothing_is_known():
     # the prior's information is added to the pair's
     alone = calibrated(np.array([0.5]), 0.1, prior=np.inf)[0]
     assert calibrated(np.array([0.5]), 0.1)[0] ** -2 == pytest.approx(alone**-2 + SIGMA_PRIOR**-2)
+
+
+@pytest.mark.slow
+def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room, monkeypatch):
+    """Gaussian noise on the flow: log depths of 100 answers spread as the information predicts.
+
+    Without truncation and with a smoothing wider than all residuals the energy is nearly quadratic:
+    `w |r|^2 / (2 eps)` a norm. The gradient's covariance under noise of variance s^2 is then
+    s^2 times the information F of E_proj with weights w^2 / eps, and that of the answer
+    `S F S s^2` with the inverse S of the whole information.
+    """
+    draws, wide, noise = 100, 300.0, 0.05
+    monkeypatch.setattr(information_module, "SMOOTHING", wide)
+    data, n = small_room.data, len(small_room)
+    free = dict.fromkeys(("sigma_proj", "sigma_cont", "sigma_cont_ref", "sigma_arap"), np.inf)
+    weights = small_room.weights.replace(**free, sigma_orient=np.inf)
+    reweighted, layout = build_tangent_nlp(
+        small_room.soup, data, weights, majorant(FORM), "inverse-depth"
+    )
+    programs = {"reweighted": reweighted, "exact": replace(reweighted, hessian_kind="exact")}
+    theta = reweighted.thetas(eps=wide, eps_pixel=wide)
+    nlp, mean = reweighted, np.zeros(9 * n)
+    mean[::9] = -small_room.segmentation.sizes / small_room.segmentation.sizes.sum()
+
+    def fixed_mean(matrix: np.ndarray) -> np.ndarray:
+        """Inverse with the mean log depth fixed."""
+        scale = 1 / np.sqrt(np.abs(matrix.diagonal()))
+        row = mean * scale / np.linalg.norm(mean * scale)
+        inner = matrix * np.outer(scale, scale)
+        kkt = np.block([[inner, row[:, None]], [row[None], np.zeros((1, 1))]])
+        return np.linalg.inv(kkt)[:-1, :-1] * np.outer(scale, scale)
+
+    def inverse(x: np.ndarray, kind: str) -> np.ndarray:
+        return fixed_mean(programs[kind].hessian(x, np.zeros(nlp.ng), theta=theta).toarray())
+
+    x = nlp.x0.copy()
+    for k in range(40):
+        step = inverse(x, "reweighted" if k < 30 else "exact") @ nlp.gradient(x, theta)
+        while nlp.value(x - step, theta) > nlp.value(x, theta) and np.abs(step).max() > 1e-9:
+            step = step / 2
+        x = x - step
+        if k >= 30 and np.abs(step).max() < 1e-12:
+            break
+    newton = inverse(x, "exact")
+    assert np.abs(newton @ nlp.gradient(x, theta)).max() < 1e-9
+    parameters, targets = _with_targets(nlp, wide)
+    rng = np.random.default_rng(0)
+    spread = np.empty((draws, n))
+    for k in range(draws):
+        p = parameters.copy()
+        p[targets] += rng.normal(0, noise, targets.shape)
+        y = x - newton @ np.asarray(nlp.grad_f(x, p)[1]).ravel()
+        y -= newton @ np.asarray(nlp.grad_f(y, p)[1]).ravel()
+        spread[k] = -np.log(y[::9] / x[::9])
+    at = layout.unpack(x)
+    S = fixed_mean(information(at, data, weights, FORM).matrix.toarray())
+    other = dict.fromkeys(("arap", "cont", "orient", "prior"), 0.0)
+    flow = replace(data, pixel_weight=(weights.proj * data.pixel_weight) ** 2 / wide)
+    F = information(at, flow, weights.replace(**other, proj=1.0), FORM).matrix.toarray()
+    predicted = noise * np.sqrt((S @ F @ S).diagonal()[::9])
+    ratio = spread.std(axis=0) / predicted
+    # the standard deviation of 100 draws has an error of 7 %
+    assert abs(np.median(ratio) - 1) < 0.1
+    assert np.mean(np.abs(ratio - 1) < 0.2) > 0.9
+
+
+def _with_targets(nlp: NLP, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters of the NLP, and positions (E, 2) of the flow's targets among them."""
+    p = nlp.with_theta(eps=smoothing, eps_pixel=smoothing)
+    offset = len(nlp.theta)
+    for group in nlp.groups:
+        rows, width = group.table.data.shape
+        if group.kernel.name == "t_proj":
+            # weight, truncation, ray (3), target (2)
+            at = offset + width * np.arange(rows)[:, None] + [5, 6]
+            return p, at
+        offset += rows * width
+    raise AssertionError("no re-projection")
 
 
 def sure_of(case, data=None, weights=None):

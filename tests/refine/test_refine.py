@@ -128,10 +128,17 @@ def test_neighbours_on_one_plane_propose_that_plane(kind):
 @pytest.mark.parametrize("total", [0, 1, 7, 49])
 def test_proposals_are_split_by_shares(total):
     shares = {**WALKS, **NEIGHBOURS}
-    split = counts(shares, total)
+    split = counts(shares, total, near=20)
     assert sum(split.values()) == total
     for kind, count in split.items():
         assert abs(count - total * shares[kind] / sum(shares.values())) <= 1
+
+
+@pytest.mark.parametrize("near", [0, 3, 7])
+def test_random_steps_replace_proposals_of_too_few_neighbours(near):
+    split = counts({**WALKS, **NEIGHBOURS}, 49, near)
+    assert sum(split.values()) == 49
+    assert {split[kind] for kind in NEIGHBOURS} == {near}
 
 
 def test_neighbours_come_nearest_first():
