@@ -125,6 +125,28 @@ def test_neighbours_on_one_plane_propose_that_plane(kind):
     assert same.mean() > 0.5
 
 
+def test_nearer_neighbours_are_taken_over_more_often():
+    tiny = Tiny("pixels")
+    maker, T = proposer(tiny.data), tiny.soup.translation
+    ranks = []
+    for _ in range(50):
+        taken = maker.propose(tiny.soup, "neighbour_motion", 1).T
+        ranks.append(np.abs(T[maker.near] - taken).max(axis=2).argmin(axis=1))
+    count = np.bincount(np.concatenate(ranks))
+    assert count[0] > 1.5 * count[-1]
+
+
+def test_planes_of_neighbours_keep_the_motion_or_the_image_of_the_anchor():
+    tiny = Tiny("pixels")
+    p = proposer(tiny.data).propose(tiny.soup, "neighbour_plane", 4)
+    targets = [anchor_targets(q, tiny.data) for q in (Particles.of(tiny.soup), p)]
+    np.testing.assert_allclose(
+        targets[1][:, ::2], np.repeat(targets[0], 2, axis=1), rtol=1e-9, atol=1e-9
+    )
+    T = tiny.soup.translation[:, None]
+    np.testing.assert_allclose(p.T[:, 1::2], np.repeat(T, 2, axis=1), rtol=1e-12)
+
+
 @pytest.mark.parametrize("total", [0, 1, 7, 49])
 def test_proposals_are_split_by_shares(total):
     shares = {**WALKS, **NEIGHBOURS}
