@@ -24,7 +24,7 @@ from pathlib import Path, PurePosixPath
 import psutil
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import PathLike, as_path, write_text
+from soup_nlp.storage.files import PathLike, as_path, atomic_path
 from soup_nlp.storage.system import deferred_signals
 
 MARK = ".soup_nlp"
@@ -119,7 +119,11 @@ def write_mark(folder: Path, files: dict[str, str], subject: str = "") -> None:
     """
     subject = subject or subject_of(folder)
     contents = ({SUBJECT: subject} if subject else {}) | {"files": dict(sorted(files.items()))}
-    write_text(folder / MARK, json.dumps(contents, indent=1) + "\n")
+    with atomic_path(folder / MARK) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(json.dumps(contents, indent=1) + "\n")
+        file.flush()
+        # on disk before it becomes the mark, as the files that it lists
+        os.fsync(file.fileno())
 
 
 _STAGE = f"{MARK}-"
