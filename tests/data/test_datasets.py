@@ -95,7 +95,7 @@ def test_folder_missing(folder: Path, name: str) -> None:
         load("folder", folder)
 
 
-def test_folder_bad_truth(folder: Path) -> None:
+def test_folder_bad_truth(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.save(folder / "depth.npy", np.ones((H, W + 1)))
     with raises("truth and reference image differ in size"):
         load("folder", folder)
@@ -110,6 +110,12 @@ def test_folder_bad_truth(folder: Path) -> None:
     with raises("millimetres"):
         np.savez(folder / "points.npz", uv_0=np.zeros((2, 2)), xyz_mm_0=np.ones((2, 3)))
         load("folder", folder, unit="feet")
+    np.savez(folder / "points.npz", uv_0=np.zeros((2, 2)), xyz_mm_0=np.ones((2, 3), complex))
+    with raises(r"points file, xyz_mm_0\.npy[\s\S]*complex"):
+        load("folder", folder)
+    with monkeypatch.context() as m, raises("points file is too large"):
+        m.setattr("soup_nlp.data.formats.map_files.MAX_PIXELS", 1)
+        load("folder", folder)
     (folder / "points.npz").write_bytes(b"PK no zip")
     with raises(r"is no \.npz"):
         load("folder", folder)
@@ -158,7 +164,7 @@ def test_kitti2012_errors(tmp_path: Path) -> None:
     with raises(r"000008_10\.png[\s\S]*expected: training/image_0"):
         load("kitti2012", root, index="8")
     for index in ("seven", "-7", ""):
-        with pytest.raises(ConfigError, match=r"input\.index"):
+        with pytest.raises(ConfigError, match=r"input\.index[\s\S]*such as '27' or '000027'"):
             load("kitti2012", root, index=index)
     calib = root / "training" / "calib" / "000007.txt"
     calib.write_text("P0: 100 0 4 0 0 100 3 0 0 0 1 0\n")

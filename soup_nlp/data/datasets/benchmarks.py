@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.datasets.layout import (
@@ -92,6 +93,12 @@ DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
 DEFAULT_SCENE = "alley_1"
 
 
+def _is_number_of_pair(index: str) -> str:
+    if not re.fullmatch(r"[0-9]{1,6}", index):
+        raise ValueError("1 to 6 digits, such as '27' or '000027'")
+    return index
+
+
 class KittiInput(PairInput):
     """KITTI 2012 (grey camera 0) or 2015 (colour camera 2): frames 10 and 11 of a sequence.
 
@@ -103,7 +110,7 @@ class KittiInput(PairInput):
     """Kind of input."""
     root: str
     """Folder that holds training/."""
-    index: Annotated[str, Field(pattern=r"^\d{1,6}$")]
+    index: Annotated[str, AfterValidator(_is_number_of_pair)]
     """Six digits in quotes, such as "000138"."""
 
     def load(self, path: Resolve) -> Pair:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 import re
 import struct
+import zipfile
 from collections.abc import Callable, Mapping
 from numbers import Real
 from pathlib import Path
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, FloatMap
 from soup_nlp.data.formats.images import assumed, check_body, decode, decode_png16
 from soup_nlp.errors import DataError, repr_of
-from soup_nlp.schema.limits import check_image_size
+from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, as_path, read_bytes
 
 Reader = Callable[[PathLike], Float]
@@ -83,7 +84,11 @@ def _read_pieh(path: PathLike, channels: tuple[int, ...], what: str) -> FloatMap
 
 def read_npy(path: PathLike, what: str) -> NDArray[Any]:
     """One array of real numbers from a .npy file, without pickles."""
-    stream = io.BytesIO(read_bytes(path, what))
+    return _array(read_bytes(path, what), path, what)
+
+
+def _array(content: bytes, path: PathLike, what: str) -> NDArray[Any]:
+    stream = io.BytesIO(content)
     try:
         array = npy.read_array(stream, allow_pickle=False)
     except Exception as error:  # parsing the header, a Python literal, raises many types
@@ -102,14 +107,23 @@ def read_npy(path: PathLike, what: str) -> NDArray[Any]:
     return np.asarray(array)
 
 
-def read_npz(path: PathLike, what: str) -> dict[str, Float]:
-    """The arrays of a .npz file by name, without pickles."""
-    content = io.BytesIO(read_bytes(path, what))
+def read_npz(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
+    """The arrays of a .npz file by name, see `read_npy`."""
+    content, most = io.BytesIO(read_bytes(path, what)), 32 * MAX_PIXELS
     try:
-        with np.load(content, allow_pickle=False) as archive:
-            return {name: np.asarray(array, np.float64) for name, array in archive.items()}
-    except Exception as error:  # zipfile and numpy raise many types
-        raise DataError(f"{what} is no .npz of numbers", where=path, found=str(error)) from error
+        with zipfile.ZipFile(content) as archive:
+            # a small file may be large when unpacked
+            size = sum(entry.file_size for entry in archive.infolist())
+            names = archive.namelist() if size <= most else []
+            parts = {name: archive.read(name) for name in names}
+    except Exception as error:  # zipfile raises many types
+        raise DataError(f"{what} is no .npz", where=path, found=str(error)) from error
+    if size > most:
+        raise DataError(f"{what} is too large", where=path, found=f"{size} bytes", expected=most)
+    return {
+        name.removesuffix(".npy"): _array(part, path, f"{what}, {name}")
+        for name, part in parts.items()
+    }
 
 
 def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> Float:
