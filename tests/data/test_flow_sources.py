@@ -142,6 +142,11 @@ def test_onnx_input_range_and_bad_networks(onnx, tmp_path, pair):
         resolve_flow(pair, str(tmp_path / "absent.onnx"))
     with pytest.raises(DataError, match="two RGB images"):
         learned_flow(str(unit), first, second[:32])
+    unknown = learned_flow(
+        str(tiny_network(onnx, tmp_path / "nan.onnx", gain=np.nan)), first, second
+    )
+    assert (unknown.uv == 0).all()
+    assert (unknown.confidence == 0).all()
 
 
 # --- frames of other focal lengths ---------------------------------------------------------------
@@ -181,6 +186,14 @@ def test_flow_of_reduced_frames_is_not_mixed_at_edges() -> None:
     shift = at + flow.uv - ((at + 0.5) / 2 - 0.5)
     np.testing.assert_allclose(shift[:, :10], 0, atol=1e-6)
     np.testing.assert_allclose(shift[:, 10:], np.broadcast_to((3, -1), (16, 10, 2)), atol=1e-6)
+
+
+def test_focal_lengths_that_contradict_the_images_give_a_warning() -> None:
+    pair = render_scene("orbit", 0, 256, 108)
+    K = pair.K_next * [[3, 1, 1], [1, 3, 1], [1, 1, 1]]
+    with pytest.warns(DataWarning, match="not at their focal lengths.*probably wrong"):
+        flow = FlowOptions().load(Pair(pair.image_ref, pair.image_next, pair.K_ref, K), Path)
+    np.testing.assert_array_equal(flow.uv, FlowOptions().load(pair, Path).uv)
 
 
 # --- flow is plausible or refused ----------------------------------------------------------------

@@ -176,8 +176,8 @@ def fit_affine(
 def _medians(which: Int, values: NDArray[np.floating], n: int) -> Float:
     """(N,) lower median of the values (P,) of every superpixel; 0 without values."""
     order = np.argsort(values)
-    # numpy uses radix sort for 16-bit integers, which is much faster
-    order = order[np.argsort(which.astype(np.uint16)[order], kind="stable")]
+    # numpy uses radix sort for integers of up to 16 bits, which is much faster
+    order = order[np.argsort(which.astype(np.min_scalar_type(n))[order], kind="stable")]
     count = np.bincount(which, minlength=n)
     middle = np.cumsum(count) - count + np.maximum(count - 1, 0) // 2
     if not len(order):

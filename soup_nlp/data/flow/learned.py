@@ -57,11 +57,16 @@ class Network:
         inputs = self.session.get_inputs()
         channels = [i.shape[1] if len(i.shape) == 4 else None for i in inputs]
         if channels not in ([3] * count, [3 * count]):
+            images, expected = (
+                ("one image", "one input (1, 3, H, W)")
+                if count == 1
+                else ("two images", "two inputs (1, 3, H, W), or one (1, 6, H, W)")
+            )
             raise DataError(
-                f"network does not take {'two images' if count == 2 else 'one image'}",
+                f"network does not take {images}",
                 where=source,
                 found=[i.shape for i in inputs],
-                expected=f"inputs (1, 3, H, W) of {count}, or one (1, {3 * count}, H, W)",
+                expected=expected,
             )
         word = self.session.get_modelmeta().custom_metadata_map.get("input_range", "255")
         if word not in RANGES:
