@@ -1,6 +1,7 @@
 """Rendered everyday scenes: exact truth, and the parallax and moving bodies of each kind."""
 
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -55,6 +56,13 @@ def test_each_kind_has_its_parallax_and_moving_bodies(name, seed):
     if name == "pan":
         turn = np.degrees(np.arccos((np.trace(p.truth.motions[0, :3, :3]) - 1) / 2))
         assert 1.9 < turn < 6.5
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_seeds_differ_in_depth_and_camera_motion(name):
+    for a, b in combinations([pair(name, seed).truth for seed in range(6)], 2):
+        assert abs(np.log(a.depth_ref / b.depth_ref)).mean() > 0.02
+        assert name == "standing" or abs(a.motions[0] - b.motions[0]).max() > 1e-3
 
 
 def test_limbs_of_a_person_move_differently():

@@ -279,7 +279,7 @@ def test_homographies_are_recovered_one_after_the_other():
     assert len(dominant_homographies(flow, np.ones((HEIGHT, WIDTH), np.float32), 1)) == 1
 
 
-def test_a_first_flow_that_is_half_wrong_is_completed():
+def test_a_first_flow_that_is_half_wrong_is_completed(monkeypatch):
     """The first flow is right on the left only; under its homography it is right everywhere."""
     first, second = images(ROAD)
     true = truth(ROAD)
@@ -308,6 +308,21 @@ def test_a_first_flow_that_is_half_wrong_is_completed():
     outside = ((at < -0.5) | (at > [WIDTH - 0.5, HEIGHT - 0.5])).any(axis=-1)
     assert outside.any()
     assert confidence_of(gap)[outside & ~left_half].max(initial=0.0) < 0.5
+    # no homography: the first flow is returned
+    monkeypatch.setattr(dis, "PLANES", 0)
+    same, _ = guided_flow(ref, nxt, match, forward, backward)
+    np.testing.assert_array_equal(same, forward)
+
+
+@pytest.mark.parametrize("planes", [0, 4])
+def test_flow_with_and_without_homographies(planes, monkeypatch):
+    monkeypatch.setattr(dis, "PLANES", planes)
+    first, second = images(ROAD)
+    flow = dis.dis_flow(first, second)
+    assert np.isfinite(flow.uv).all()
+    sure = flow.confidence > 0.5
+    assert sure.mean() > 0.3
+    assert np.median(np.linalg.norm(flow.uv - truth(ROAD), axis=-1)[sure]) < 0.3
 
 
 @pytest.mark.parametrize(("error", "taken"), [(0.2, False), (0.8, True)])

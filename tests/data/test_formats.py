@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from soup_nlp.data.formats import map_files as fmt
+from soup_nlp.data.formats.camera_files import read_kitti_projections
 
 many = settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -33,6 +34,28 @@ def flows(low: float, high: float) -> st.SearchStrategy[np.ndarray]:
 
 
 # --- .flo ---------------------------------------------------------------------------------------
+
+
+def test_flo_golden_bytes(tmp_path: Path) -> None:
+    golden = struct.pack("<fii4f", 202021.25, 2, 1, 1.5, -2.0, 1e10, 0.0)
+    assert golden[:4] == b"PIEH"
+    flow = fmt.read_flo(put(tmp_path / "a.flo", golden))
+    np.testing.assert_array_equal(flow, [[[1.5, -2.0], [np.nan, np.nan]]])
+
+
+@pytest.mark.shared
+def test_real_files(shared_data: Path, tmp_path: Path) -> None:
+    """The values that are read have the bytes of the file."""
+    path = shared_data / "sintel" / "training" / "flow" / "alley_1" / "frame_0002.flo"
+    assert path.read_bytes()[12:] == fmt.read_flo(path).astype("<f4").tobytes()
+    path = shared_data / "sintel" / "training" / "depth" / "alley_1" / "frame_0020.dpt"
+    assert path.read_bytes()[12:] == fmt.read_dpt(path).astype("<f4").tobytes()
+    folder = shared_data / "kitti2012" / "training"
+    flow = fmt.read_kitti_flow(folder / "flow_occ" / "000027_10.png")
+    write_kitti_flow(tmp_path / "a.png", flow)
+    np.testing.assert_array_equal(fmt.read_kitti_flow(tmp_path / "a.png"), flow)
+    (projection,) = read_kitti_projections(folder / "calib" / "000027.txt", ["P1"])
+    assert projection[0, 3] == -386.1448
 
 
 @many
@@ -66,9 +89,14 @@ def sized(width: int, height: int, count: int) -> bytes:
         ("a.flo", sized(0, 3, 0), "impossible size"),
         ("a.flo", sized(-4, 3, 96), "impossible size"),
         ("a.flo", sized(2**31 - 1, 2**31 - 1, 0), "impossible size"),
+        ("a.dpt", b"", "is empty"),
         ("a.dpt", b"PIEX" + bytes(16), "wrong magic number"),
+        ("a.dpt", b"PIEH\x01", "truncated"),
         ("a.dpt", sized(4, 3, 47), "truncated"),
         ("a.dpt", sized(4, 3, 49), "left over"),
+        ("a.dpt", sized(0, 3, 0), "impossible size"),
+        ("a.dpt", sized(-4, 3, 48), "impossible size"),
+        ("a.dpt", sized(2**31 - 1, 2**31 - 1, 0), "impossible size"),
         ("a.pfm", b"PF\n1 1\n-1.0\n" + bytes(12), "in colour"),
         ("a.pfm", b"P5\n1 1\n255\n0", "damaged header"),
         ("a.pfm", b"Pf\n1 1\n0\n" + bytes(4), "damaged header"),

@@ -149,6 +149,8 @@ def test_16_bits_are_stretched_to_their_values(low: int, high: int, tmp_path: Pa
     stretched = read_image(tmp_path / "a.png", white=high)
     assert stretched[-1, -1, 0] == 255
     assert stretched[0, 0, 0] == round(255 * low / high)
+    # brighter than white
+    assert stretched[5, 5, 0] == 255
 
 
 @pytest.mark.skipif(not features.check("avif"), reason="this Pillow writes no AVIF")

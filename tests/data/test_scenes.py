@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -160,6 +161,22 @@ def test_brightness_constancy(name):
     assert right < 4, right
     if name not in ("still", "standing"):
         assert wrong > 2.5 * right
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_flow_estimator_finds_the_true_flow(name):
+    p = pair(name)
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(0)
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (p.image_ref, p.image_next)]
+    flow = dis.calc(*grey, None)
+    error = np.linalg.norm(flow - p.truth.flow, axis=-1)[~p.truth.occluded]
+    assert np.median(error) < 0.1
+    assert error.mean() < 0.5
+    size = np.linalg.norm(p.truth.flow, axis=-1)
+    assert size.max() < 45 * WIDTH / 1024
+    if name != "still":
+        assert 2 * WIDTH / 1024 < size.mean() < 18 * WIDTH / 1024
 
 
 @pytest.mark.parametrize("name", SCENES)

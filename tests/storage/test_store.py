@@ -140,6 +140,20 @@ def test_h5_bad_array_leaves_the_old_file(tmp_path, value):
     assert os.listdir(tmp_path) == ["r.h5"]
 
 
+def test_h5_failure_half_way_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "r.h5"
+    path.write_bytes(b"old")
+
+    def fail(*args, **kwargs):
+        raise OSError("disk is full")
+
+    monkeypatch.setattr("soup_nlp.storage.store._write_group", fail)
+    with pytest.raises(DataError, match="disk is full"):
+        write_h5(path, tree(), {})
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["r.h5"]
+
+
 def test_h5_unreadable(tmp_path):
     with pytest.raises(DataError, match="is missing"):
         read_h5(tmp_path / "no.h5")
