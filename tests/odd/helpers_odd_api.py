@@ -1,4 +1,4 @@
-"""Arguments of wrong types for the Python API."""
+"""Arguments of wrong types for the Python API, and unusual uses of a run."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from helpers_odd_run import Case, cases
 from helpers_odd_world import SIZE, World
 
 import soup_nlp
+from soup_nlp.cli.main import main
 from soup_nlp.data.formats import camera_files, images, map_files
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.sol import read_sol
@@ -165,6 +166,32 @@ def _called(do: Call) -> Any:
     return lambda w, o, x: (do(w, o, x), None)[1]
 
 
+def _again(w: World, o: Path) -> None:
+    w.run.save(o / "out", formats=["npy"])
+    assert main(["check", str(o / "out")]) in (0, 1)
+
+
+def _strided(w: World, o: Path) -> None:
+    """Views that are not contiguous, read-only arrays and other byte orders are arrays."""
+    a, b = (np.asarray(x) for x in (w.run.pair.image_ref, w.run.pair.image_next))
+    K = np.asarray(w.run.pair.K_ref, ">f8")
+    made = soup_nlp.Pair(a[:, ::-1], np.asfortranarray(b), K)
+    a.flags.writeable = False
+    made.with_flow(soup_nlp.Flow(np.zeros((*SIZE, 2), ">f4"), np.ones(SIZE, np.float16)))
+
+
+USES: dict[str, Callable[[World, Path], object]] = {
+    "plot": lambda w, o: w.run.plot().save(o / "a.png"),
+    "repr": lambda w, o: [repr(x) for x in (w.run, w.run.components, w.run.camera)],
+    "save twice": lambda w, o: [w.run.save(o / "out") for _ in range(2)],
+    "save and check": _again,
+    "arrays of other layouts": _strided,
+    "compare records": lambda w, o: w.run.pair == w.run.pair.with_flow(w.run.pair.flow),
+    "hash of records": lambda w, o: {w.run, w.run.pair, w.run.soup, w.run.reconstruction},
+}
+"""Valid but unusual uses of a run."""
+
+
 def api_cases() -> Iterator[Case]:
     """Calls of the Python API with every kind of argument."""
     for name, call in CALLS.items():
@@ -172,5 +199,7 @@ def api_cases() -> Iterator[Case]:
         for quiet in (False, True):
             things = {k: v for k, v in THINGS.items() if k not in left and (k in fine) is quiet}
             yield from cases(API, f"api {name} {{}}", _called(call), things, quiet=quiet)
+    used = _called(lambda w, o, use: use(w, o))
+    yield from cases(API, "use {}", used, USES, quiet=True)
     huge = {"truth that overflows": np.full(SIZE, 1e300)}
     yield from cases(API, "{}", _called(lambda w, o, x: soup_nlp.Truth(depth_ref=x)), huge)

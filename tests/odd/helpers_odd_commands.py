@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from helpers_odd_run import ANY, DOORS, Case, cases, changed, words, write, written
-from helpers_odd_world import NO_FOLDER, ODD, World
+from helpers_odd_world import CAMERA, NO_FOLDER, ODD, World
 
 from soup_nlp.cli.main import main
 from soup_nlp.storage.rows import append_row, read_rows
@@ -62,6 +62,14 @@ DATASETS = {
     "vkitti1": 'root: {}, scene: "0001", frame: 0',
     "vkitti2": "root: {}, scene: Scene01, frame: 0",
 }
+PARTS = {
+    **dict.fromkeys(("frame_0", "frame_1", "occluded", "moving"), "png"),
+    **{"K": "txt", "K_next": "txt", "depth": "npy png dpt pfm", "depth_next": "npy"},
+    **{"flow": "flo npy png", "points": "npz"},
+}
+"""Suffixes by name of the files of an input folder."""
+MALFORMED = ("empty", "garbage", "line", "brackets", "digits", "braces")
+"""Kinds of odd files with contents."""
 SMALL_SPEED = "bench speed --scenes street --sizes 12 --neighbours 4 --seeds 0 --width 64"
 WRITE = {
     "solve": "{solve} -o {odd}",
@@ -93,6 +101,20 @@ def _dataset(name: str, text: str) -> Any:
     return make
 
 
+def _part(name: str) -> Any:
+    """A problem with an input folder in which one file is odd."""
+
+    def make(w: World, o: Path, kind: str) -> str:
+        for k, image in enumerate("ab"):
+            (o / f"frame_{k}.png").symlink_to(w.good(f"{image}.png"))
+        write(o / "K.txt", CAMERA.replace(",", " "))
+        _instead(o / name, kind)
+        write(o / "p.yaml", f"input: {{kind: folder, path: {json.dumps(str(o))}}}\n")
+        return str(o / "p.yaml")
+
+    return make
+
+
 def _listed(w: World, o: Path, kind: str) -> str:
     """A folder that holds an odd file, or a link to it."""
     name = w.odd(kind, ".yaml")
@@ -111,6 +133,9 @@ def path_cases() -> Iterator[Case]:
     for name, text in DATASETS.items():
         make = _dataset(name, text)
         yield from cases(DOORS, f"dataset {name} {{}}", "solve {x} -o {out}", KINDS, make=make)
+    for name in (f"{stem}.{suffix}" for stem, kinds in PARTS.items() for suffix in kinds.split()):
+        line = "solve {x} -q -o {out}"
+        yield from cases(DOORS, f"part {name} {{}}", line, MALFORMED, make=_part(name))
     for door, line in WRITE.items():
         yield from cases(DOORS, f"{door} -o {{}}", line, NO_FOLDER)
     yield from cases(DOORS, "list of {}", "list {x}", KINDS, (0, 2), make=_listed)
