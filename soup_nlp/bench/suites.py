@@ -250,7 +250,7 @@ _ALL = (
         partial(_kitti, "kitti2015", "image_2", 200),
         presets=KITTI,
         folders=(".", "kitti2015", "data_scene_flow"),
-        layout="training/image_2, training/calib_cam_to_cam, training/disp_occ_0, disp_occ_1",
+        layout="training/image_2, training/calib_cam_to_cam, training/disp_occ_0",
         source=(
             "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (data_scene_flow.zip and"
             " data_scene_flow_calib.zip)"
