@@ -127,8 +127,8 @@ def write_mark(folder: Path, files: dict[str, str], subject: str = "") -> None:
 
 
 _STAGE = f"{MARK}-"
-"""First part of the names of temporary folders; the number of their process follows. One with a
-mark is complete: its files are being moved to their places."""
+"""First part of the names of temporary folders; the number of their process follows. A temporary
+folder with a mark is complete: its files are being moved to their places."""
 
 _open: set[Path] = set()
 """Temporary folders that this process is filling."""

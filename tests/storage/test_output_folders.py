@@ -90,6 +90,25 @@ def test_a_failure_leaves_the_old_result(tmp_path):
     assert os.listdir(tmp_path) == ["out"]
 
 
+@pytest.mark.parametrize("fits", [0, 1], ids=["file", "mark"])
+def test_a_disk_that_reports_late_that_it_is_full(fits, tmp_path, monkeypatch):
+    target, synced = tmp_path / "out", []
+    write(target, a="1")
+
+    def full(handle: int) -> None:
+        synced.append(handle)
+        if len(synced) > fits:
+            raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as m:
+        m.setattr(os, "fsync", full)
+        with pytest.raises(DataError, match="cannot be written"):
+            write(target, a="2")
+    recover(target)
+    assert content(target) == {"a": "1"}
+    assert sorted(os.listdir(target)) == [MARK, "a"]
+
+
 def foreign(folder: Path, kind: str) -> Path:
     path = folder / "a"
     if kind == "file":

@@ -93,7 +93,7 @@ DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
 DEFAULT_SCENE = "alley_1"
 
 
-def _is_number_of_pair(index: str) -> str:
+def _is_pair_number(index: str) -> str:
     if not re.fullmatch(r"[0-9]{1,6}", index):
         raise ValueError("1 to 6 digits, such as '27' or '000027'")
     return index
@@ -110,7 +110,7 @@ class KittiInput(PairInput):
     """Kind of input."""
     root: str
     """Folder that holds training/."""
-    index: Annotated[str, AfterValidator(_is_number_of_pair)]
+    index: Annotated[str, AfterValidator(_is_pair_number)]
     """Six digits in quotes, such as "000138"."""
 
     def load(self, path: Resolve) -> Pair:
