@@ -45,11 +45,15 @@ def test_flo_golden_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.shared
 def test_real_files(shared_data: Path, tmp_path: Path) -> None:
-    """The values that are read have the bytes of the file."""
-    path = shared_data / "sintel" / "training" / "flow" / "alley_1" / "frame_0002.flo"
-    assert path.read_bytes()[12:] == fmt.read_flo(path).astype("<f4").tobytes()
-    path = shared_data / "sintel" / "training" / "depth" / "alley_1" / "frame_0020.dpt"
-    assert path.read_bytes()[12:] == fmt.read_dpt(path).astype("<f4").tobytes()
+    """A header of 1024 x 436 and the values that are read are the bytes of the file."""
+    header, sintel = struct.pack("<4sii", b"PIEH", 1024, 436), shared_data / "sintel" / "training"
+    for path, read in (
+        (sintel / "flow" / "alley_1" / "frame_0002.flo", fmt.read_flo),
+        (sintel / "depth" / "alley_1" / "frame_0020.dpt", fmt.read_dpt),
+    ):
+        values = read(path)
+        assert values.shape[:2] == (436, 1024)
+        assert path.read_bytes() == header + values.astype("<f4").tobytes()
     folder = shared_data / "kitti2012" / "training"
     flow = fmt.read_kitti_flow(folder / "flow_occ" / "000027_10.png")
     write_kitti_flow(tmp_path / "a.png", flow)
