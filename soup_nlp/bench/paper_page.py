@@ -132,7 +132,9 @@ def _plot_bars(path: Path, bars: pd.DataFrame, text: str, base: float = 0.0) -> 
     ax = picture.add_subplot()
     if len(bars):
         style = {"width": 0.8, "fontsize": 7, "grid": True, "logx": base > 0}
-        (bars - base).plot.barh(ax=ax, left=base, title=text, **style)
+        (bars - base).plot.barh(ax=ax, left=base, ylabel="", **style)
+        ax.set_title(text, fontsize=10)
+        ax.set_axisbelow(True)
         ax.invert_yaxis()
         ax.legend(fontsize=7)
     save(picture, path)
@@ -272,13 +274,18 @@ def _missing(present: set[str]) -> list[str]:
 
 
 def _plot_lines(path: Path, tables: Mapping[str, pd.DataFrame], axis: str, text: str) -> None:
-    """Lines of tables over their columns, a panel for each table."""
+    """Lines of tables over their columns, a panel for each table; the mean in black."""
     picture = figure(4.5 * len(tables), 3.8)
-    for k, (title, table) in enumerate(tables.items()):
-        ax = picture.add_subplot(1, len(tables), k + 1)
-        style = {"marker": "o", "ms": 3, "lw": 1, "fontsize": 8, "grid": True, "rot": 20}
+    axes = picture.subplots(1, len(tables), sharey=True, squeeze=False)[0]
+    for ax, (title, table) in zip(axes, tables.items(), strict=True):
+        means = [str(name).startswith("mean of") for name in table.index]
+        style: dict[str, Any] = {"marker": "o", "ms": 3, "lw": 1, "fontsize": 8, "rot": 20}
+        style["color"] = ["black" if mean else f"C{k % 10}" for k, mean in enumerate(means)]
         if len(table):
-            table.T.plot(ax=ax, title=title, xlabel=axis, ylabel="MRE", logy=True, **style)
+            ticks = range(table.shape[1])
+            table.T.plot(ax=ax, xlabel=axis, ylabel="MRE", logy=True, xticks=ticks, **style)
+            ax.grid(alpha=0.3)
             ax.legend(fontsize=5)
+        ax.set_title(title, fontsize=9)
     picture.suptitle(text, fontsize=10)
     save(picture, path)
