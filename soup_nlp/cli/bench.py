@@ -188,7 +188,8 @@ def search(
     wanted, space = _wanted(flow, width, seeds, only), searching.parse_space(texts)
     items = [i for name in suites for i in list_suite(name, data, wanted)]
     settings = {"suite": suites, "trials": trials, "seeds": seeds, "width": width, "flow": flow}
-    command = _command("search", data, {**settings, "only": only, "set": overrides})
+    settings |= {"only": only, "param": params, "set": overrides}
+    command = _command("search", data, settings)
     changes = tuple(overrides or ())
     code = _study(
         out / "search.md",

@@ -132,7 +132,7 @@ def test_command_line_of_the_search(tmp_path, capsys, monkeypatch):
     out = capsys.readouterr()
     assert "image is missing, where: a/0.png" in out.err
     assert "DataError: image is missing, where: a/0.png, found: nothing\n" in out.out
-    assert "segmentation.neighbours=int:4:19" in (tmp_path / "search.md").read_text()
+    assert "--param segmentation.neighbours=int:4:19" in (tmp_path / "search.md").read_text()
     assert main([*words, "--param", "nonsense"]) == 2
 
 
