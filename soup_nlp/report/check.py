@@ -33,6 +33,8 @@ ROUNDINGS = 16
 """Error of a pixel coordinate after projection into both frames, in units of machine precision."""
 LOST = 1e-4
 """Share of the pixels that may lie on either side of a horizon."""
+WORST = 3
+"""Number of superpixels that are named by a claim."""
 RECOMPUTED, WRITTEN = "recomputed", "as written"
 MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, MemoryError)
 """Errors of claims and arrays that are missing or do not fit together."""
@@ -180,11 +182,13 @@ def _constraints(r: Stored) -> Iterator[Claim]:
     for which, (key, most) in limits.items():
         violations = recompute.constraints(r.soup(which), rim, r.weights["min_facing"])
         for name, limit in most.items():
-            value = float(violations[name].max())
+            # NaN counts as an infinite violation
+            violation = np.nan_to_num(violations[name], nan=np.inf, posinf=np.inf)
+            value = float(violation.max())
             claimed = _number(r.claims[key][name])
-            worst = f"superpixel {int(violations[name].argmax())}" if value > 0 else ""
+            note = "" if name == "simplex" else _worst(violation, limit)
             tolerance = 1e-3 * value + ABSOLUTE
-            yield Claim(f"{which} {name}", claimed, value, tolerance, limit, worst)
+            yield Claim(f"{which} {name}", claimed, value, tolerance, limit, note)
     if r.claims["delivered"] == "constrained NLP":
         a, b = r.soup("answer"), r.soup("nlp")
         # the gauge decides the unit of length and how a distance is split into lam and d
@@ -192,6 +196,16 @@ def _constraints(r: Stored) -> Iterator[Claim]:
         gaps = [np.abs(a[k] - b[k]).max() for k in ("n", "R")]
         gap = float(max(*gaps, np.abs(ratio / ratio.mean() - 1).max()))
         yield Claim("nlp is Ipopt's answer", 0.0, gap, 10 * within + RELATIVE)
+
+
+def _worst(violation: Float, limit: float) -> str:
+    """The superpixels of the largest violations (N,), and how many are beyond the limit."""
+    order = [k for k in np.argsort(-violation, kind="stable")[:WORST] if violation[k] > 0]
+    if not order:
+        return ""
+    beyond = int((violation > limit).sum())
+    count = f"{beyond} of {len(violation)} beyond {limit:.1e}; " if beyond else ""
+    return f"{count}worst superpixels " + "  ".join(f"{k} ({violation[k]:.1e})" for k in order)
 
 
 def _depths(r: Stored) -> Iterator[Claim]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -105,9 +106,10 @@ def test_check_holds_and_catches_tampering(solved, capsys):
         file["solution/R"][3] = 1.001 * kept
     report = check_folder(solved)
     assert not report.ok
-    assert any(
-        r.name == "solution so3" and r.note == "superpixel 3" and not r.ok for r in report.rows
-    )
+    (so3,) = (r for r in report.rows if r.name == "solution so3")
+    assert not so3.ok
+    # R'R = 1.002 I
+    assert re.match(r"1 of \d+ beyond 1\.0e-08; worst superpixels 3 \(2\.0e-03\)", so3.note)
     with h5py.File(solved / "result.h5", "a") as file:
         file["solution/R"][3] = kept
     assert check_folder(solved).ok

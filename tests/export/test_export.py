@@ -142,6 +142,7 @@ def test_a_foreign_solution_becomes_a_result_folder(exported, optimum, tmp_path,
         assert (out / name).stat().st_size > 0
     assert main(["check", str(out)]) == 0
     said = capsys.readouterr().out
+    assert "worst superpixels" in said
     assert "every claim holds" in said
 
 

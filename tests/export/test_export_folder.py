@@ -127,6 +127,8 @@ def test_the_file_has_nine_coordinates(exported):
     case, nlp, layout, (v, r), manifest = problem_of(exported)
     assert isinstance(layout, TangentLayout)
     assert manifest["formulation"]["coordinates"] == "tangent"
+    # the format casadi has the start too
+    assert {"soup.h5", "oracle.casadi"} <= set(manifest["files"])
     n = len(case)
     # eight rim rays a superpixel and the length unit; SO(3) and unit normals hold by construction
     assert (nlp.nx, nlp.ng) == (9 * n, 8 * n + 1)

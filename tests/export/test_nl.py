@@ -130,7 +130,8 @@ def test_names_are_unique_and_point_to_their_rows(form):
     for name in touched:
         owners = name.partition("[")[2].rstrip("]").split(",")
         assert "7" in owners[:2], name
-    assert "simplex" in g_names
+    assert {"simplex", "so3[11,6]", "normal[3]", "visible[5,1]"} <= set(g_names)
+    assert ("translation[4]" in g_names) == (form.gauge == "unit-translation")
 
 
 # --- foreign readers -----------------------------------------------------------------------------

@@ -101,6 +101,14 @@ def test_json_that_is_none_is_an_error_of_the_file(text, tmp_path):
         read_json(path, "summary.json")
 
 
+def test_versions_that_are_no_json_are_an_error_of_the_file(tmp_path):
+    write_h5(tmp_path / "result.h5", {"a": {"x": Array(1.0, "1", "")}}, {"versions": 1})
+    with h5py.File(tmp_path / "result.h5", "a") as file:
+        file.attrs["versions"] = "{"
+    with pytest.raises(DataError, match="HDF5"):
+        read_attrs(tmp_path / "result.h5")
+
+
 @pytest.mark.parametrize("name", ["result.h5", "summary.json"])
 @pytest.mark.parametrize("kind", ["missing", "folder", "dangling link"])
 def test_files_that_are_not_there(kind, name, tmp_path, capsys):

@@ -92,6 +92,7 @@ def test_planes_and_motions_rebuild_both_frames(text, small_run):
     scale, n = run.metrics["solution"].scale, len(run.soup)
     labels = unpack(s["labels"], "<u2", run.segmentation.labels.shape)
     np.testing.assert_array_equal(labels, run.segmentation.labels)
+    np.testing.assert_allclose(np.array(s["camera"])[:3, 3], scale * run.camera.centre, rtol=1e-9)
     planes = unpack(s["planes"], "<f4", (n, 3)).astype(float)
     ray = rays(np.array(s["K"]), pixel_grid(*labels.shape))
     points = ray / np.einsum("hwc,hwc->hw", planes[labels], ray)[..., None]
