@@ -5,34 +5,46 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import FunctionType, NoneType
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from pydantic import BaseModel
 
-from soup_nlp.config.problem import Problem, make_problem, title
+from soup_nlp.config.problem import (
+    Expected,
+    OutputOptions,
+    Problem,
+    SegmentationOptions,
+    make_problem,
+    title,
+)
 from soup_nlp.data.accept import prior_of
 from soup_nlp.data.flow.consistency import check_flow
+from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.formats.cameras import check_cameras
-from soup_nlp.data.inputs import pair_hash, resized_prior
+from soup_nlp.data.inputs import PriorOptions, pair_hash, resized_prior
 from soup_nlp.data.pair import Pair
-from soup_nlp.errors import StoppedError, expect
+from soup_nlp.errors import ConfigError, StoppedError, expect
 from soup_nlp.evaluate.baselines import rigid_depth
 from soup_nlp.evaluate.confidence import confidence
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
+from soup_nlp.model.energy_options import EnergyOptions
+from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run, full_size
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
-from soup_nlp.refine.records import Refined
+from soup_nlp.refine.records import Refined, RefineOptions
 from soup_nlp.solve.kkt import constraint_residuals
+from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
+from soup_nlp.start.start_options import StartOptions
 from soup_nlp.storage.progress import Listener, Watch
 
 EXACT, EXACT_PARALLAX = 0.015, 1.0
@@ -221,13 +233,35 @@ def skipped(case: Case) -> Solution:
     )
 
 
+Options = Mapping[str, Any]
+"""Keys of a section of a problem file."""
+
+
+class ProblemKeys(TypedDict, total=False):
+    """Keys of a problem file for a pair in memory; a section that is None has its defaults."""
+
+    preset: str | None
+    seed: int
+    max_size: float | None
+    segmentation: Options | SegmentationOptions | None
+    flow: Options | FlowOptions | None
+    depth_prior: Options | PriorOptions | None
+    start: Options | StartOptions | None
+    energy: Options | EnergyOptions | None
+    formulation: Options | FormulationOptions | None
+    solver: Options | SolverOptions | None
+    refine: Options | RefineOptions | None
+    expected: Options | Expected | None
+    output: Options | OutputOptions | None
+
+
 def solve_pair(
     pair: Pair,
     *,
     prior_ref: object = None,
     progress: bool | Listener = False,
     cropped: bool = False,
-    **keys: object,
+    **keys: Unpack[ProblemKeys],
 ) -> Run:
     """Solve a pair that is in memory.
 
@@ -239,9 +273,8 @@ def solve_pair(
         prior_ref: Depth of the reference frame from elsewhere, (H, W) or a file.
         progress: True prints a line after every stage; a function is called at every iteration.
         cropped: The images are parts of larger ones: the principal points may be anywhere.
-        keys: Keys of a problem file: `preset`, `seed`, `max_size`, and sections such as
-            `segmentation={"superpixels": 500}` or `segmentation=SegmentationOptions(...)`. A
-            section that is None has its defaults.
+        keys: Those of `ProblemKeys`: `preset`, `seed`, `max_size`, and sections such as
+            `segmentation={"superpixels": 500}` or `segmentation=SegmentationOptions(...)`.
 
     Raises:
         ConfigError: an option is wrong.
@@ -260,6 +293,9 @@ def solve_pair(
         for key, value in keys.items()
         if value is not None or key == "max_size"
     }
+    # make_problem names the other unknown keys
+    if decided := sorted(raw.keys() & {"name", "input"}):
+        raise ConfigError("key follows from the pair", where="solve_pair", found=decided[0])
     raw |= {"name": title(pair.name), "input": {"kind": "memory", "hash": pair_hash(pair)}}
     begin = time.perf_counter()
 

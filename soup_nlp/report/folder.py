@@ -251,10 +251,11 @@ def convert(
         ConfigError: a format is not known.
         DataError: the folder holds no result, or the other one cannot be written.
     """
+    names = check_formats(formats)
     result = load(folder)
     where = extended(folder, overwrite) if out is None else staged(out, overwrite=overwrite)
     with where as new:
-        return write_formats(new, result, formats)
+        return write_formats(new, result, names)
 
 
 # --- the run that Python gets --------------------------------------------------------------------

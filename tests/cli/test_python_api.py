@@ -14,7 +14,7 @@ from soup_nlp.config.problem import SegmentationOptions
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 
 SMALL = {"superpixels": 12, "neighbours": 4}
 
@@ -70,6 +70,15 @@ def test_options_may_be_records_and_progress_is_reported(capsys):
     assert {p.stage for p in seen} >= {"constrained NLP"}
     soup_nlp.solve_pair(pair, progress=True, **options)
     assert "evaluation" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [("sead", "did you mean seed"), ("input", "follows from the pair"), ("name", "follows from")],
+)
+def test_a_key_that_solve_pair_does_not_take_is_refused(key, said):
+    with pytest.raises(ConfigError, match=said):
+        soup_nlp.solve_pair(render_scene("orbit", 0, 64, 48), **{key: {}})
 
 
 def test_depth_is_scored_from_run_array_or_stored_result(run, tmp_path):
