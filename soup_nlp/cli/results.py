@@ -139,10 +139,12 @@ def foreign_verdict(imported: Imported) -> str:
     word = "verified" if s.converged else "not verified" if sol.solved else "no success claimed"
     start = imported.manifest["exact_energy_at_start"]["total"]
     headline = sol.headline or "no message"
+    terms = "  ".join(f"{k} {v:.5g}" for k, v in s.energy.items() if k != "total")
     lines = [
         f"solver      {headline} ({sol.status}, code {sol.code}): {word}",
         # start of the solver, which after a presolve is not the proposal
         f"energy      start {start:.6g}  solution {s.energy['total']:.6g}",
+        f"{'':<12}of the solution: {terms}",
         "residuals   " + "  ".join(f"{k} {v:.1e}" for k, v in s.residuals.items()),
     ]
     if imported.run.metrics:

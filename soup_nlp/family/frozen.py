@@ -145,7 +145,7 @@ def read_frozen(path: Path) -> Frozen:
             return Frozen(
                 text=a["problem"].tobytes().decode(),
                 labels=np.cumsum(a["labels"].astype(np.int32), axis=1, dtype=np.int32),
-                **{name: a[name].astype(kind) for name, (_, kind) in STORED.items()},
+                **{name: a[name].astype(kind)[()] for name, (_, kind) in STORED.items()},
             )
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise DataError("record of the family cannot be read", where=path, found=error) from error
