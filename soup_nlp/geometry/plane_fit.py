@@ -6,10 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from soup_nlp.arrays import Float, Int
+from soup_nlp.arrays import Float
 
 ROUNDING_PX = 1e-3
 """Parallax, in pixels, that counts as none, because the flow is not more accurate."""
+SLOPES, MOST_SLOPE = 0.4, 0.75
+"""Standard deviation of a slope without flow, and its limit, as in `PlaneFit.slope`."""
+NOISE_PX, CLIP_PX = 0.5, 5.0
+"""Flow noise that slopes are weighed against, and limit of an error, pixels."""
+ROUNDS = 4
+"""Re-weighting rounds of a fit."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +33,6 @@ class PlaneFit:
     slope: Float
     cost: Float
     parallax: Float
-
-    def pick(self, take: tuple[Int, Int]) -> PlaneFit:
-        """One candidate per superpixel, (N, 1), by index arrays (N,) of both axes."""
-        return PlaneFit(*(v[take][:, None] for v in self.__dict__.values()))
 
     def columns(self, indices: list[int]) -> PlaneFit:
         """The candidates in some columns."""
@@ -54,12 +56,6 @@ def fit_planes(
     anchor: Float,
     radius: Float,
     focal: tuple[float, float],
-    *,
-    noise: float = 0.5,
-    slope_prior: float = 0.4,
-    max_slope: float = 0.75,
-    clip: float = 5.0,
-    rounds: int = 4,
 ) -> PlaneFit:
     """Fit `mu(r) = mu_a + g . (r - r_a) / h` with `q ~ R r + mu t` to the flow.
 
@@ -72,11 +68,6 @@ def fit_planes(
         anchor: (N, 3) anchor rays.
         radius: (N,) reach in ray units (h).
         focal: (fx, fy) of the next camera: errors are in pixels.
-        noise: Flow noise in pixels that the slope prior is weighed against.
-        slope_prior: Standard deviation of the slopes g / mu_a.
-        max_slope: Slopes are clipped to this.
-        clip: Errors are clipped at this many pixels.
-        rounds: Reweighting rounds.
     """
     # one array (N, C, S) per coordinate, the pixels contiguous
     y = R @ np.ascontiguousarray(ray.transpose(0, 2, 1))[:, None]
@@ -94,7 +85,7 @@ def fit_planes(
     ab = ax * bx + ay * by
     mu = np.zeros((*front.shape[:2], 3))
     floor = 1e-12
-    for step in range(rounds):
+    for step in range(ROUNDS):
         s = w / depth_like**2
         mu_a = -np.sum(s * ab, axis=2) / np.maximum(np.sum(s * b2, axis=2), floor)
         if step == 0:
@@ -102,23 +93,23 @@ def fit_planes(
         else:
             A = ((s * b2) @ outer).reshape(*mu.shape, 3)
             rhs = -(s * ab) @ basis
-            # slopes are known a priori to slope_prior, the flow to noise pixels
-            prior = (noise / (slope_prior * np.maximum(np.abs(mu[..., 0]), 1e-9))) ** 2
+            # slopes are known a priori to SLOPES, the flow to NOISE_PX pixels
+            prior = (NOISE_PX / (SLOPES * np.maximum(np.abs(mu[..., 0]), 1e-9))) ** 2
             A[..., 1, 1] += prior
             A[..., 2, 2] += prior
             size = np.trace(A, axis1=-2, axis2=-1)[..., None, None]
             A += (floor * size + 1e-18) * np.eye(3)
             mu = np.linalg.solve(A, rhs[..., None])[..., 0]
-            limit = max_slope * np.abs(mu[..., :1])
+            limit = MOST_SLOPE * np.abs(mu[..., :1])
             mu[..., 1:] = np.clip(mu[..., 1:], -limit, limit)
         value = mu @ basis.transpose(0, 2, 1)
         depth_like = np.maximum(front + value * shift, 1e-3)
         ex, ey = ax + bx * value, ay + by * value
         error = np.sqrt(ex * ex + ey * ey) / depth_like
-        w = confident / np.sqrt(error**2 + noise**2)
+        w = confident / np.sqrt(error**2 + NOISE_PX**2)
     total = np.maximum(confident.sum(axis=2), 1e-9)
-    cost = np.sum(confident * np.minimum(error, clip), axis=2) / total
+    cost = np.sum(confident * np.minimum(error, CLIP_PX), axis=2) / total
     parallax = np.sqrt(np.sum(confident * b2 / depth_like**2, axis=2) / total)
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.where(mu[..., :1] != 0, mu[..., 1:] / mu[..., :1], 0.0)
-    return PlaneFit(mu[..., 0], np.clip(slope, -max_slope, max_slope), cost, parallax)
+    return PlaneFit(mu[..., 0], np.clip(slope, -MOST_SLOPE, MOST_SLOPE), cost, parallax)
