@@ -83,6 +83,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
     cont = float((e["pair_weight"] * gap).sum())
     turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
     orient = float((e["orient_weight"] * np.minimum(turn, w["sigma_orient"])).sum())
+    # along the mean ray, whose length does not matter
     middle = e["boundary_ray"].sum(axis=1, keepdims=True)
     rhos = [1 / lift(s, middle, superpixel)[0][:, 0, 2] for superpixel in (i, k)]
     sign = np.sign(e["order_weight"])

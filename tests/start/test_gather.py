@@ -1,5 +1,4 @@
-"""Components take one motion each: those in pieces are gathered, halves come back, the rest
-stays."""
+"""Components get one motion each: pieces are gathered, lost halves return, others do not change."""
 
 from __future__ import annotations
 
@@ -52,7 +51,7 @@ def turned(m: Motion, degrees: float, axis: int) -> Motion:
 
 
 def agreement(choice: Choice, component: np.ndarray) -> tuple[float, float]:
-    """Share of wedge and of room that have the commonest motion of theirs."""
+    """Shares of the wedge and of the room with the most frequent motion there."""
     shares = []
     for b in (1, 0):
         own = choice.label[component == b]
