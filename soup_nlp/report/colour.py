@@ -20,11 +20,16 @@ VIVID = (
 )
 """Colours of tab10 without its grey, which means unknown."""
 
+LEAST_RANGE = 1.02
+"""Least ratio of the two ends of a colour scale of depth."""
+
 _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 
 
 def depth_range(depth: AnyFloat) -> tuple[float, float]:
     """(near, far) of the colour scale of a depth map: its 2nd and 98th percentile.
+
+    They are at least 2 % apart, so that a constant depth has one colour in spite of its rounding.
 
     Args:
         depth: (H, W) z; values that are not finite or not positive are left out.
@@ -37,8 +42,9 @@ def depth_range(depth: AnyFloat) -> tuple[float, float]:
     if z.size == 0:
         return 1.0, 2.0
     near, far = (float(x) for x in np.percentile(z, (2.0, 98.0)))
-    if not far > near * (1 + 1e-9):  # a constant depth
-        near, far = near / 1.1, far * 1.1
+    if far < near * LEAST_RANGE:
+        middle, half = np.sqrt(near * far), np.sqrt(LEAST_RANGE)
+        near, far = float(middle / half), float(middle * half)
     return near, far
 
 
