@@ -61,6 +61,8 @@ def test_casadi_reads_back_every_formulation(form, tmp_path):
     for seed, size in ((0, 0.02), (1, 0.2)):
         agrees(nlp, file, back, wiggle(nlp, layout.size, seed, size), seed)
     assert file.size == file.path.stat().st_size
+    nonzeros = file.path.read_text().splitlines()[7]
+    assert nonzeros.split()[:2] == [str(nlp.nnzj), str(file.counts["gradient_nonzeros"])]
 
 
 def test_parameters_and_start_are_written(tmp_path):
@@ -130,7 +132,7 @@ def test_names_are_unique_and_point_to_their_rows(form):
     for name in touched:
         owners = name.partition("[")[2].rstrip("]").split(",")
         assert "7" in owners[:2], name
-    assert {"simplex", "so3[11,6]", "normal[3]", "visible[5,1]"} <= set(g_names)
+    assert {"simplex", "so3[0,1]", "so3[11,6]", "normal[3]", "visible[5,1]"} <= set(g_names)
     assert ("translation[4]" in g_names) == (form.gauge == "unit-translation")
 
 

@@ -5,6 +5,7 @@ import matplotlib
 import numpy as np
 import pytest
 
+from soup_nlp.errors import DataError
 from soup_nlp.report.colour import (
     UNKNOWN,
     colour_wheel,
@@ -23,6 +24,7 @@ from soup_nlp.report.figures import (
     strip,
     write_clipped_depth_png16,
     write_picture,
+    write_png,
 )
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 
@@ -243,6 +245,15 @@ def test_a_white_panel_has_a_frame():
     assert abs(np.ptp(columns) - 420) < 4
     assert abs(np.ptp(rows) - 252) < 4
     assert not dark[rows[0] + 3 : rows[-1] - 2, columns[0] + 3 : columns[-1] - 2].any()
+
+
+def test_png_round_trip(tmp_path):
+    rgb = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
+    write_png(tmp_path / "a.png", rgb)
+    back = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB)
+    np.testing.assert_array_equal(back, rgb)
+    with pytest.raises(DataError, match="cannot be written"):
+        write_png(tmp_path / "no" / "a.png", rgb)
 
 
 def test_depth_png(tmp_path):
