@@ -121,24 +121,21 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
 
 
 def _sigma(result: Run) -> Row:
-    """ "within" and "sparsification" of sigma at true pixels, after a median scale."""
+    """ "within" and "sparsification" of sigma at true pixels, after a median scale, if any."""
     truth, sigma = result.pair.truth, result.reconstruction.sigma_ref
     if truth is None or not has_depth(truth) or sigma is None:
-        return {"within": None}
+        return {}
     z, gt = at_truth(truth, result.reconstruction.depth_ref)
     true = true_pixels(gt, None) & np.isfinite(z)
     if not true.any():
-        return {"within": None}
+        return {}
     z, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
     uncertain = at_truth(truth, sigma)[0][true]
     measured = sparsification(np.abs(z - gt) / gt, uncertain)
-    curve = [
-        [round(float(v), 5) for v in line]
-        for line in (measured.kept, measured.error, measured.oracle)
-    ]
+    curve = np.round([measured.kept, measured.error, measured.oracle], 5)
     return {
         "within": coverage(np.abs(np.log(z / gt)), uncertain),
-        "sparsification": {"ause": measured.ause, "curve": curve},
+        "sparsification": {"ause": measured.ause, "curve": curve.tolist()},
     }
 
 
@@ -149,13 +146,10 @@ def has_depth(truth: Truth | None) -> bool:
 
 def _applies(truth: Truth | None, convention: Preset) -> bool:
     """Whether a true pixel counts under a convention; a crop needs a depth map."""
-    if truth is None:
-        return False
-    if truth.depth_ref is not None:
+    if truth is not None and truth.depth_ref is not None:
         return convention.counts(truth.depth_ref)
-    if truth.points is None or convention.crop is not None:
-        return False
-    return convention.counts(truth.points[:, 2])
+    points = None if truth is None or convention.crop is not None else truth.points
+    return points is not None and convention.counts(points[:, 2])
 
 
 def _metrics(

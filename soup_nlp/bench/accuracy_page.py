@@ -8,21 +8,34 @@ import numpy as np
 import pandas as pd
 
 from soup_nlp.bench.accuracy import BASELINES, METHODS
-from soup_nlp.bench.study import (
-    failures,
-    main_metric,
-    markdown,
-    page_text,
-    panels,
-    provenance,
-    save,
-    titled,
-)
+from soup_nlp.bench.study import main_metric, markdown, page_text, panels, provenance, save, titled
 from soup_nlp.evaluate.metrics import ERRORS
 from soup_nlp.evaluate.protocols import preset
 
-SURENESS = ("AUSE", "guess", "within 1", "within 2")
+SURENESS = ["AUSE", "guess", "within 1", "within 2"]
 """Columns on sigma."""
+ABOUT_FAMILIES = (
+    "Means over the pairs, each under its own convention. Moving: pixels that move by themselves,"
+    " where a mask or the true motion is known. AUSE: area between the sparsification curve of"
+    " sigma and the oracle's, over the MRE; 0 is perfect, 0.8 to 1 is chance. Guess: share of the"
+    " image. Within k: share of the pixels whose log depth is within k sigma."
+)
+BETTER = {
+    "main": ("convention", ""),
+    "baseline": ("baseline", ""),
+    "theirs": ("its MRE", ".4f"),
+    "mre": ("the solution's", ".4f"),
+    "pixels": ("its pixels", ".1%"),
+    "difference": ("difference", "+.4f"),
+}
+"""Columns of the table of baselines that are better."""
+DETAILS = {
+    "flow_error.mean": "flow EPE px",
+    "scene_flow.mean": "3D EPE",
+    "scene_flow.mean_truth_length": "of length",
+    "bending_share": "bending",
+}
+"""Titles of further columns of the solution's errors, by column of the frame."""
 
 
 def write_suite(page: Path, frame: pd.DataFrame, note: str = "") -> None:
@@ -33,28 +46,29 @@ def write_suite(page: Path, frame: pd.DataFrame, note: str = "") -> None:
 
 def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = False) -> str:
     """The page of the rows of one suite, with or without its picture."""
-    good = frame[frame["ok"].eq(True)].copy()
-    scored = good[good["mre"].notna()]
+    good = frame[frame["ok"].eq(True)]
+    scored = good[good["mre"].notna()].copy()
+    scored[SURENESS[:2]] = scored.reindex(columns=["sparsification.ause", "guess"]).astype(float)
+    for k in (0, 1):
+        within = [v[k] if isinstance(v, list) else np.nan for v in scored.get("within", [])]
+        scored[f"within {k + 1}"] = within or np.nan
     settings = ", ".join(sorted(frame["settings"].astype(str).unique()))
-    lines = [f"# Accuracy on {name}", "", note, "", _verdict(good, scored, len(frame)), ""]
-    lines += [f"{provenance(frame)}; settings {settings} (one a flow source).", ""]
-    for convention in dict.fromkeys(p for presets in scored["presets"] for p in presets):
-        lines += _convention(convention, scored)
-    lines += [*_families(scored), *_better_baselines(scored)]
-    for convention, group in scored.groupby("main", sort=False):
-        lines += _details(str(convention), group)
-    if picture:
-        lines += ["## Sigma", "", f"![Sparsification by sigma, by family]({name}.png)", ""]
-    return page_text([*lines[:-1], *failures(frame)])
-
-
-def _verdict(good: pd.DataFrame, scored: pd.DataFrame, total: int) -> str:
     beaten = beating(scored)["title"].nunique()
-    return (
-        f"{len(good)} of {total} pairs measured, {int(good.get('good', scored['ok']).sum())}"
+    verdict = (
+        f"{len(good)} of {len(frame)} pairs measured, {int(good.get('good', good['ok']).sum())}"
         f" converged. The solution beats every baseline on {len(scored) - beaten} of {len(scored)}"
         " (MRE, each pair's own convention)."
     )
+    about = f"{provenance(frame)}; settings {settings} (one a flow source)."
+    blocks = [f"# Accuracy on {name}", note, verdict, about]
+    for convention in dict.fromkeys(p for presets in scored["presets"] for p in presets):
+        blocks += _convention(convention, scored)
+    blocks += [*_families(scored), *_better_baselines(scored)]
+    for convention, group in scored.groupby("main", sort=False):
+        blocks += [f"## The solution, {preset(str(convention))}", _details(group)]
+    if picture:
+        blocks += ["## Sigma", f"![Sparsification by sigma, by family]({name}.png)"]
+    return page_text(blocks, frame)
 
 
 def beating(frame: pd.DataFrame) -> pd.DataFrame:
@@ -78,17 +92,12 @@ def _better_baselines(frame: pd.DataFrame) -> list[str]:
     if better.empty:
         return []
     better["difference"] = better["theirs"] - better["mre"]
-    columns = {
-        "main": ("convention", ""),
-        "baseline": ("baseline", ""),
-        "theirs": ("its MRE", ".4f"),
-        "mre": ("the solution's", ".4f"),
-        "pixels": ("its pixels", ".1%"),
-        "difference": ("difference", "+.4f"),
-    }
     text = "The solution's MRE is on the pixels that the baseline has a depth for."
-    lines = titled(better.set_axis(pd.Index(better["title"], name="pair, flow")), columns)
-    return ["## Baselines that are better", "", text, "", *lines, ""]
+    return ["## Baselines that are better", text, titled(_by_pair(better), BETTER)]
+
+
+def _by_pair(frame: pd.DataFrame) -> pd.DataFrame:
+    return frame.set_axis(pd.Index(frame["title"], name="pair, flow"))
 
 
 def _convention(name: str, frame: pd.DataFrame) -> list[str]:
@@ -96,78 +105,52 @@ def _convention(name: str, frame: pd.DataFrame) -> list[str]:
     columns = {f"metrics.{name}.{m}.mre": m for m in METHODS}
     columns |= {f"metrics.{name}.solution.{k}": k for k in ("skill", "coverage")}
     scored = frame[frame[f"metrics.{name}.solution.mre"].notna()]
-    keys = ["suite", "sequence", "flow", "title"]
     numbers = scored[[c for c in columns if c in scored]].astype(float).rename(columns=columns)
     numbers = numbers.dropna(axis=1, how="all")
     text = preset(name).text
-    lines = [f"## MRE, {preset(name)}", "", f"{text[0].upper()}{text[1:]}.", ""]
-    lines += markdown(numbers.set_axis(pd.Index(scored["title"], name="pair, flow")))
-    for level, by in (("sequence", keys[:3]), ("dataset", ["suite", "flow"])):
-        groups = pd.concat([scored[keys], numbers], axis=1).groupby(by, sort=False)
+    blocks = [f"## MRE, {preset(name)}", f"{text[0].upper()}{text[1:]}."]
+    blocks.append(markdown(numbers.set_axis(_by_pair(scored).index)))
+    for level, by in (("sequence", ["suite", "sequence", "flow"]), ("dataset", ["suite", "flow"])):
+        groups = pd.concat([scored[by], numbers], axis=1).groupby(by, sort=False)
         if 0 < groups.ngroups < len(scored):
-            means = groups[list(numbers.columns)].mean()
-            means.insert(0, "pairs", groups.size())
-            lines += ["", f"Mean per {level}:", "", *markdown(means, _forms(means))]
-    return [*lines, ""]
+            blocks += [f"Mean per {level}:", _means(groups)]
+    return blocks
 
 
-def _forms(frame: pd.DataFrame) -> dict[str, str]:
-    """Formats of a table: counts as they are, all other numbers with four digits."""
-    return {str(c): "" if str(c).endswith("pairs") else ".4f" for c in frame.columns}
+def _means(groups: pd.api.typing.DataFrameGroupBy, **more: pd.Series) -> str:
+    """Table of the number of pairs and the means of groups, and further columns."""
+    means = groups.mean().assign(**more)
+    means.insert(0, "pairs", groups.size())
+    return markdown(means, {str(c): "" if c == "pairs" else ".4f" for c in means})
 
 
 def _families(frame: pd.DataFrame) -> list[str]:
     """Table of the solution by family (sequence) and flow: means, moving pixels, worst pair."""
-    if frame.groupby(["sequence", "flow"]).ngroups < 2:
+    by = ["sequence", "flow"]
+    shown = frame[[*by, "mre", "constant"]].copy()
+    for title, name in {"median": "median_relative", "d<1.25": "delta1", "skill": "skill"}.items():
+        shown[title] = main_metric(frame, name=name)
+    for title, column in {"MRE moving": "moving.mre", "MRE of the rest": "moving.rest"}.items():
+        shown[title] = frame[column].astype(float) if column in frame else np.nan
+    groups = pd.concat([shown, frame[SURENESS]], axis=1).groupby(by, sort=False)
+    if groups.ngroups < 2:
         return []
-    shown = frame[["sequence", "flow", "title", "mre", "constant"]].copy()
-    shown["median"] = main_metric(frame, name="median_relative")
-    shown["d<1.25"] = main_metric(frame, name="delta1")
-    shown["skill"] = main_metric(frame, name="skill")
-    for column, name in {"moving.mre": "MRE moving", "moving.rest": "MRE of the rest"}.items():
-        shown[name] = frame[column].astype(float) if column in frame else np.nan
-    shown[list(SURENESS)] = _sureness(frame)
-    groups = shown.groupby(["sequence", "flow"], sort=False)
-    means = groups[[c for c in shown.columns if c not in ("sequence", "flow", "title")]].mean()
-    means.insert(0, "pairs", groups.size())
-    means["worst pair"] = [shown.loc[i, "title"] for i in groups["mre"].idxmax()]
-    text = (
-        "Means over the pairs, each under its own convention. Moving: pixels that move by"
-        " themselves, where a mask or the true motion is known. AUSE: area between the"
-        " sparsification curve of sigma and the oracle's, over the MRE; 0 is perfect, 0.8 to 1 is"
-        " chance. Guess: share of the image. Within k: share of the pixels whose log depth is"
-        " within k sigma."
-    )
-    return ["## By family", "", text, "", *markdown(means, _forms(means)), ""]
+    worst = frame["title"][groups["mre"].idxmax()].set_axis(groups["mre"].max().index)
+    return ["## By family", ABOUT_FAMILIES, _means(groups, **{"worst pair": worst})]
 
 
-def _sureness(frame: pd.DataFrame) -> pd.DataFrame:
-    """SURENESS by row; "within" of a row has the shares within one and within two sigma."""
-    out = frame.reindex(columns=["sparsification.ause", "guess"]).astype(float)
-    for k in (0, 1):
-        values = [v[k] if isinstance(v, list) else np.nan for v in frame.get("within", [])]
-        out[f"within {k + 1}"] = values or np.nan
-    return out.set_axis(list(SURENESS), axis=1)
-
-
-def _details(convention: str, frame: pd.DataFrame) -> list[str]:
+def _details(frame: pd.DataFrame) -> str:
     """Table of the solution's other errors, flow error, scene flow, sigma and seconds."""
-    out = pd.DataFrame(index=pd.Index(frame["title"], name="pair, flow"))
     heads = ("median", "SqRel", "RMSE", "log-RMSE", "d<1.25", "d<1.25^2", "d<1.25^3")
-    for head, name in zip(heads, ERRORS[1:], strict=True):
-        out[head] = main_metric(frame, name=name).to_numpy()
-    for column, head in {
-        "flow_error.mean": "flow EPE px",
-        "scene_flow.mean": "3D EPE",
-        "scene_flow.mean_truth_length": "of length",
-        "bending_share": "bending",
-    }.items():
+    errors = zip(heads, ERRORS[1:], strict=True)
+    out = pd.DataFrame({head: main_metric(frame, name=name) for head, name in errors})
+    for column, head in DETAILS.items():
         if column in frame:
-            out[head] = frame[column].astype(float).to_numpy()
-    out[list(SURENESS)] = _sureness(frame).to_numpy()
-    out["status"], out["s"] = frame["status"].to_numpy(), frame["cpu_seconds"].to_numpy()
+            out[head] = frame[column].astype(float)
+    out[SURENESS] = frame[SURENESS]
+    out[["status", "s"]] = frame[["status", "cpu_seconds"]]
     forms = dict.fromkeys(out.columns, ".4f") | {"s": ".0f"}
-    return [f"## The solution, {preset(convention)}", "", *markdown(out, forms), ""]
+    return markdown(out.set_axis(_by_pair(frame).index), forms)
 
 
 def _plot_sparsification(path: Path, frame: pd.DataFrame) -> bool:
@@ -180,8 +163,11 @@ def _plot_sparsification(path: Path, frame: pd.DataFrame) -> bool:
     families = (computed if len(computed) else shown).groupby("sequence", sort=False)
     if not len(families):
         return False
-    out, axes = panels(families.ngroups, 4, 3.0, 2.4)
-    for ax, (family, group) in zip(axes, families, strict=True):
+    columns = min(4, families.ngroups)
+    out, axes = panels(-(-families.ngroups // columns), columns, 3.0, 2.4)
+    for ax in axes.flat[families.ngroups :]:
+        ax.set_axis_off()
+    for ax, (family, group) in zip(axes.flat, families, strict=False):
         for curve in group["sparsification.curve"]:
             kept, by_sigma, oracle = np.array(curve)
             ax.plot(100 * (1 - kept), by_sigma / by_sigma[0], color="#4477aa", lw=1)

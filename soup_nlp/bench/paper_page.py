@@ -13,16 +13,7 @@ import pandas as pd
 from soup_nlp.bench.paper import BASE, DATASETS, METHODS
 from soup_nlp.bench.processes import processor
 from soup_nlp.bench.studies import ABLATION, COMPARISON, DATA, DEPARTURES, SOURCE, STUDIES
-from soup_nlp.bench.study import (
-    failures,
-    figure,
-    markdown,
-    page_text,
-    pivot,
-    provenance,
-    save,
-    titled,
-)
+from soup_nlp.bench.study import markdown, page_text, panels, pivot, provenance, save, titled
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.evaluate.protocols import preset
 
@@ -41,6 +32,18 @@ WITHOUT_TRUTH = {
     "ULDEMV": "the paper draws its errors on KITTI and prints no number",
 }
 """Data of the paper without a row here, and the reason."""
+ABOUT = (
+    "`preset: paper` is the method as printed; *defaults* are those of this program. What both"
+    " differ in is in [the table of departures](../../docs/formulation.md#the-preset-paper)."
+    " MRE is the mean relative error of the reference frame's depth after one global scale per"
+    f" image. Published numbers are copied, not measured: {SOURCE}; the paper names neither its"
+    " scale rule nor a depth cap. A dash is a number that is not published or not measured."
+)
+ALONE = {
+    "defaults": "Defaults with one departure undone (*off alone*): above 1 it pays.",
+    "preset: paper": "The preset with one departure made (*on alone*): below 1 it pays.",
+}
+"""Titles of the tables of departures by method."""
 
 
 def write_paper(
@@ -49,21 +52,26 @@ def write_paper(
     """Write the page and its figures beside it; `note` gives the sizes of the rows."""
     folder = page.parent
     rows = plan.join(frame.set_index("key").drop(columns="variant"), on="key")
-    sections = dict(list(rows.groupby("section", sort=False)))
-    none = rows.iloc[:0]
-    compared = sections.pop("comparison", none)
-    departures = sections.pop("departures", none)
-    lines = [*_head(frame, command, note), *_comparison(folder, compared)]
-    lines += _pictures(folder, compared)
-    for name, section_rows in sections.items():
-        lines += _study(folder, str(name), section_rows)
-    lines += [*_convergence(folder, compared), *_time(compared), *_departures(folder, departures)]
-    lines += [*_missing(set(plan["dataset"])), *failures(frame)]
-    page.write_text(page_text(lines), encoding="utf-8")
+    of_section = dict(list(rows.groupby("section", sort=False)))
+    compared = of_section.get("comparison", rows.iloc[:0])
+    head = [
+        "# The paper, row by row",
+        f"Made by `{command}`. {provenance(frame)}. Flow by OpenCV DIS unless named."
+        f" Machine: {os.cpu_count()} cores of an {processor()}.\n"
+        f"{note} {int(frame['ok'].eq(True).sum())} of the {len(frame)} rows were measured.",
+        ABOUT,
+    ]
+    blocks = [*head, *_comparison(folder, compared), *_pictures(folder, compared)]
+    for name in STUDIES:
+        if name in of_section:
+            blocks += _study(folder, name, of_section[name])
+    blocks += [*_convergence(folder, compared), *_time(compared)]
+    blocks += _departures(folder, of_section.get("departures", rows.iloc[:0]))
+    page.write_text(page_text([*blocks, *_missing(set(plan["dataset"]))], frame), encoding="utf-8")
 
 
-def _figure(name: str, text: str) -> list[str]:
-    return ["", f"![{text}]({name}.png)", ""]
+def _figure(name: str, text: str) -> str:
+    return f"![{text}]({name}.png)"
 
 
 def _mre(rows: pd.DataFrame, convention: str = "paper", method: str = "solution") -> pd.Series:
@@ -71,27 +79,9 @@ def _mre(rows: pd.DataFrame, convention: str = "paper", method: str = "solution"
     return rows[column].astype(float) if column in rows else pd.Series(np.nan, index=rows.index)
 
 
-def _head(frame: pd.DataFrame, command: str, note: str) -> list[str]:
-    return [
-        "# The paper, row by row",
-        "",
-        f"Made by `{command}`. {provenance(frame)}. Flow by OpenCV DIS unless named."
-        f" Machine: {os.cpu_count()} cores of an {processor()}.",
-        f"{note} {int(frame['ok'].eq(True).sum())} of the {len(frame)} rows were measured.",
-        "",
-        "`preset: paper` is the method as printed; *defaults* are those of this program. What both"
-        " differ in is in [the table of departures](../../docs/formulation.md#the-preset-paper)."
-        " MRE is the mean relative error of the reference frame's depth after one global scale per"
-        f" image. Published numbers are copied, not measured: {SOURCE}; the paper names neither its"
-        " scale rule nor a depth cap. A dash is a number that is not published or not measured.",
-        "",
-    ]
-
-
 def _comparison(folder: Path, rows: pd.DataFrame) -> list[str]:
     """Tables by dataset and by pair, and the figure of the errors."""
     caps = dict.fromkeys(cap for _, _, cap in DATASETS.values() if cap)
-    lines = ["## Mean relative error per dataset", ""]
     entries, bars = {}, {}
     for name, (title, _, cap) in DATASETS.items():
         group = rows[rows["dataset"] == name]
@@ -109,27 +99,28 @@ def _comparison(folder: Path, rows: pd.DataFrame) -> list[str]:
             shown = {"published": line["Superpixel Soup (published)"]}
             shown |= {method: line[f"{method}: median"] for method in METHODS}
             bars[title] = {**shown, "constant depth": line["constant depth"]}
-    data = pd.DataFrame.from_dict(entries, orient="index").rename_axis("dataset")
-    lines += [*markdown(data), ""]
-    lines += ["Columns: " + "; ".join(str(preset(n)) for n in ("paper", "best", *caps)) + ".", ""]
-    lines += ["On which pairs: " + "; ".join(f"{n}: {t}" for n, t in DATA.items()) + ".", ""]
-    lines += ["Every pair, MRE after median scale, no cap; the constrained NLP's status:", ""]
-    by_pair = rows[["name", "method", "status"]].assign(
+    by_pair = rows[["name", "method"]].assign(
         start=_mre(rows, "paper", "start"),
         NLP=_mre(rows, "paper", "nlp"),
         refined=_mre(rows),
         constant=_mre(rows, "paper", "constant"),
+        status=rows["status"],
     )
-    by_pair["status"] = by_pair.pop("status")
-    lines += [*markdown(by_pair.set_index(["name", "method"]))]
     _plot_bars(folder / "comparison.png", pd.DataFrame(bars).T, "MRE by dataset")
-    return [*lines, *_figure("comparison", "MRE by dataset")]
+    return [
+        "## Mean relative error per dataset",
+        markdown(pd.DataFrame.from_dict(entries, orient="index").rename_axis("dataset")),
+        "Columns: " + "; ".join(str(preset(n)) for n in ("paper", "best", *caps)) + ".",
+        "On which pairs: " + "; ".join(f"{n}: {t}" for n, t in DATA.items()) + ".",
+        "Every pair, MRE after median scale, no cap; the constrained NLP's status:",
+        markdown(by_pair.set_index(["name", "method"])),
+        _figure("comparison", "MRE by dataset"),
+    ]
 
 
 def _plot_bars(path: Path, bars: pd.DataFrame, text: str, base: float = 0.0) -> None:
     """Groups of horizontal bars from `base`: a group for each row, a colour for each column."""
-    picture = figure(8, 0.4 * len(bars) + 1.5)
-    ax = picture.add_subplot()
+    picture, ((ax,),) = panels(1, 1, 8, 0.4 * len(bars) + 1.5)
     if len(bars):
         style = {"width": 0.8, "fontsize": 7, "grid": True, "logx": base > 0}
         (bars - base).plot.barh(ax=ax, left=base, ylabel="", **style)
@@ -149,8 +140,7 @@ def _pictures(folder: Path, rows: pd.DataFrame) -> list[str]:
                 maps.setdefault(name, {})[method] = dict(file)
     shown = {name: by_method for name, by_method in maps.items() if len(by_method) == len(METHODS)}
     heads = ("image", "truth", "paper's start", "preset: paper", "defaults")
-    picture = figure(2.0 * len(heads), 1.15 * max(1, len(shown)) + 0.4)
-    axes = picture.subplots(max(1, len(shown)), len(heads), squeeze=False)
+    picture, axes = panels(len(shown), len(heads), 2.0, 1.2)
     for ax in axes.flat:
         ax.set_axis_off()
     for line, (name, by_method) in zip(axes, shown.items(), strict=False):
@@ -168,34 +158,48 @@ def _pictures(folder: Path, rows: pd.DataFrame) -> list[str]:
     picture.suptitle("Depth: dark is near, bright is far; one logarithmic scale a line", fontsize=8)
     save(picture, folder / "depth_maps.png")
     text = "Depth maps: image, truth, unorganised soup, preset, defaults"
-    return ["## Depth maps", "", f"{text}.", *_figure("depth_maps", text)]
+    return ["## Depth maps", f"{text}.", _figure("depth_maps", text)]
 
 
 def _study(folder: Path, name: str, rows: pd.DataFrame) -> list[str]:
     """A study by both methods: a table for each, and a figure."""
-    text = STUDIES[name].text
-    lines = [f"## {text[0].upper()}{text[1:]}", ""]
-    drawn = {}
+    study = STUDIES[name]
+    blocks, drawn = [f"## {study.text[0].upper()}{study.text[1:]}"], {}
     for method in METHODS:
         group = rows[rows["method"] == method].assign(value=_mre(rows))
         drawn[method] = pivot(group, "value", "name", "change").rename_axis(index="pair")
-        lines += [f"{method}, MRE after median scale, no cap:", "", *markdown(drawn[method]), ""]
+        blocks += [f"{method}, MRE after median scale, no cap:", markdown(drawn[method])]
     if name == "ablation":
         terms = ["arap", "+ proj", "+ cont", "+ orient"]
         printed = pd.DataFrame.from_dict(dict(ABLATION), orient="index", columns=terms)
-        lines += ["Published MRE:", "", *markdown(printed.rename_axis("sequence")), ""]
-        lines += [f"Copied, not measured: {SOURCE}.", ""]
-    lines += [STUDIES[name].published, ""] if STUDIES[name].published else []
-    _plot_lines(folder / f"{name}.png", drawn, name, text)
-    return [*lines, *_figure(name, text)]
+        blocks += ["Published MRE:", markdown(printed.rename_axis("sequence"))]
+        blocks.append(f"Copied, not measured: {SOURCE}.")
+    _plot_lines(folder / f"{name}.png", drawn, name, study.text)
+    return [*blocks, study.published, _figure(name, study.text)]
+
+
+def _plot_lines(path: Path, tables: Mapping[str, pd.DataFrame], axis: str, text: str) -> None:
+    """Lines of tables over their columns, a panel for each table; the mean in black."""
+    picture, (axes,) = panels(1, len(tables), 4.5, 3.8, sharey=True)
+    for ax, (title, table) in zip(axes, tables.items(), strict=True):
+        means = [str(name).startswith("mean of") for name in table.index]
+        style: dict[str, Any] = {"marker": "o", "ms": 3, "lw": 1, "fontsize": 8, "rot": 20}
+        style["color"] = ["black" if mean else f"C{k % 10}" for k, mean in enumerate(means)]
+        if len(table):
+            ticks = range(table.shape[1])
+            table.T.plot(ax=ax, xlabel=axis, ylabel="MRE", logy=True, xticks=ticks, **style)
+            ax.grid(alpha=0.3)
+            ax.legend(fontsize=5)
+        ax.set_title(title, fontsize=9)
+    picture.suptitle(text, fontsize=10)
+    save(picture, path)
 
 
 def _convergence(folder: Path, rows: pd.DataFrame) -> list[str]:
     """Table and figure of the energy over iterations and rounds."""
     good = rows[rows["curve.exact"].notna()] if "curve.exact" in rows else rows.iloc[:0]
     entries = []
-    picture = figure(9, 2.1 * max(1, len(good)) + 0.7)
-    axes = picture.subplots(max(1, len(good)), 2, squeeze=False)
+    picture, axes = panels(len(good), 2, 4.5, 2.5)
     for (left, right), row in zip(axes, good.to_dict("records"), strict=False):
         begin = 0
         for k, (stage, y) in enumerate(zip(row["curve.names"], row["curve.values"], strict=True)):
@@ -214,10 +218,12 @@ def _convergence(folder: Path, rows: pd.DataFrame) -> list[str]:
     save(picture, folder / "convergence.png")
     head = ["pair", "method", "constrained NLP", "iterations", "E start", "E NLP"]
     table = pd.DataFrame(entries, columns=[*head, "refinement lowers E by"])
-    lines = ["## Convergence of E over iterations and rounds", ""]
-    lines += ["The exact energy of start and NLP; the figure has the smoothed energy by stage.", ""]
-    lines += markdown(table.set_index("pair"), "")
-    return [*lines, *_figure("convergence", "Energy over iterations and rounds")]
+    return [
+        "## Convergence of E over iterations and rounds",
+        "The exact energy of start and NLP; the figure has the smoothed energy by stage.",
+        markdown(table.set_index("pair"), ""),
+        _figure("convergence", "Energy over iterations and rounds"),
+    ]
 
 
 def _time(rows: pd.DataFrame) -> list[str]:
@@ -228,24 +234,19 @@ def _time(rows: pd.DataFrame) -> list[str]:
         "Wall seconds by stage, the machine shared with other work, and CPU seconds of the whole"
         " row. Published: 15 to 20 minutes for 1024 x 436 in MATLAB and C++ on an i7."
     )
-    return ["## Time", "", text, "", *titled(runs, columns), ""]
+    return ["## Time", text, titled(runs, columns)]
 
 
 def _departures(folder: Path, rows: pd.DataFrame) -> list[str]:
     """Tables and figure of the departures, each undone or made alone."""
-    titles = {
-        "defaults": "Defaults with one departure undone (*off alone*): above 1 it pays.",
-        "preset: paper": "The preset with one departure made (*on alone*): below 1 it pays.",
-    }
-    lines = ["## Departures, one at a time", ""]
-    lines += [
+    blocks = [
+        "## Departures, one at a time",
         "MRE, one pair of each family. *Mean* and *median* are of the ratios to the first line (the"
         " mean is geometric, a single diverging solve decides it); *worse / better* counts the"
         " pairs that change by more than 1 %.",
-        "",
     ]
     bars = {}
-    for method, text in titles.items():
+    for method, text in ALONE.items():
         group = rows[rows["method"] == method].assign(value=_mre(rows))
         values = pivot(group, "value", "change", "name", average=False).dropna(axis=1, how="all")
         ratios = values / values.loc[BASE] if len(values) else values
@@ -255,11 +256,11 @@ def _departures(folder: Path, rows: pd.DataFrame) -> list[str]:
         values.insert(0, "median", ratios.median(axis=1))
         values.insert(0, "mean", mean)
         bars[method] = mean.drop(BASE, errors="ignore")
-        lines += [text, "", *markdown(values.rename_axis("departure")), ""]
-    lines += [f"- {d.name}: {d.needs}." for d in DEPARTURES if d.needs]
+        blocks += [text, markdown(values.rename_axis("departure"))]
     text = "MRE relative to all others as they are (geometric mean of the pairs)"
     _plot_bars(folder / "departures.png", pd.DataFrame(bars), text, base=1.0)
-    return [*lines, "", *_figure("departures", text)]
+    needs = "\n".join(f"- {d.name}: {d.needs}." for d in DEPARTURES if d.needs)
+    return [*blocks, needs, _figure("departures", text)]
 
 
 def _missing(present: set[str]) -> list[str]:
@@ -270,22 +271,4 @@ def _missing(present: set[str]) -> list[str]:
             suite = SUITES[suites[0]]
             reasons[title] = f"no pair was given; from {suite.source}, as {suite.layout}"
     table = pd.Series(reasons | WITHOUT_TRUTH, name="why, and where from").rename_axis("data")
-    return ["## What is not here", "", *markdown(table.to_frame()), ""]
-
-
-def _plot_lines(path: Path, tables: Mapping[str, pd.DataFrame], axis: str, text: str) -> None:
-    """Lines of tables over their columns, a panel for each table; the mean in black."""
-    picture = figure(4.5 * len(tables), 3.8)
-    axes = picture.subplots(1, len(tables), sharey=True, squeeze=False)[0]
-    for ax, (title, table) in zip(axes, tables.items(), strict=True):
-        means = [str(name).startswith("mean of") for name in table.index]
-        style: dict[str, Any] = {"marker": "o", "ms": 3, "lw": 1, "fontsize": 8, "rot": 20}
-        style["color"] = ["black" if mean else f"C{k % 10}" for k, mean in enumerate(means)]
-        if len(table):
-            ticks = range(table.shape[1])
-            table.T.plot(ax=ax, xlabel=axis, ylabel="MRE", logy=True, xticks=ticks, **style)
-            ax.grid(alpha=0.3)
-            ax.legend(fontsize=5)
-        ax.set_title(title, fontsize=9)
-    picture.suptitle(text, fontsize=10)
-    save(picture, path)
+    return ["## What is not here", markdown(table.to_frame())]

@@ -6,6 +6,7 @@ search can be continued.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,6 @@ from soup_nlp.bench.study import (
     Cell,
     Item,
     Overrides,
-    failures,
     main_metric,
     markdown,
     measure_cells,
@@ -90,10 +90,7 @@ def parse_space(texts: Sequence[str]) -> Space:
 
 def as_yaml(value: float) -> str:
     """A suggested value as YAML, floats with four digits."""
-    if isinstance(value, int):
-        return str(value)
-    text = f"{value:.4g}"
-    return text if "." in text or "e" in text else f"{text}.0"
+    return json.dumps(value if isinstance(value, int) else float(f"{value:.4g}"))
 
 
 def pair_loss(frame: pd.DataFrame) -> pd.Series:
@@ -166,8 +163,7 @@ def leave_one_family_out(frame: pd.DataFrame) -> pd.DataFrame:
     lines = {}
     for family in sums.columns if len(sums.columns) > 1 else []:
         others = sums.drop(columns=family).sum(axis=1) / sizes.drop(columns=family).sum(axis=1)
-        within = sums[family] / sizes[family]
-        trial = str(others.idxmin())
+        within, trial = sums[family] / sizes[family], str(others.idxmin())
         lines[family] = {"trial": trial, "change": math.expm1(within[trial] - within[DEFAULT])}
     out = pd.DataFrame.from_dict(lines, orient="index", columns=["trial", "change"])
     return out.rename_axis("family left out")
@@ -187,31 +183,28 @@ def search_page(frame: pd.DataFrame, space: Sequence[str], command: str) -> str:
     trials = trials.sort_values("score", kind="stable").rename_axis("trial")
     trials = trials.rename(columns={"mre": "mean MRE"})
     best = str(trials.index[0])
-    lines = ["# Search for defaults", ""]
-    lines += [
+    blocks = [
+        "# Search for defaults",
         f"{len(trials) - 1} trials; the best is {best}: {trials['score'][best]:.3f} against"
         f" {trials['score'][DEFAULT]:.3f} of the default.",
-        "",
         f"{provenance(frame)}.",
-        "",
         f"    {command}",
-        "",
         "Score: mean over pairs of ln(MRE / MRE of a constant depth), MRE under the pair's own"
         f" convention and at least {MIN_MRE:g}; {FAILED_LOSS:.2f} for a pair that fails. Lower is"
         " better; -0.69 is half the error of a constant depth.",
-        "",
+        "## What was varied",
+        "\n".join(f"- `{text}`" for text in space),
+        "## Trials",
+        markdown(trials.head(TOP), ".3f"),
     ]
-    lines += ["## What was varied", "", *(f"- `{text}`" for text in space), ""]
-    lines += ["## Trials", "", *markdown(trials.head(TOP), ".3f"), ""]
     left_out = leave_one_family_out(frame)
     if len(left_out):
-        about = (
+        blocks += [
+            "## One family left out at a time",
             "MRE of the trial that the other families choose against the default. A change of"
             f" defaults must gain together and lose at most {LOSS_ALLOWED:.0%} on any:"
-            f" {'met' if accepted(left_out) else 'not met'}."
-        )
-        lines += ["## One family left out at a time", "", about, ""]
-        lines += [*markdown(left_out, {"change": "+.1%"}), ""]
+            f" {'met' if accepted(left_out) else 'not met'}.",
+            markdown(left_out, {"change": "+.1%"}),
+        ]
     both = frame[frame["variant"].isin([DEFAULT, best])]
-    lines += ["## By pair, MRE", "", *markdown(pivot(both, average=False))]
-    return page_text([*lines, *failures(frame)])
+    return page_text([*blocks, "## By pair, MRE", markdown(pivot(both, average=False))], frame)

@@ -16,14 +16,7 @@ from scipy.stats import linregress
 
 from soup_nlp.bench.processes import machine
 from soup_nlp.bench.reference_solver import levenberg_marquardt
-from soup_nlp.bench.study import (
-    Cell,
-    Item,
-    failures,
-    markdown,
-    page_text,
-    titled,
-)
+from soup_nlp.bench.study import Cell, Item, markdown, page_text, titled
 from soup_nlp.bench.suites import MOTORCYCLE, Options, list_suite
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.evaluate.scoring import score_depths
@@ -255,16 +248,16 @@ def growth(frame: pd.DataFrame) -> pd.DataFrame:
 def speed_page(frame: pd.DataFrame) -> str:
     """The page of all rows."""
     good = with_costs(frame)
-    lines = ["# Speed and growth", "", _conclusion(good), ""]
+    blocks = ["# Speed and growth", _conclusion(good)]
     if len(good):
         runs = good.set_axis(pd.MultiIndex.from_frame(good[list(RUN)].rename(columns=RUN)))
-        lines += titled(runs, COLUMNS)
-        lines += ["", NOTE, "", "## Growth: cost = factor N^p", "", *markdown(growth(good), ".2f")]
+        blocks += [titled(runs, COLUMNS), NOTE]
+        blocks += ["## Growth: cost = factor N^p", markdown(growth(good), ".2f")]
         stages = {f"wall.{phase}": (phase, ".2f") for phase in PHASES}
-        lines += ["", "## Wall seconds by stage", "", *titled(runs, stages)]
+        blocks += ["## Wall seconds by stage", titled(runs, stages)]
     facts = {"date": date.today(), **machine()}.items()
-    lines += ["", "## Machine", "", *(f"- {k}: {v}" for k, v in facts)]
-    return page_text([*lines, *failures(frame)])
+    blocks += ["## Machine", "\n".join(f"- {k}: {v}" for k, v in facts)]
+    return page_text(blocks, frame)
 
 
 def progress_line(row: Row) -> str:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from soup_nlp.bench.processes import alone
 from soup_nlp.config.problem import Problem, make_problem
@@ -26,7 +27,6 @@ from soup_nlp.storage.files import atomic_path
 from soup_nlp.storage.rows import Job, MeasureRows, Row, attempt, measure_all, reason
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -203,17 +203,17 @@ def show(value: Any, form: str = ".4f") -> str:
     return format(value, form) if number else str(value)
 
 
-def markdown(frame: pd.DataFrame, forms: str | Mapping[str, str] = ".4f") -> list[str]:
+def markdown(frame: pd.DataFrame, forms: str | Mapping[str, str] = ".4f") -> str:
     """A frame as a Markdown table, its index first; one format, or one for each column."""
     flat = frame.reset_index()
     form = {c: forms if isinstance(forms, str) else forms.get(c, "") for c in flat.columns}
     columns = [[show(v, form[c]) for v in flat[c].tolist()] for c in flat.columns]
     rule = ["---"] + ["---:"] * (len(columns) - 1)
     lines = [map(str, flat.columns), rule, *zip(*columns, strict=True)]
-    return ["| " + " | ".join(cells) + " |" for cells in lines]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
-def titled(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> list[str]:
+def titled(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> str:
     """Columns of a frame as a Markdown table under other titles: (title, format) by column."""
     shown = frame.reindex(columns=list(columns))
     return markdown(
@@ -229,32 +229,25 @@ def provenance(frame: pd.DataFrame) -> str:
     return f"{where}, {seconds:.0f} CPU seconds in all; code {code}"
 
 
-def failures(frame: pd.DataFrame) -> list[str]:
-    """A section that lists the failed rows; no lines if none failed."""
-    bad = frame[frame["ok"].ne(True)]
-    lines = [f"- {r['key']}: {reason(r)}" for r in bad.to_dict("records")]
-    return ["", "## Failed", "", *lines] if lines else []
+def page_text(blocks: Sequence[str], frame: pd.DataFrame | None = None) -> str:
+    """Text of a page: headings, paragraphs and tables that are not empty, then failed rows."""
+    blocks = [*blocks]
+    failed = [] if frame is None else frame[frame["ok"].ne(True)].to_dict("records")
+    if failed:
+        blocks += ["## Failed", "\n".join(f"- {r['key']}: {reason(r)}" for r in failed)]
+    return "\n\n".join(filter(None, blocks)) + "\n"
 
 
-def page_text(lines: Sequence[str]) -> str:
-    """Text of a page from its lines."""
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def figure(width: float, height: float) -> Figure:
-    """A figure, size in inches, with constrained layout; it needs no display."""
+def panels(
+    rows: int, columns: int, width: float, height: float, **shared: Any
+) -> tuple[Figure, NDArray[Any]]:
+    """A figure and its (rows, columns) panels, each width by height inches; needs no display."""
     # the import takes half a second, which commands without pictures do not need
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), dpi=120, layout="constrained")
-
-
-def panels(count: int, across: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of `count` panels, each width by height inches, at most `across` in a row."""
-    columns = min(across, max(1, count))
-    rows = max(1, -(-count // columns))
-    out = figure(width * columns, height * rows + 0.4)
-    return out, [out.add_subplot(rows, columns, k + 1) for k in range(count)]
+    size = width * columns, height * max(1, rows)
+    out = Figure(figsize=size, dpi=120, layout="constrained")
+    return out, out.subplots(max(1, rows), columns, squeeze=False, **shared)
 
 
 def save(out: Figure, path: Path) -> None:

@@ -12,16 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from soup_nlp.bench.study import (
-    Cell,
-    Item,
-    failures,
-    markdown,
-    page_text,
-    pivot,
-    provenance,
-    titled,
-)
+from soup_nlp.bench.study import Cell, Item, markdown, page_text, pivot, provenance, titled
 from soup_nlp.errors import DataError
 from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import Frames, find_depths, find_images, scene_frames
@@ -97,13 +88,12 @@ def measure_chain(cell: Cell, frames: int = 10) -> Row:
 
 def chain_page(frame: pd.DataFrame) -> str:
     """The page of all rows."""
-    lines = [NOTE, "", f"{provenance(frame)}.", ""]
-    good = frame[frame["ok"].eq(True)]
+    blocks, good = [NOTE, f"{provenance(frame)}."], frame[frame["ok"].eq(True)]
     if len(good):
-        lines += titled(good.set_axis(pd.Index(good["pair"], name="sequence")), COLUMNS)
         mean = good["cost"].astype(float).mean()
-        lines += ["", f"Mean cost of one scale: {mean:+.2%} of the MRE."]
-    return page_text([*lines, *failures(frame)])
+        blocks.append(titled(good.set_axis(pd.Index(good["pair"], name="sequence")), COLUMNS))
+        blocks.append(f"Mean cost of one scale: {mean:+.2%} of the MRE.")
+    return page_text(blocks, frame)
 
 
 # --- bench cost ----------------------------------------------------------------------------------
@@ -131,7 +121,7 @@ def cost_cells() -> list[Cell]:
 
 def cost_page(frame: pd.DataFrame) -> str:
     """Tables with a line for each size and a column for each N; rendering is left out."""
-    lines = ["# Time and memory", "", f"{provenance(frame)}. One process with one thread.", ""]
+    blocks = ["# Time and memory", f"{provenance(frame)}. One process with one thread."]
     good = frame[frame["ok"].eq(True)]
     if len(good):
         left_out = ("stages.nlp_", "stages.load")
@@ -139,5 +129,5 @@ def cost_page(frame: pd.DataFrame) -> str:
         costs = {"seconds": good[stages].sum(axis=1), "GB": good["peak_bytes"] / 2**30}
         good = good.assign(**costs)
         for column, (title, form) in TABLES.items():
-            lines += [f"## {title}", "", *markdown(pivot(good, column, average=False), form), ""]
-    return page_text([*lines, *failures(frame)])
+            blocks += [f"## {title}", markdown(pivot(good, column, average=False), form)]
+    return page_text(blocks, frame)

@@ -22,7 +22,7 @@ from soup_nlp.bench.solvers.page import (
     summary,
 )
 from soup_nlp.bench.solvers.page import page as page_of
-from soup_nlp.bench.study import figure
+from soup_nlp.bench.study import panels
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError
@@ -85,7 +85,7 @@ def test_profiles_by_hand():
 
 
 def test_a_profile_names_the_solvers_that_solve_nothing():
-    axes = figure(4, 3).subplots()
+    axes = panels(1, 1, 4, 3)[1][0, 0]
     _draw_profile(axes, "seconds", 2, profile(cost_table(frame_of_runs(ROWS), "seconds")))
     told = [text.get_text() for text in axes.get_legend().get_texts()]
     assert told == ["one", "two", "none by three"]

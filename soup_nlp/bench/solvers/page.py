@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from soup_nlp.arrays import Float
-from soup_nlp.bench.study import figure, markdown, page_text, save, show, titled
+from soup_nlp.bench.study import markdown, page_text, panels, save, show, titled
 from soup_nlp.family.write import REACHED
 
 Row = Mapping[str, Any]
@@ -39,12 +39,11 @@ LIMITS = (
     " the comparison is of how quickly a solver proves it. The other starts are the problem.",
     "Local solvers end in local minima: an energy says where this start led, not what is best.",
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
-    "Options are those of `soup_nlp/bench/solvers/plugins.py`, the package's own ones being tuned "
-    "on such problems.",
+    "Options are those of `soup_nlp/bench/solvers/plugins.py`, the package's own ones being tuned"
+    " on such problems.",
     "lm, the reference solver on the manifold, claims no optimum; its points are verified alike.",
 )
 COLUMNS = {
-    "problem": ("problem", ""),
     "superpixels": ("N", ""),
     "formulation": ("formulation", ""),
     "solver": ("solver", ""),
@@ -59,7 +58,7 @@ COLUMNS = {
     "MB": ("MB", ".0f"),
     "ended": ("status", ""),
 }
-"""Title and format of every column of the table of runs."""
+"""Title and format of every column of the table of runs, after the problem."""
 FURTHER = ("objective", "peak_bytes", "status", "best_known")
 """Further columns that the page and the records need."""
 
@@ -88,26 +87,20 @@ def page(frame: pd.DataFrame) -> str:
         f" {limits['memory'] / 2**30:g} GiB, and is asked for a dual infeasibility of"
         f" {limits['tol']:g}."
     )
-    note = (
-        "Verified: KKT residuals and exact energy, recomputed from the solver's point, are those of"
-        " an optimum, to one tolerance for all, whether or not it claims one."
-    )
     begun = frame["start"] == CONFIRMATION
     facts = [*sorted(frame["machine"].unique()), ", ".join(sorted(packages)), f"code {code}"]
-    lines = ["# Solvers on the Superpixel Soup NLP", "", *conclusion(frame), ""]
-    lines += ["![performance profiles](profile.png)"]
     sections = {
         "By start and size": _by_start(of_family(frame)),
         "By problem": _by_problem(frame),
-        "By solver": [note, "", *_by_solver(frame)],
+        "By solver": _by_solver(frame),
         "By run": _by_run(frame[~begun]),
         "Confirmation: runs that begin at a solution": _by_run(frame[begun]),
-        "Limits": [f"- {text}" for text in (limit, *LIMITS)],
-        "Machine and versions": [f"- {text}" for text in facts],
+        "Limits": "\n".join(f"- {text}" for text in (limit, *LIMITS)),
+        "Machine and versions": "\n".join(f"- {text}" for text in facts),
     }
-    for title, body in sections.items():
-        lines += ["", f"## {title}", "", *body] if body else []
-    return page_text(lines)
+    head = ["# Solvers on the Superpixel Soup NLP", "\n".join(conclusion(frame))]
+    parts = [part for title, body in sections.items() if body for part in (f"## {title}", body)]
+    return page_text([*head, "![performance profiles](profile.png)", *parts])
 
 
 def of_family(frame: pd.DataFrame) -> pd.DataFrame:
@@ -119,40 +112,44 @@ def conclusion(frame: pd.DataFrame) -> list[str]:
     """Conclusion in two sentences."""
     solved = np.isfinite(cost_table(frame, "seconds")).sum()
     successes = solved[solved > 0].sort_values(ascending=False, kind="stable")
-    problems = frame.groupby(PROBLEM).ngroups
     counts = ", ".join(f"{name} {count}" for name, count in successes.items()) or "none"
-    claims = frame[frame["claimed"]]
-    false = sorted(claims.loc[~claims["verified"], "solver"].unique())
-    exceptions = f"; not always those of {', '.join(false)}" if false else ""
-    true = f"{int(claims['verified'].sum())} of {len(claims)}{exceptions}"
-    return [
-        f"**{problems} problems, {len(solved)} solvers, {len(frame)} runs:"
+    lines = [
+        f"**{frame.groupby(PROBLEM).ngroups} problems, {len(solved)} solvers, {len(frame)} runs:"
         f" {int(frame['verified'].sum())} verified.** Verified problems by solver: {counts}.",
-        *([f"Claims of an optimum that were true: {true}."] if len(claims) else []),
     ]
+    claims = frame[frame["claimed"]]
+    if len(claims):
+        false = sorted(claims.loc[~claims["verified"], "solver"].unique())
+        exceptions = f"; not always those of {', '.join(false)}" if false else ""
+        true = f"{int(claims['verified'].sum())} of {len(claims)}{exceptions}"
+        lines.append(f"Claims of an optimum that were true: {true}.")
+    return lines
 
 
-def _by_problem(frame: pd.DataFrame) -> list[str]:
+def _by_problem(frame: pd.DataFrame) -> str:
     """Exact energy that every solver reached, by problem; brackets where it is not verified."""
     feasible = frame["energy"].where(frame["primal"] <= FEASIBLE).astype(float)
     texts = feasible.map(lambda e: show(e, ".6g"))
     texts = texts.where(frame["verified"] | feasible.isna(), "(" + texts + ")")
-    shown = frame.assign(energy=texts)
     # problems of one name may have different contents
-    keys = [*PROBLEM, "energy_start"]
-    table = shown.pivot_table(
-        index=keys, columns="solver", values="energy", aggfunc="last", fill_value="-", sort=False
+    table = frame.assign(energy=texts).pivot_table(
+        index=[*PROBLEM, "energy_start"],
+        columns="solver",
+        values="energy",
+        aggfunc="last",
+        fill_value="-",
+        sort=False,
     )
     table = table.reset_index("energy_start").droplevel("problem_hash")
     table.index.names = ["problem", "N", "formulation"]
     text = (
         "Exact energy of the point that each solver reached, in brackets where it is feasible (to"
-        f" {FEASIBLE:g}) but not verified."
+        f" {FEASIBLE:g}) but not verified.\n\n"
     )
-    return [text, "", *markdown(table.rename(columns={"energy_start": "start"}), ".6g")]
+    return text + markdown(table.rename(columns={"energy_start": "start"}), ".6g")
 
 
-def _by_solver(frame: pd.DataFrame) -> list[str]:
+def _by_solver(frame: pd.DataFrame) -> str:
     """Table of the numbers of runs, claims and verified claims of each solver."""
     groups = frame.assign(true=frame["claimed"] & frame["verified"]).groupby("solver")
     table = groups.agg(
@@ -162,16 +159,18 @@ def _by_solver(frame: pd.DataFrame) -> list[str]:
     table["claims that were true"] = true.where(table["claimed"] > 0, "-")
     ends = frame[~frame["claimed"]].groupby("solver")["ended"].agg(lambda e: sorted(e.unique()))
     table["ended otherwise"] = ends.str.join("; ").reindex(table.index, fill_value="")
-    return markdown(table, "")
+    text = (
+        "Verified: KKT residuals and exact energy, recomputed from the solver's point, are those of"
+        " an optimum, to one tolerance for all, whether or not it claims one.\n\n"
+    )
+    return text + markdown(table, "")
 
 
-def _by_run(frame: pd.DataFrame) -> list[str]:
+def _by_run(frame: pd.DataFrame) -> str:
     """Table of every run; nothing without runs."""
-    if frame.empty:
-        return []
     ascending = [True] * len(PROBLEM) + [False, True]
     order = frame.sort_values([*PROBLEM, "verified", "seconds"], ascending=ascending)
-    return titled(order.set_index("problem"), {k: v for k, v in COLUMNS.items() if k != "problem"})
+    return titled(order.set_index("problem"), COLUMNS) if len(order) else ""
 
 
 def reached(frame: pd.DataFrame) -> pd.Series:
@@ -189,10 +188,10 @@ def by_start(frame: pd.DataFrame) -> dict[str, pd.DataFrame]:
     }
 
 
-def _by_start(frame: pd.DataFrame) -> list[str]:
+def _by_start(frame: pd.DataFrame) -> str:
     """Table of the verified runs by start and size of the family; nothing without runs."""
     if frame.empty:
-        return []
+        return ""
 
     def cell(runs: pd.DataFrame) -> str:
         good = runs[runs["verified"]]
@@ -201,14 +200,14 @@ def _by_start(frame: pd.DataFrame) -> list[str]:
 
     text = (
         "Verified runs of all, in brackets those at the best known objective (within"
-        f" {REACHED:g}); median CPU seconds of the verified ones."
+        f" {REACHED:g}); median CPU seconds of the verified ones.\n\n"
     )
     cells = {
         title: {solver: cell(runs) for solver, runs in group.groupby("solver")}
         for title, group in by_start(frame).items()
     }
-    table = pd.DataFrame(cells).sort_index().rename_axis("solver")
-    return [text, "", *markdown(table), "", "![profiles by start and size](profiles.png)"]
+    table = markdown(pd.DataFrame(cells).sort_index().rename_axis("solver"))
+    return f"{text}{table}\n\n![profiles by start and size](profiles.png)"
 
 
 # --- performance profiles (Dolan and More, 2002) ------------------------------------------------
@@ -245,8 +244,7 @@ def draw_profiles(
     path: Path, groups: Mapping[str, pd.DataFrame], measures: tuple[str, ...]
 ) -> None:
     """Write a picture of profiles: a row of panels for each group of runs, one for each measure."""
-    picture = figure(4.5 * len(measures), 3.3 * max(1, len(groups)))
-    axes = picture.subplots(max(1, len(groups)), len(measures), squeeze=False)
+    picture, axes = panels(len(groups), len(measures), 4.5, 3.3)
     for (title, frame), line in zip(groups.items(), axes, strict=False):
         for ax, measure in zip(line, measures, strict=True):
             cost = cost_table(frame, measure)
