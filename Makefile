@@ -65,7 +65,8 @@ results: $(VENV)/.optional
 	$(SOUP) bench chain -o results/accuracy $(if $(DATA),--data $(DATA)) --overwrite
 	$(SOUP) bench paper -o results/paper $(if $(DATA),--data $(DATA)) --limit 2 --superpixels 500 \
 		--analysis 250 --overwrite
-	$(SOUP) bench speed -o results/speed --superpixels 500,1000,2000 --neighbours 20 --overwrite
+	$(SOUP) bench speed -o results/speed --scenes street,room,orbit,motorcycle --superpixels 1000,2000 \
+		--neighbours 15 --seeds 0 --overwrite
 	$(SOUP) bench cost -o results/speed --overwrite
 	$(SOUP) family out/tangent --sizes 100,250 --starts hard --coordinates tangent --overwrite
 	$(SOUP) family out/matrix --sizes 100 --starts hard --overwrite

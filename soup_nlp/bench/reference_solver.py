@@ -52,8 +52,16 @@ class ReferenceSolve:
     status: str
 
 
-class Tangent:
-    """Smoothed energy f of the presolve, its gradient and normal matrix, and the feasible set."""
+class Descent:
+    """A feasible iterate of the smoothed energy f; a step lowers f or raises the damping.
+
+    Attributes:
+        nlp, layout: The tangent program; its Hessian is the normal matrix.
+        simplex: (nx,) gradient of the simplex.
+        rows, lower: Visibility as `rows @ x >= lower`.
+        x: (nx,) iterate, at first the start.
+        path: All accepted iterates.
+    """
 
     def __init__(
         self, start: Soup, data: EnergyData, weights: Weights, form: Formulation | None
@@ -74,14 +82,9 @@ class Tangent:
         self.rows, self.lower = A[rows], nlp.lbg[rows] - constant[rows]
         # a visibility row depends on the slopes of one superpixel only
         self.owner = self.rows.indices[self.rows.indptr[:-1]] // 9
-
-    def smoothing(self, eps: float) -> None:
-        """Set both smoothing widths."""
-        self.theta = self.nlp.thetas(eps=eps, eps_pixel=eps, theta=0.0, ridge=0.0)
-
-    def value(self, x: Float) -> float:
-        """Smoothed energy."""
-        return self.nlp.value(x, self.theta)
+        self.x = self.project(nlp.x0)
+        self.path = [self.x]
+        self.damping, self.growth = FIRST_DAMPING, 2.0
 
     def project(self, x: Float) -> Float:
         """The point clipped to the bounds, its slopes shrunk until every rim pixel is visible."""
@@ -95,33 +98,31 @@ class Tangent:
         x.reshape(-1, 9)[:, 1:3] *= worst[:, None]
         return x
 
-
-class _Descent:
-    """An iterate with its damping; every step either lowers f or raises the damping."""
-
-    def __init__(self, problem: Tangent) -> None:
-        """An iterate at the start; `path` has all accepted iterates."""
-        self.problem = problem
-        self.x = problem.project(problem.nlp.x0)
-        self.path = [self.x]
-        self.damping, self.growth = FIRST_DAMPING, 2.0
+    def value(self, x: Float) -> float:
+        """Smoothed energy."""
+        return self.nlp.value(x, self.theta)
 
     def smoothing(self, eps: float) -> None:
-        """Set the smoothing widths for the next steps, and lower a damping that steps raised."""
-        self.problem.smoothing(eps)
+        """Set both smoothing widths, and lower a damping that steps raised."""
+        self.theta = self.nlp.thetas(eps=eps, eps_pixel=eps, theta=0.0, ridge=0.0)
         self.damping, self.growth = min(self.damping, FIRST_DAMPING), 2.0
         self._move(self.x)
 
+    def _move(self, x: Float) -> None:
+        nlp, theta = self.nlp, self.theta
+        self.x, self.f, self.gradient = x, self.value(x), nlp.gradient(x, theta)
+        self.H = nlp.hessian(x, np.zeros(nlp.ng), theta=theta)
+
     def step(self) -> float | None:
         """Try a step; returns the relative decrease of f, or None if the step is rejected."""
-        a, gradient = self.problem.simplex, self.gradient
+        a, gradient = self.simplex, self.gradient
         damped = self.H + self.damping * sparse.eye(len(gradient), format="csc")
         options = {"SymmetricMode": True}
         factor = splu(damped, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
         u, v = factor.solve(gradient), factor.solve(a)
-        trial = self.problem.project(self.x - u + v * (a @ u) / (a @ v))
+        trial = self.project(self.x - u + v * (a @ u) / (a @ v))
         h = trial - self.x
-        fresh = self.problem.value(trial)
+        fresh = self.value(trial)
         promised = -(gradient @ h + 0.5 * h @ (self.H @ h))
         gain = (self.f - fresh) / promised if promised > 0 else -1.0
         if not (np.isfinite(fresh) and fresh < self.f and gain > 0):
@@ -134,11 +135,6 @@ class _Descent:
         self.damping = max(LEAST_DAMPING, self.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3))
         self.growth = 2.0
         return float(fall)
-
-    def _move(self, x: Float) -> None:
-        nlp, theta = self.problem.nlp, self.problem.theta
-        self.x, self.f, self.gradient = x, nlp.value(x, theta), nlp.gradient(x, theta)
-        self.H = nlp.hessian(x, np.zeros(nlp.ng), theta=theta)
 
     def run(self, eps: Sequence[float], iterations: int, end: float) -> tuple[int, str]:
         """Descend with every smoothing width in turn until the time `end`; steps and status."""
@@ -189,11 +185,11 @@ def levenberg_marquardt(
         seconds: Limit of the wall time.
     """
     end, cpu = time.perf_counter() + seconds, time.process_time()
-    descent = _Descent(Tangent(start, data, weights, form))
+    descent = Descent(start, data, weights, form)
     count, status = descent.run(eps, iterations, end)
     spent = time.process_time() - cpu
     # computed here, so that the time excludes the exact energies
-    soups = [descent.problem.layout.unpack(x) for x in descent.path]
+    soups = [descent.layout.unpack(x) for x in descent.path]
     energies = [oracle.energy(soup, data, weights) for soup in soups]
     best = int(np.argmin([energy["total"] for energy in energies]))
     return ReferenceSolve(soups[best], energies[best], count, spent, status)

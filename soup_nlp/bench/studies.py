@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import attrgetter
 from types import MappingProxyType
 from typing import Any
 
 from soup_nlp.bench.study import Overrides
-from soup_nlp.config.presets import PRESETS, leaves
+from soup_nlp.config.presets import overrides_of
 from soup_nlp.config.problem import make_problem
 
 SOURCE = "Superpixel Soup (Kumar, Dai, Li, TPAMI), table of the performance comparison"
@@ -105,25 +105,25 @@ class Departure:
     Attributes:
         name: Title of its row.
         keys: Dotted names of the options.
-        with_off: Further options that "off alone" needs.
-        with_on: Further options that "on alone" needs.
-        needs: Explanation of the further options, for the table.
+        with_off: Further overrides that "off alone" needs.
+        with_on: Further overrides that "on alone" needs.
+        needs: Explanation of the further overrides, for the table.
     """
 
     name: str
     keys: tuple[str, ...] = ()
-    with_off: Mapping[str, Any] = field(default_factory=dict)
-    with_on: Mapping[str, Any] = field(default_factory=dict)
+    with_off: Overrides = ()
+    with_on: Overrides = ()
     needs: str = ""
 
     def off_alone(self) -> Overrides:
         """Overrides of the defaults for "off alone"."""
-        printed = dict(leaves(PRESETS["paper"]))
-        return _overrides({**{k: printed[k] for k in self.keys}, **self.with_off})
+        printed = {o.partition("=")[0]: o for o in overrides_of("paper")}
+        return (*(printed[key] for key in self.keys), *self.with_off)
 
     def on_alone(self) -> Overrides:
         """Overrides of the preset for "on alone"."""
-        return _overrides({**{k: default(k) for k in self.keys}, **self.with_on})
+        return (*_defaults(*self.keys), *self.with_on)
 
 
 def default(key: str) -> Any:
@@ -131,20 +131,21 @@ def default(key: str) -> Any:
     return attrgetter(key)(make_problem({"input": {"kind": "motorcycle"}}))
 
 
-def _overrides(values: Mapping[str, Any]) -> Overrides:
-    return tuple(
-        f"{key}={'.inf' if value == float('inf') else json.dumps(value)}"
-        for key, value in values.items()
-    )
+def _defaults(*keys: str) -> Overrides:
+    values = {key: default(key) for key in keys}
+    texts = {k: ".inf" if v == float("inf") else json.dumps(v) for k, v in values.items()}
+    return tuple(f"{key}={text}" for key, text in texts.items())
 
 
-_WEIGHTS = tuple(f"energy.weights.{w}" for w in ("arap", "proj", "cont", "orient", "sigma_cont"))
-_ADDED = ("prior", "sigma_arap", "leak_arap")
-_PIXELS = {key: default(key) for key in ("energy.units", *_WEIGHTS)}
-_ADDED_WEIGHTS = {f"energy.weights.{w}": default(f"energy.weights.{w}") for w in _ADDED}
-_DENSE_SAMPLES = {"energy.pixel_samples": 64, "segmentation.boundary_samples": 12}
-_SMALL = {"max_size": 0.05}
-_SHARED = {"start.method": "shared"}
+_IN_PIXELS = (
+    "energy.units",
+    *(f"energy.weights.{w}" for w in ("arap", "proj", "cont", "orient", "sigma_cont")),
+)
+_ADDED = tuple(f"energy.weights.{w}" for w in ("prior", "sigma_arap", "leak_arap"))
+_DENSE = ("energy.pixel_samples=64", "segmentation.boundary_samples=12")
+_SMALL = ("max_size=0.05",)
+_SHARED = ("start.method=shared",)
+_FINDS = "on: with the start that finds components"
 
 DEPARTURES = (
     Departure(
@@ -153,45 +154,32 @@ DEPARTURES = (
     ),
     Departure(
         "pixel units and their weights",
-        ("energy.units", "energy.length", *_WEIGHTS),
+        (*_IN_PIXELS, "energy.length"),
         # a truncation given in pixels has no meaning in the paper's units
-        with_off={"energy.weights.sigma_arap": float("inf")},
+        with_off=("energy.weights.sigma_arap=.inf",),
         needs="off: E_arap not truncated, since its truncation is in pixels",
     ),
     Departure(
         "E_arap truncated with a leak",
         ("energy.weights.sigma_arap", "energy.weights.leak_arap"),
-        with_on={"energy.weights.sigma_arap": 1e-3},
+        with_on=("energy.weights.sigma_arap=1e-3",),
         needs="on: at 0.001 in the paper's units",
     ),
     Departure(
-        "E_arap and E_prior weak across components",
-        ("energy.arap_across",),
-        with_on=_SHARED,
-        needs="on: with the start that finds components",
+        "E_arap and E_prior weak across components", ("energy.arap_across",), (), _SHARED, _FINDS
     ),
-    Departure(
-        "E_cont weak at occlusions",
-        ("energy.cont_occluded",),
-        with_on=_SHARED,
-        needs="on: with the start that finds components",
-    ),
+    Departure("E_cont weak at occlusions", ("energy.cont_occluded",), (), _SHARED, _FINDS),
     Departure(
         "another energy where surfaces bend",
         ("start.bending",),
-        with_on={**_SHARED, **_PIXELS, **_ADDED_WEIGHTS},
+        with_on=(*_SHARED, *_defaults(*_IN_PIXELS, *_ADDED)),
         needs="on: with the start that finds them, pixel units and all weights",
     ),
     Departure("prior on relief", ("energy.weights.prior",)),
     Departure(
         "depth prior", ("energy.weights.depth",), needs="a file: without one it has no elements"
     ),
-    Departure(
-        "order by occlusion",
-        ("energy.weights.order",),
-        with_on=_SHARED,
-        needs="on: with the start that finds components",
-    ),
+    Departure("order by occlusion", ("energy.weights.order",), (), _SHARED, _FINDS),
     Departure("borders that follow the flow", ("segmentation.follow_flow_px",)),
     Departure("confidence of the flow", ("flow.consistency",)),
     Departure("flow seen through reflections", ("flow.see_through",)),
@@ -204,22 +192,19 @@ DEPARTURES = (
     ),
     Departure(
         "samples of pixels and boundaries",
-        with_off=_DENSE_SAMPLES,
-        with_on=_DENSE_SAMPLES,
+        with_off=_DENSE,
+        with_on=_DENSE,
         needs="off in both: 64 pixels a superpixel, 12 points a boundary (default 16 and 3)",
     ),
     Departure("gauge: d constant", ("formulation.gauge",)),
     Departure("visibility", ("formulation.min_facing", "formulation.depth_ratio")),
     Departure(
         "stages before the constrained NLP",
-        with_off={"solver.presolve": False},
-        with_on={"solver.presolve": False},
+        with_off=("solver.presolve=false",),
+        with_on=("solver.presolve=false",),
         needs="off in both; the preset has it, since it is a way to the minimum of the same energy",
     ),
-    Departure(
-        "proposals beyond walks, depths within reach",
-        ("refine.proposals",),
-    ),
+    Departure("proposals beyond walks, depths within reach", ("refine.proposals",)),
     Departure("rounds end early", ("refine.rounds", "refine.stagnation")),
     Departure("images in the refinement", ("refine.photo",)),
 )
@@ -228,18 +213,19 @@ DEPARTURES = (
 
 # --- mean relative errors printed in the paper, copied: none is measured --------------------------
 
-_COLUMNS = ("DT", "GLRT", "BMM", "PTA", "DMDE", "Superpixel Soup")
-_TABLE: dict[str, tuple[float | None, ...]] = {
-    "sintel": (0.4833, 0.4101, 0.3121, 0.3177, 0.297, 0.1643),
-    "vkitti": (0.2630, 0.3237, 0.2894, 0.2742, None, 0.0925),
-    "kitti": (0.2703, 0.4112, 0.3903, 0.4090, 0.148, 0.1254),
-    "kinect_paper": (0.2040, 0.0920, 0.0322, 0.0520, None, 0.0472),
-    "kinect_tshirt": (0.2170, 0.1030, 0.0443, 0.0420, None, 0.0480),
+_PUBLISHED: Mapping[str, tuple[float | None, ...]] = {
+    "DT": (0.4833, 0.2630, 0.2703, 0.2040, 0.2170),
+    "GLRT": (0.4101, 0.3237, 0.4112, 0.0920, 0.1030),
+    "BMM": (0.3121, 0.2894, 0.3903, 0.0322, 0.0443),
+    "PTA": (0.3177, 0.2742, 0.4090, 0.0520, 0.0420),
+    "DMDE": (0.297, None, 0.148, None, None),
+    "Superpixel Soup": (0.1643, 0.0925, 0.1254, 0.0472, 0.0480),
+    # compared in a figure, without printed numbers
+    "ULDEMV": (None, None, None, None, None),
 }
 COMPARISON: Mapping[str, Mapping[str, float | None]] = {
-    # ULDEMV is compared in a figure of the paper, without printed numbers
-    dataset: {**dict(zip(_COLUMNS, row, strict=True)), "ULDEMV": None}
-    for dataset, row in _TABLE.items()
+    dataset: {method: errors[k] for method, errors in _PUBLISHED.items()}
+    for k, dataset in enumerate(("sintel", "vkitti", "kitti", "kinect_paper", "kinect_tshirt"))
 }
 """MRE by dataset and method; None where the paper prints none. KITTI is the odometry set 00-09
 with LiDAR truth, not the stereo and flow sets of the suites."""
@@ -254,14 +240,13 @@ ABLATION: Mapping[str, tuple[float, float, float, float]] = MappingProxyType(
 )
 """MRE with E_arap, + E_proj, + E_cont, + E_orient (the paper's ablation table)."""
 
-DATA: Mapping[str, str] = MappingProxyType(
-    {
-        "sintel": "The paper names the five sequences and 120 pairs, not which pairs",
-        "vkitti": "The paper names the four worlds and 120 pairs, not which pairs",
-        "kitti": "Published rows are of the odometry set 00-09 with LiDAR truth, measured ones of"
-        " the stereo and flow training set with its own truth",
-        "kinect_paper": "Measured rows are of the pairs in the folder, whichever those are",
-        "kinect_tshirt": "Measured rows are of the pairs in the folder, whichever those are",
-    }
-)
+_KINECT = "Measured rows are of the pairs in the folder, whichever those are"
+DATA: Mapping[str, str] = {
+    "sintel": "The paper names the five sequences and 120 pairs, not which pairs",
+    "vkitti": "The paper names the four worlds and 120 pairs, not which pairs",
+    "kitti": "Published rows are of the odometry set 00-09 with LiDAR truth, measured ones of the"
+    " stereo and flow training set with its own truth",
+    "kinect_paper": _KINECT,
+    "kinect_tshirt": _KINECT,
+}
 """Pairs that the published and the measured numbers of a dataset are of, as far as known."""

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares, linear_sum_assignment
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError, expect
 from soup_nlp.evaluate.metrics import overlap_shares
+from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction
@@ -51,6 +52,17 @@ class SolvedPair:
     def still(self) -> bool:
         """Whether most of the background has no parallax, so that its depth is a guess."""
         return self.result.components.background.borrowed > MAX_GUESSED
+
+    @property
+    def static(self) -> Mask:
+        """(H, W) confident pixels of the static scene in the reference frame."""
+        return np.asarray(self.result.sure & (self.result.components.of_pixel == 0))
+
+    def view(self, frame: int) -> tuple[Float, Mask]:
+        """(H, W) z of one of the two frames, and its confident pixels of the static scene."""
+        if frame == self.first:
+            return self.result.depths[0], self.static
+        return self.result.depths[1], carried(self.static, self.result.reconstruction) > 0
 
 
 def read_pair(first: int, second: int, place: Path) -> SolvedPair:
@@ -128,31 +140,21 @@ def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
     for b, second in enumerate(pairs):
         for a, first in enumerate(pairs[:b]):
             for frame in {first.first, first.second} & {second.first, second.second}:
-                z1, keep1 = _view(first, frame)
-                z2, keep2 = _view(second, frame)
+                (z1, keep1), (z2, keep2) = first.view(frame), second.view(frame)
                 guess = first.still or second.still
                 shared = link(a, b, z1, z2, keep1 & keep2, flagged=guess)
                 out.append(shared or link(a, b, z1, z2, np.ones_like(keep1), flagged=True))
     # consecutive pairs are the first of those that start at a frame
     at = {pair.first: b for b, pair in reversed([*enumerate(pairs)])}
     for a, pair in enumerate(pairs):
-        frame, (z, keep) = pair.second, _view(pair, pair.second)
+        frame, (z, keep) = pair.second, pair.view(pair.second)
         while not pair.still and frame in at and pairs[at[frame]].still:
             z, keep = _carry(z, keep, pairs[at[frame]])
             frame = pairs[at[frame]].second
         if frame > pair.second and frame in at:
-            other, sure = _view(pairs[at[frame]], frame)
+            other, sure = pairs[at[frame]].view(frame)
             out.append(link(a, at[frame], z, other, keep & sure, bridge=True))
     return [shared for shared in out if shared]
-
-
-def _view(pair: SolvedPair, frame: int) -> tuple[Float, Mask]:
-    """(H, W) z of a frame of a pair, and the mask of confident pixels of the static scene."""
-    result = pair.result
-    keep = result.sure & (result.components.of_pixel == 0)
-    if frame == pair.first:
-        return result.depths[0], keep
-    return result.depths[1], carried(keep, result.reconstruction) > 0
 
 
 def _carry(z: Float, keep: Mask, still: SolvedPair) -> tuple[Float, Mask]:
@@ -265,11 +267,9 @@ class Chain:
     def path(self, track: int) -> dict[int, Float]:
         """Centre (3,) of a track in the world, by frame."""
         out: dict[int, Float] = {}
-        for k, pair in enumerate(self.pairs):
-            if (label := self.label(k, track)) is not None:
-                centre = pair.result.components[label].centre
-                out[k] = self.world_from_camera[k](self.scales[k] * centre)
-                out[k + 1] = self.motion(k, label)(out[k])
+        for k, part in self.members(track).items():
+            out[k] = self.world_from_camera[k](self.scales[k] * part.centre)
+            out[k + 1] = self.motion(k, part.label)(out[k])
         return out
 
     @property
@@ -277,9 +277,15 @@ class Chain:
         """Numbers of the tracks; the background, 0, is none."""
         return sorted({track for numbers in self.tracks for track in numbers.values()} - {0})
 
-    def label(self, pair: int, track: int) -> int | None:
-        """Label of a track's component in a pair; None where the pair does not show the track."""
-        return next((label for label, t in self.tracks[pair].items() if t == track), None)
+    def members(self, track: int) -> dict[int, Component]:
+        """Components of a track, by number of the pair; a pair need not show the track."""
+        numbered = enumerate(zip(self.pairs, self.tracks, strict=True))
+        return {
+            k: pair.result.components[label]
+            for k, (pair, numbers) in numbered
+            for label, number in numbers.items()
+            if number == track
+        }
 
 
 def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> Chain:

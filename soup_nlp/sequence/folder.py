@@ -84,19 +84,16 @@ def _same(stored: Float, recomputed: Float) -> bool:
 def write_fused(path: Path, chain: Chain, contents: Mapping[str, Any]) -> None:
     """The static scene of all frames as one cloud."""
     cloud = fuse(chain)
-    comments = [
-        f"{contents['name']}: static scene of {len(chain)} frames, one point per voxel",
-        f"frame: the first frame's camera, {AXES}",
-        f"unit: {contents['unit']}",
-        "sigma_log_depth: of the frame that the point is from; guesses are left out",
-    ]
+    title = f"{contents['name']}: static scene of {len(chain)} frames, one point per voxel"
+    note = "sigma_log_depth: of the frame that the point is from; guesses are left out"
+    comments = [title, f"frame: {WORLD}", f"unit: {contents['unit']}", note]
     scalars = {"sigma_log_depth": cloud.sigma, "frame": cloud.label}
     write_ply(path, cloud.points, cloud.colours, None, scalars, comments)
 
 
 def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> None:
     """COLMAP's model of the sequence: all frames and the fused cloud."""
-    cloud = fuse(chain).thinned(COLMAP_POINTS)
+    cloud = fuse(chain, COLMAP_POINTS)
     frames, seen = range(len(chain)), []
     for k in frames:
         inside, v, u, z = projected(chain, cloud.points, k)
@@ -154,6 +151,7 @@ SINGLE = "chain.json", "trajectory.tum", "depth.mp4", CHAIN_PAGE, "scene.ply"
 """Files of a chain that are not made for each frame."""
 POINTS = 100_000
 """Largest number of points in the cloud of a frame."""
+WORLD = f"the first frame's camera, {AXES}"
 UNIT = "the first pair's soup unit (free scale: its planes are at mean distance 1)"
 
 
@@ -211,15 +209,7 @@ def renew_chain_page(folder: Path) -> Path:
 
 def summary(chain: Chain) -> dict[str, Any]:
     """Scales, links, poses and tracks as plain values."""
-
-    def pixels(track: int) -> dict[int, int]:
-        """Pixels of a track by frame."""
-        return {
-            k: pair.result.components[label].pixels
-            for k, pair in enumerate(chain.pairs)
-            if (label := chain.label(k, track)) is not None
-        }
-
+    parts = {track: chain.members(track) for track in chain.track_numbers}
     return {
         "frames": len(chain),
         "unit": UNIT,
@@ -241,7 +231,8 @@ def summary(chain: Chain) -> dict[str, Any]:
         ],
         "world_from_camera": [m.matrix for m in chain.world_from_camera],
         "tracks": [
-            {"track": t, "path": chain.path(t), "pixels": pixels(t)} for t in chain.track_numbers
+            {"track": t, "path": chain.path(t), "pixels": {k: c.pixels for k, c in of_t.items()}}
+            for t, of_t in parts.items()
         ],
     }
 
@@ -271,11 +262,7 @@ def _cloud(path: Path, chain: Chain, frame: int, name: str) -> None:
     keep = thinned(result.sure, POINTS)
     tracks = np.array([chain.tracks[frame][k] for k in range(len(result.components))])
     normals = result.normals[0][keep] @ chain.world_from_camera[frame].R.T
-    comments = [
-        f"{name}: frame {frame}",
-        f"frame: the first frame's camera, {AXES}",
-        f"unit: {UNIT}",
-        "track: what moves by itself, 0 is the static scene",
-    ]
+    note = "track: what moves by itself, 0 is the static scene"
+    comments = [f"{name}: frame {frame}", f"frame: {WORLD}", f"unit: {UNIT}", note]
     scalars = {"track": tracks[result.components.of_pixel[keep]]}
     write_ply(path, chain.points(frame)[keep], result.images[0][keep], normals, scalars, comments)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.report.models import thinned
@@ -22,43 +22,21 @@ IN_FRONT = 0.8
 SHOWN = 3
 """Least number of frames of a track that is shown; shorter ones are mostly no real bodies."""
 
-
-@dataclass(frozen=True)
-class Cloud:
-    """Points in world coordinates.
-
-    Attributes:
-        points: (M, 3) positions in the unit of the chain.
-        colours: (M, 3) uint8 RGB.
-        sigma: (M,) standard deviation of log depth.
-        label: (M,) frame of the static scene's points, track of moving points.
-    """
-
-    points: Float
-    colours: NDArray[np.uint8]
-    sigma: Float
-    label: Int
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def kept(self, keep: NDArray[np.generic]) -> Cloud:
-        """The points of a mask or of indices."""
-        parts = (self.points, self.colours, self.sigma, self.label)
-        return Cloud(*(part[keep] for part in parts))
-
-    def thinned(self, most: int) -> Cloud:
-        """At most so many points: each k-th one."""
-        return self.kept(np.arange(0, len(self), max(1, -(-len(self) // most))))
+Cloud: TypeAlias = "np.recarray[Any, Any]"
+"""(M,) points with the fields of POINT."""
+POINT = np.dtype([("points", float, 3), ("colours", "u1", 3), ("sigma", float), ("label", int)])
+"""Position in world coordinates in the unit of the chain, RGB, standard deviation of log depth, and
+the frame of a point of the static scene or the track of a moving one."""
 
 
-def fuse(chain: Chain) -> Cloud:
+def fuse(chain: Chain, most: int = MOST) -> Cloud:
     """The static scene of all frames: guesses left out, conflicts resolved, one point per voxel.
 
     A point that stands before the static surface which a neighbouring frame sees gives way where
-    that frame is surer. In a voxel the surest point is kept.
+    that frame is surer. In a voxel the surest point is kept. Of more than `most` points each k-th
+    one is returned.
     """
-    masks = [_static(chain, k) for k in range(len(chain.pairs))]
+    masks = [pair.static for pair in chain.pairs]
     share = MOST / max(sum(int(mask.sum()) for mask in masks), 1)
     clouds = []
     for k, mask in enumerate(masks):
@@ -67,7 +45,7 @@ def fuse(chain: Chain) -> Cloud:
         for other in (k - 2, k - 1, k + 1, k + 2):
             if 0 <= other < len(chain.pairs):
                 fits &= ~_contradicts(chain, cloud, other)
-        clouds.append(cloud.kept(fits))
+        clouds.append(kept(cloud, fits))
     cloud = _joined(clouds)
     if not len(cloud):
         return cloud
@@ -76,7 +54,17 @@ def fuse(chain: Chain) -> Cloud:
     order = np.lexsort((cloud.sigma, *voxel.T))
     first = np.ones(len(order), bool)
     first[1:] = (np.diff(voxel[order], axis=0) != 0).any(axis=1)
-    return cloud.kept(order[first])
+    return every_kth(kept(cloud, order[first]), most)
+
+
+def every_kth(cloud: Cloud, most: int) -> Cloud:
+    """At most so many points of a cloud: each k-th one."""
+    return kept(cloud, slice(None, None, max(1, -(-len(cloud) // most))))
+
+
+def kept(cloud: Cloud, keep: Mask | Int | slice) -> Cloud:
+    """The points of a mask, of indices or of a slice."""
+    return cloud[keep].view(np.recarray)
 
 
 def shown_tracks(chain: Chain) -> list[int]:
@@ -93,29 +81,28 @@ def movers(chain: Chain, frame: int) -> Cloud:
         mask = result.sure & (result.components.of_pixel == label)
         if track in shown and mask.any():
             cloud = _cloud(chain, pair, thinned(mask, OF_MOVER), track)
-            points = cloud.points if pair == frame else chain.motion(pair, label)(cloud.points)
-            clouds.append(replace(cloud, points=points))
+            if pair != frame:
+                cloud.points = chain.motion(pair, label)(cloud.points)
+            clouds.append(cloud)
     return _joined(clouds)
 
 
-def _static(chain: Chain, frame: int) -> Mask:
-    """(H, W) pixels of the static scene that are sure."""
+def _sigma(chain: Chain, frame: int) -> Float:
+    """(H, W) standard deviation of the log depth of a frame; 0 if it is unknown."""
     result = chain.pairs[frame].result
-    return np.asarray(result.sure & (result.components.of_pixel == 0))
+    return np.zeros(result.sure.shape) if result.sigma is None else result.sigma
 
 
 def _cloud(chain: Chain, frame: int, mask: Mask, label: int) -> Cloud:
     """The points of a mask."""
-    result = chain.pairs[frame].result
-    sigma = np.zeros(mask.shape) if result.sigma is None else result.sigma
-    points = chain.points(frame)[mask]
-    return Cloud(points, result.images[0][mask], sigma[mask], np.full(len(points), label))
+    out = np.recarray(int(mask.sum()), POINT)
+    out.points, out.colours = chain.points(frame)[mask], chain.image(frame)[mask]
+    out.sigma, out.label = _sigma(chain, frame)[mask], label
+    return out
 
 
-def _joined(clouds: list[Cloud]) -> Cloud:
-    nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0), np.zeros(0, int))
-    parts = [(c.points, c.colours, c.sigma, c.label) for c in (nothing, *clouds)]
-    return Cloud(*(np.concatenate(part) for part in zip(*parts)))
+def _joined(clouds: Sequence[Cloud]) -> Cloud:
+    return np.concatenate([np.empty(0, POINT), *clouds]).view(np.recarray)
 
 
 def projected(chain: Chain, points: Float, frame: int) -> tuple[Mask, Int, Int, Float]:
@@ -137,9 +124,7 @@ def projected(chain: Chain, points: Float, frame: int) -> tuple[Mask, Int, Int, 
 def _contradicts(chain: Chain, cloud: Cloud, frame: int) -> Mask:
     """(M,) points before the static surface that a frame sees and is surer of."""
     inside, v, u, z = projected(chain, cloud.points, frame)
-    result = chain.pairs[frame].result
-    sigma = np.zeros(result.images[0].shape[:2]) if result.sigma is None else result.sigma
-    seen = _static(chain, frame)[v, u] & inside
     with np.errstate(invalid="ignore"):
         before = z < IN_FRONT * chain.depth(frame)[v, u]
-    return np.asarray(seen & before & (sigma[v, u] <= cloud.sigma))
+    surer = _sigma(chain, frame)[v, u] <= cloud.sigma
+    return np.asarray(chain.pairs[frame].static[v, u] & inside & before & surer)

@@ -25,7 +25,7 @@ from soup_nlp.report.models import GLTF
 from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
 from soup_nlp.report.pictures import Bar
 from soup_nlp.sequence.chain import Chain
-from soup_nlp.sequence.fused import Cloud, fuse, movers, shown_tracks
+from soup_nlp.sequence.fused import Cloud, every_kth, fuse, kept, movers, shown_tracks
 from soup_nlp.sequence.score import LINK_HEADS, link_rows, score_text
 from soup_nlp.storage.files import PathLike, write_bytes
 from soup_nlp.storage.store import plain
@@ -84,14 +84,15 @@ def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
 
 def _scene(chain: Chain) -> dict[str, Any]:
     """The 3D view: clouds, paths and cameras as numbers and packed arrays."""
-    still = fuse(chain).thinned(STILL)
+    still = fuse(chain, STILL)
     K, (height, width) = chain.camera(0), chain.image(0).shape[:2]
 
     def points(cloud: Cloud) -> dict[str, str]:
         numbers = packed(cloud.points.astype(np.float32))
         return {"points": numbers, "colours": packed(cloud.colours)}
 
-    moving = [movers(chain, k).thinned(MOVING // len(chain)) for k in range(len(chain))]
+    most = MOVING // len(chain)
+    moving = [every_kth(movers(chain, k), most) for k in range(len(chain))]
     return {
         "still": points(still),
         "moving": [*map(points, moving)],
@@ -125,37 +126,9 @@ def _tracks(chain: Chain, tracks: Sequence[Mapping[str, Any]]) -> str:
 
 RATE = 5.0
 """Frames a second, of the video too."""
-FLOAT, UBYTE = 5126, 5121
-"""glTF's numbers of the types."""
-
-
-class _Buffer:
-    """Binary part of a GLB with its views and accessors."""
-
-    def __init__(self) -> None:
-        self.data = b""
-        self.views: list[dict[str, Any]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def add(self, array: NDArray[Any]) -> int:
-        """Number of the accessor of an array (M, ...) of float32, with its limits, or uint8."""
-        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[1 if array.ndim == 1 else array.shape[1]]
-        raw = np.ascontiguousarray(array).tobytes()
-        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(raw)})
-        self.data += raw + b"\0" * (-len(raw) % 4)
-        accessor: dict[str, Any] = {
-            "bufferView": len(self.views) - 1,
-            "componentType": UBYTE if array.dtype == np.uint8 else FLOAT,
-            "count": len(array),
-            "type": kind,
-        }
-        if array.dtype == np.uint8:
-            accessor["normalized"] = True
-        else:
-            low, high = np.atleast_1d(array.min(axis=0)), np.atleast_1d(array.max(axis=0))
-            accessor |= {"min": low.tolist(), "max": high.tolist()}
-        self.accessors.append(accessor)
-        return len(self.accessors) - 1
+KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+NUMBERS = {np.dtype(np.float32): 5126, np.dtype(np.uint8): 5121}
+"""glTF's names of the shapes and numbers of the types of an array."""
 
 
 def write_animation(path: PathLike, chain: Chain, contents: Mapping[str, Any]) -> None:
@@ -164,82 +137,99 @@ def write_animation(path: PathLike, chain: Chain, contents: Mapping[str, Any]) -
     Nodes are "static scene", "track N" for what moves, and "camera". A track has the points of its
     first frame, which move rigidly from frame to frame as its component does.
     """
-    buffer, meshes, nodes, channels, samplers = _Buffer(), [], [], [], []
-    times = buffer.add(np.arange(len(chain), dtype=np.float32) / np.float32(RATE))
+    arrays: list[NDArray[Any]] = []
+    meshes, nodes, channels, samplers = [], [], [], []
 
-    def animate(node: int, poses: list[RigidMotion]) -> None:
-        for what, values in (
-            ("translation", np.array([GLTF @ p.t for p in poses])),
-            ("rotation", _quaternions(poses)),
-        ):
-            output = buffer.add(values.astype(np.float32))
-            samplers.append({"input": times, "output": output, "interpolation": "LINEAR"})
+    def add(array: NDArray[Any]) -> int:
+        """The number of the accessor of an array; real numbers become float32."""
+        arrays.append(array if array.dtype == np.uint8 else array.astype(np.float32))
+        return len(arrays) - 1
+
+    times = add(np.arange(len(chain)) / RATE)
+
+    def animate(node: int, poses: Sequence[RigidMotion]) -> None:
+        shifts = np.array([GLTF @ p.t for p in poses])
+        for what, values in (("translation", shifts), ("rotation", _quaternions(poses))):
+            samplers.append({"input": times, "output": add(values), "interpolation": "LINEAR"})
             target = {"node": node, "path": what}
             channels.append({"sampler": len(samplers) - 1, "target": target})
 
-    def mesh(cloud: Cloud, name: str) -> int:
-        white = np.full((len(cloud), 1), 255, np.uint8)
-        places = {
-            "POSITION": buffer.add((cloud.points @ GLTF).astype(np.float32)),
-            "COLOR_0": buffer.add(np.hstack([cloud.colours, white])),
-        }
-        meshes.append({"name": name, "primitives": [{"attributes": places, "mode": 0}]})
-        return len(meshes) - 1
+    def show(cloud: Cloud, name: str) -> None:
+        colours = np.hstack([cloud.colours, np.full((len(cloud), 1), 255, np.uint8)])
+        attributes = {"POSITION": add(cloud.points @ GLTF), "COLOR_0": add(colours)}
+        meshes.append({"name": name, "primitives": [{"attributes": attributes, "mode": 0}]})
+        nodes.append({"name": name, "mesh": len(meshes) - 1})
 
     static = fuse(chain)
     if len(static):
-        nodes.append({"name": "static scene", "mesh": mesh(static, "static scene")})
+        show(static, "static scene")
     for track in shown_tracks(chain):
         first = min(chain.path(track))
         cloud = movers(chain, first)
-        cloud = cloud.kept(cloud.label == track)
+        cloud = kept(cloud, cloud.label == track)
         if len(cloud):
-            nodes.append({"name": f"track {track}", "mesh": mesh(cloud, f"track {track}")})
+            show(cloud, f"track {track}")
             animate(len(nodes) - 1, _from_first(chain, track, first))
-    K, size = chain.pairs[0].result.K[0], chain.pairs[0].result.images[0].shape
-    view = 2 * float(np.arctan(size[0] / 2 / K[1, 1]))
-    near = 1e-3 * float(np.nanmedian(chain.depth(0)))
-    optics = {"yfov": view, "aspectRatio": size[1] / size[0], "znear": near}
+    K, (height, width) = chain.camera(0), chain.image(0).shape[:2]
+    optics = {
+        "yfov": 2 * float(np.arctan(height / 2 / K[1, 1])),
+        "aspectRatio": width / height,
+        "znear": 1e-3 * float(np.nanmedian(chain.depth(0))),
+    }
     nodes.append({"name": "camera", "camera": 0})
-    animate(len(nodes) - 1, list(chain.world_from_camera))
+    animate(len(nodes) - 1, chain.world_from_camera)
+    extras = {"unit": str(contents["unit"])}
     tree = {
-        "asset": {
-            "version": "2.0",
-            "generator": "soup_nlp",
-            "extras": {"unit": str(contents["unit"])},
-        },
+        "asset": {"version": "2.0", "generator": "soup_nlp", "extras": extras},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(nodes)))}],
         "nodes": nodes,
         "meshes": meshes,
         "cameras": [{"type": "perspective", "perspective": optics}],
         "animations": [{"name": "sequence", "channels": channels, "samplers": samplers}],
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": len(buffer.data)}],
     }
-    text = json.dumps({key: value for key, value in tree.items() if value != []}).encode()
+    write_bytes(path, _glb({key: value for key, value in tree.items() if value != []}, arrays))
+
+
+def _glb(tree: Mapping[str, Any], arrays: Sequence[NDArray[Any]]) -> bytes:
+    """A GLB of a tree and its arrays (M,), (M, 3) or (M, 4), each of which has an accessor."""
+    views, accessors, data = [], [], b""
+    for k, array in enumerate(arrays):
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
+        accessors.append(
+            {
+                "bufferView": k,
+                "componentType": NUMBERS[array.dtype],
+                "normalized": array.dtype == np.uint8,
+                "count": len(array),
+                "type": KINDS[array[0].size],
+                "min": np.atleast_1d(array.min(axis=0)).tolist(),
+                "max": np.atleast_1d(array.max(axis=0)).tolist(),
+            }
+        )
+        data += array.tobytes() + b"\0" * (-array.nbytes % 4)
+    buffers = [{"byteLength": len(data)}]
+    tables = {"accessors": accessors, "bufferViews": views, "buffers": buffers}
+    text = json.dumps({**tree, **tables}).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", len(buffer.data), b"BIN\0") + buffer.data
-    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    chunks += struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def _from_first(chain: Chain, track: int, first: int) -> list[RigidMotion]:
     """Motion of a track from its first frame to every frame; it rests before and after."""
-    now = RigidMotion(np.eye(3), np.zeros(3))
-    poses = [now] * (first + 1)
+    members = chain.members(track)
+    poses = [RigidMotion(np.eye(3), np.zeros(3))] * (first + 1)
     for k in range(first, len(chain.pairs)):
-        label = chain.label(k, track)
-        now = now if label is None else chain.motion(k, label) @ now
-        poses.append(now)
+        now = poses[-1]
+        poses.append(chain.motion(k, members[k].label) @ now if k in members else now)
     return poses
 
 
-def _quaternions(poses: list[RigidMotion]) -> Float:
+def _quaternions(poses: Sequence[RigidMotion]) -> Float:
     """(M, 4) x, y, z, w in the axes of glTF, neighbours in one half of the sphere."""
-    quaternions = np.array([RigidMotion(GLTF @ p.R @ GLTF, p.t).quaternion for p in poses])
-    for k in range(1, len(quaternions)):
-        if quaternions[k] @ quaternions[k - 1] < 0:
-            quaternions[k] *= -1
-    return quaternions
+    out = np.array([RigidMotion(GLTF @ p.R @ GLTF, p.t).quaternion for p in poses])
+    turns = np.where((out[1:] * out[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    out[1:] *= np.cumprod(turns)[:, None]
+    return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from soup_nlp.bench.reference_solver import ReferenceSolve, Tangent, levenberg_marquardt
+from soup_nlp.bench.reference_solver import Descent, ReferenceSolve, levenberg_marquardt
 from soup_nlp.config.problem import make_problem
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_options import Weights
@@ -62,7 +62,7 @@ def test_it_is_the_same_energy(case):
     free = Weights().replace(
         sigma_cont=np.inf, sigma_orient=np.inf, sigma_arap=np.inf, sigma_proj=np.inf
     )
-    problem = Tangent(case.soup, case.data, free, FORM)
+    problem = Descent(case.soup, case.data, free, FORM)
     x = problem.project(problem.nlp.x0)
     exact = oracle.energy(problem.layout.unpack(x), case.data, free)["total"]
     problem.smoothing(1e-7)
@@ -72,7 +72,7 @@ def test_it_is_the_same_energy(case):
 
 
 def test_projection_keeps_bounds_and_visibility(case):
-    problem = Tangent(case.soup, case.data, case.weights, FORM)
+    problem = Descent(case.soup, case.data, case.weights, FORM)
     inside = problem.project(problem.nlp.x0)
     np.testing.assert_allclose(problem.project(inside), inside, rtol=1e-12, atol=1e-12)
     rng = np.random.default_rng(0)

@@ -6,6 +6,7 @@ import hashlib
 import platform
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
@@ -13,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from soup_nlp.arrays import Float
 from soup_nlp.bench.processes import isolated, processor
 from soup_nlp.bench.solvers.plugins import WALL_PER_CPU, Answer, Task
 from soup_nlp.bench.solvers.registry import find_solver
@@ -78,14 +78,10 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
 
     `label` has the entries that identify the task, and "energy_limit".
     """
-    work = find_solver(solver)
-    limits = task.limits
+    work, limits = find_solver(solver), task.limits
+    wall = WALL_PER_CPU * limits.seconds
     ended = isolated(
-        lambda: work(task),
-        task.folder,
-        WALL_PER_CPU * limits.seconds,
-        limits.memory,
-        cpu_seconds=limits.seconds,
+        lambda: work(task), task.folder, wall, limits.memory, cpu_seconds=limits.seconds
     )
     row: Row = {
         **label,
@@ -109,39 +105,34 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
     return row
 
 
-def _energy(task: Task, x: Float) -> float:
-    """Exact energy of a point retracted to the constraints; infinite if it is not finite."""
-    with np.errstate(all="ignore"):
-        try:
-            soup = task.layout.unpack(x).retracted()
-            value = oracle.energy(soup, task.data, task.weights)["total"]
-        except np.linalg.LinAlgError:
-            return float("inf")
-    return float(value) if np.isfinite([value, *x]).all() else float("inf")
-
-
 def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
     """Entries of a row from an answer: claim, exact energy and residuals.
 
-    One tolerance decides what is verified, whether the solver claims an optimum or not.
+    One tolerance decides what is verified, whether the solver claims an optimum or not. The exact
+    energy is that of the point retracted to the constraints; infinite if it is not finite.
     """
     # a claim after the time limit does not count
-    late = not answer.seconds <= task.limits.seconds
+    x, late = answer.x, not answer.seconds <= task.limits.seconds
     row: Row = {
         "status": f"over the time limit: {answer.status}" if late else answer.status,
-        "claimed": answer.claimed and answer.x is not None and not late,
+        "claimed": answer.claimed and x is not None and not late,
         "iterations": answer.iterations,
         "seconds": answer.seconds,
     }
-    if answer.x is None:
+    if x is None:
         return row
-    row["energy"] = _energy(task, answer.x)
+    energy = np.inf
+    with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
+        soup = task.layout.unpack(x).retracted()
+        energy = oracle.energy(soup, task.data, task.weights)["total"]
     with np.errstate(all="ignore"):
-        value = task.nlp.value(answer.x)
+        value = task.nlp.value(x)
+    finite = bool(np.isfinite(x).all())
+    row["energy"] = float(energy) if finite and np.isfinite(energy) else float("inf")
     row["objective"] = value if np.isfinite(value) else None
-    if not np.isfinite(answer.x).all():
+    if not finite:
         return row
-    residuals = examine(task.nlp, answer.x, answer.lam_g).residuals
+    residuals = examine(task.nlp, x, answer.lam_g).residuals
     good = residuals.within(task.limits) and row["energy"] <= energy_limit
     return {**row, **vars(residuals), "verified": bool(good and not late)}
 
