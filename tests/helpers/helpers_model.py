@@ -12,7 +12,7 @@ from hypothesis import settings
 from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.scenes.raycast import Body, Part, Scene, render
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, View, render
 from soup_nlp.data.scenes.shapes import Box, Plane
 from soup_nlp.data.scenes.texture import Texture
 from soup_nlp.geometry import camera, rotation
@@ -296,9 +296,10 @@ def cut_by_part(
     """Grid superpixels cut along the parts' outlines; and which of them lie on one part only."""
     height, width = pair.size
     uv = camera.pixel_grid(height, width).reshape(-1, 2)
-    part = scene.trace(pair.K_ref, uv, 0)[1].reshape(height, width)
+    view = View(scene, pair.K_ref, 0)
+    part = view.trace(uv)[1].reshape(height, width)
     cells = segment(pair.image_ref, count, "grid")
-    labels = split_components(cells * len(scene.parts) + part.astype(np.int32), 40)
+    labels = split_components(cells * len(view.parts) + part.astype(np.int32), 40)
     low, high = np.full(labels.max() + 1, 99), np.full(labels.max() + 1, -1)
     np.minimum.at(low, labels.ravel(), part.ravel())
     np.maximum.at(high, labels.ravel(), part.ravel())

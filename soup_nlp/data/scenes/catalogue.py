@@ -11,7 +11,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes import everyday
-from soup_nlp.data.scenes.raycast import Body, Part, Scene, advanced, inverse, render
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
 from soup_nlp.data.scenes.shapes import Sheet
 from soup_nlp.data.scenes.texture import Panels
 from soup_nlp.data.scenes.things import (
@@ -57,7 +57,7 @@ def render_scene(
     rng = np.random.default_rng([seed, list(_LAYOUTS).index(name)])
     scene = layout(SceneBuilder(rng, width / (2 * f), height / (2 * f), contrast, seed))
     title = f"{name}-{seed}" + (f"-{frame}" if frame else "")
-    return render(advanced(scene, frame), K, height, width, name=title)
+    return render(scene.advanced(frame), K, height, width, name=title)
 
 
 def _street(b: SceneBuilder) -> Scene:
@@ -128,9 +128,10 @@ def _sheet(b: SceneBuilder) -> Scene:
     # sides that bend away from the camera look smaller
     room = 1.06 if bend > 0 else 0.93
     half = room * b.half_width, room * b.half_height
-    shape = Sheet(half, (bend, bend + change), (axis, axis + b.sign() * b.uniform(0.02, 0.06)))
+    bent = Sheet(half, bend + change, axis + b.sign() * b.uniform(0.02, 0.06))
     dots = Panels((0.16, 0.16), (0.5, 0.5), (0.66, 0.64, 0.56), variation=0.3)
-    cloth = Part(shape, placed(0, 0, 1.0, yaw=b.uniform(-8, 8)), b.paint(0.12, dots), glow=0.6)
+    pose = placed(0, 0, 1.0, yaw=b.uniform(-8, 8))
+    cloth = Part(Sheet(half, bend, axis), pose, b.paint(0.12, dots), glow=0.6, bent=bent)
     shift = b.uniform([-0.003, -0.003, -0.01], [0.003, 0.003, 0.01])
     wall = Body([backdrop(1.7, b.wall(0.3))])
     sheet = Body([cloth], about([0, 0, 1], b.uniform(-0.4, 0.4, 3), shift))
@@ -166,12 +167,12 @@ def _banner(b: SceneBuilder) -> Scene:
     axis = b.uniform(-0.2, 0.2)
     z, up = 3.5, 0.81  # its foot is on the floor, in the image
     unit = z * b.half_width
-    turned = axis + b.sign() * b.uniform(0.02, 0.05)
-    shape = Sheet((0.4 * unit, up), (bend, bend + change), (axis, turned))
+    half = 0.4 * unit, up
+    bent = Sheet(half, bend + change, axis + b.sign() * b.uniform(0.02, 0.05))
     dots = Panels((0.3, 0.3), (0.5, 0.5), (0.66, 0.64, 0.56), variation=0.3)
     x = b.uniform(-0.3, 0.3) * unit
     pose = placed(x, -up, z, yaw=b.uniform(-10, 10))
-    cloth = Part(shape, pose, b.paint(0.25, dots), glow=0.4)
+    cloth = Part(Sheet(half, bend, axis), pose, b.paint(0.25, dots), glow=0.4, bent=bent)
     turn, shift = b.uniform(-0.5, 0.5, 3), b.uniform(-0.015, 0.015, 3)
     bodies = [Body([*b.interior(), *things]), Body([cloth], about([x, 0, z], turn, shift))]
     return Scene(bodies, *_sideways(b))

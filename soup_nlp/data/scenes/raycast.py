@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, FloatMap, Image, Int, Mask
+from soup_nlp.arrays import Float, FloatMap, Image, Int
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes.shapes import NEAR, Shape
 from soup_nlp.data.scenes.texture import Texture
@@ -52,6 +52,7 @@ class Part:
         texture: Colours by material coordinates.
         glow: Share of the colour that does not depend on the light; 1 for no shading (sky).
         motion: (4, 4) motion in scene coordinates before that of the body, such as of a limb.
+        bent: The surface at the next time if it bends, with the same material coordinates.
     """
 
     shape: Shape
@@ -59,14 +60,18 @@ class Part:
     texture: Texture
     glow: float = 0.45
     motion: Float = field(default_factory=lambda: np.eye(4))
+    bent: Shape | None = None
 
-    def colour(self, points: Float, footprint: Float, frame: int) -> FloatMap:
-        """Colours (N, 3) of points (N, 3) in part coordinates; shading moves with the surface."""
-        material = self.shape.material(points, frame)
-        normals = self.shape.normals(self.shape.place(material, 0), 0)
+    def colour(self, shape: Shape, points: Float, footprint: Float) -> FloatMap:
+        """Colours (N, 3) of points (N, 3) of the part's shape at a time.
+
+        Shading moves with the surface.
+        """
+        material = shape.material(points)
+        normals = self.shape.normals(self.shape.place(material))
         light = self.scene_from_part[:3, :3].T @ LIGHT
         shade = self.glow + (1 - self.glow) * (0.5 + 0.5 * normals @ light)
-        colour = self.texture.colour(material, self.shape.chart(material), footprint)
+        colour = self.texture.colour(material, shape.chart(material), footprint)
         return colour * shade[:, None].astype(np.float32)
 
 
@@ -85,7 +90,7 @@ class Body:
     @property
     def bends(self) -> bool:
         """Whether the body has no rigid motion: a part bends, or parts move differently."""
-        return any(not p.shape.rigid or (p.motion != np.eye(4)).any() for p in self.parts)
+        return any(p.bent is not None or (p.motion != np.eye(4)).any() for p in self.parts)
 
 
 @dataclass(frozen=True)
@@ -102,28 +107,6 @@ class Scene:
     ref_from_scene: Float
     next_from_scene: Float
 
-    @property
-    def parts(self) -> list[Part]:
-        """All parts, body by body."""
-        return [part for body in self.bodies for part in body.parts]
-
-    @property
-    def body_of_part(self) -> NDArray[np.int32]:
-        """(P,) body label of each part."""
-        return np.repeat(
-            np.arange(len(self.bodies), dtype=np.int32), [len(b.parts) for b in self.bodies]
-        )
-
-    def camera_from_part(self, frame: int) -> Float:
-        """(P, 4, 4) poses of all parts in the camera of a frame."""
-        poses = []
-        for body in self.bodies:
-            view = self.next_from_scene @ body.motion if frame else self.ref_from_scene
-            for part in body.parts:
-                part_view = view @ part.motion if frame else view
-                poses.append(part_view @ part.scene_from_part)
-        return np.array(poses)
-
     def motions(self) -> Float:
         """(B, 4, 4) next_from_ref of each body, camera motion included; NaN where not rigid."""
         scene_from_ref = inverse(self.ref_from_scene)
@@ -131,59 +114,138 @@ class Scene:
         out[[b.bends for b in self.bodies]] = np.nan
         return out
 
-    def trace(self, K: Float, uv: Float, frame: int) -> tuple[Float, Int]:
-        """First hit of the rays through pixels.
+    def advanced(self, steps: int) -> Scene:
+        """The scene `steps` frames later; camera and bodies repeat their motion of one frame.
 
-        Args:
-            K: (3, 3) intrinsics.
-            uv: (N, 2) pixels, any real numbers.
-            frame: 0 for the reference, 1 for the next frame.
+        Raises:
+            DataError: a body bends; bending is defined for the first two frames only.
+        """
+        if steps and any(body.bends for body in self.bodies):
+            what = "a scene that bends has two frames"
+            raise DataError(what, found=f"frame {steps}", expected="0")
+        go_on = self.next_from_scene @ inverse(self.ref_from_scene)
+        ref = np.linalg.matrix_power(go_on, steps) @ self.ref_from_scene
+        bodies = []
+        for body in self.bodies:
+            so_far = np.linalg.matrix_power(body.motion, steps)
+            parts = [replace(p, scene_from_part=so_far @ p.scene_from_part) for p in body.parts]
+            bodies.append(replace(body, parts=parts))
+        return Scene(bodies, ref, go_on @ ref)
+
+
+class View:
+    """A scene in the camera of a frame, 0 for the reference and 1 for the next.
+
+    Attributes:
+        parts: All parts, body by body.
+        shapes: Their shapes in the frame.
+        poses: (P, 4, 4) camera_from_part.
+        body: (P,) int32 component label of each part.
+    """
+
+    def __init__(self, scene: Scene, K: Float, frame: int) -> None:
+        self.K = K
+        self.parts = [part for body in scene.bodies for part in body.parts]
+        self.shapes = [(frame and part.bent) or part.shape for part in self.parts]
+        self.body = np.repeat(
+            np.arange(len(scene.bodies), dtype=np.int32), [len(b.parts) for b in scene.bodies]
+        )
+        poses = []
+        for body in scene.bodies:
+            view = scene.next_from_scene @ body.motion if frame else scene.ref_from_scene
+            for part in body.parts:
+                poses.append((view @ part.motion if frame else view) @ part.scene_from_part)
+        self.poses = np.array(poses)
+
+    def trace(self, uv: Float) -> tuple[Float, Int]:
+        """First hits of the rays through pixels (N, 2), which may be any real numbers.
 
         Returns:
             Depth z (N,), inf where nothing is hit, and part index (N,), -1 there.
         """
-        rays = camera.rays(K, uv)
+        rays = camera.rays(self.K, uv)
         depth = np.full(len(uv), np.inf)
         index = np.full(len(uv), -1, dtype=np.int64)
-        for p, (part, pose) in enumerate(zip(self.parts, self.camera_from_part(frame))):
-            near = _may_hit(part.shape, pose, K, uv)
+        for p, (shape, pose) in enumerate(zip(self.shapes, self.poses)):
+            near = self._may_hit(shape, pose, uv)
             R, t = pose[:3, :3], pose[:3, 3]
-            hit = part.shape.intersect(-R.T @ t, rays[near] @ R, frame)
+            hit = shape.intersect(-R.T @ t, rays[near] @ R)
             closer = hit < depth[near]
             depth[near[closer]] = hit[closer]
             index[near[closer]] = p
         return depth, index
 
+    def _may_hit(self, shape: Shape, pose: Float, uv: Float) -> Int:
+        """Indices of the pixels (N, 2) within the bounding rectangle of a shape's projection."""
+        if shape.bound is not None:
+            corners = np.array(list(product((-1, 1), repeat=3))) * shape.bound
+            seen = corners @ pose[:3, :3].T + pose[:3, 3]
+            if seen[:, 2].min() > NEAR:
+                at, (u, v) = camera.project(self.K, seen), uv.T
+                low, high = at.min(axis=0) - 1e-6, at.max(axis=0) + 1e-6
+                across, down = (u >= low[0]) & (u <= high[0]), (v >= low[1]) & (v <= high[1])
+                return np.flatnonzero(across & down)
+        return np.arange(len(uv))
 
-def advanced(scene: Scene, steps: int) -> Scene:
-    """The scene `steps` frames later; camera and bodies repeat their motion from frame 0 to 1.
+    def image(self, depth: Float, part: Int, size: tuple[int, int]) -> Image:
+        """The image (H, W, 3) of the hits of all pixels.
 
-    Raises:
-        DataError: a body bends; bending is defined for the first two frames only.
-    """
-    if steps and any(body.bends for body in scene.bodies):
-        raise DataError("a scene that bends has two frames", found=f"frame {steps}", expected="0")
-    go_on = scene.next_from_scene @ inverse(scene.ref_from_scene)
-    ref = np.linalg.matrix_power(go_on, steps) @ scene.ref_from_scene
-    bodies = []
-    for body in scene.bodies:
-        so_far = np.linalg.matrix_power(body.motion, steps)
-        parts = [replace(p, scene_from_part=so_far @ p.scene_from_part) for p in body.parts]
-        bodies.append(replace(body, parts=parts))
-    return Scene(bodies, ref, go_on @ ref)
+        Pixels whose 4-neighbours show another part or another face are averages of TAPS x TAPS
+        traced samples.
+        """
+        uv = camera.pixel_grid(*size).reshape(-1, 2)
+        colour, normals = self._shade(uv, depth, part, TAPS)
+        parts, faces, edge = part.reshape(size), normals.reshape(*size, 3), np.zeros(size, bool)
+        for first, second in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
+            turned = np.einsum("...i,...i", faces[first], faces[second]) < 0.7
+            differ = (parts[first] != parts[second]) | turned
+            edge[first] |= differ
+            edge[second] |= differ
+        steps = (np.arange(TAPS) + 0.5) / TAPS - 0.5
+        offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, -1, 2)
+        at = (uv[edge.ravel(), None] + offsets).reshape(-1, 2)
+        samples, _ = self._shade(at, *self.trace(at), 1)
+        colour[edge.ravel()] = np.clip(samples, 0, 1).reshape(-1, TAPS**2, 3).mean(axis=1)
+        return np.round(255 * np.clip(colour, 0, 1)).astype(np.uint8).reshape(*size, 3)
+
+    def _shade(self, uv: Float, depth: Float, part: Int, taps: int) -> tuple[FloatMap, Float]:
+        """Colours (N, 3) and unit normals (N, 3), in camera coordinates, of hits.
+
+        A tilted surface is foreshortened in one image direction only. Its texture has the finer
+        resolution of the other direction, and `taps` samples are averaged along the first; 1 if the
+        caller averages samples.
+        """
+        colour, normals = np.zeros((len(uv), 3), np.float32), np.zeros((len(uv), 3))
+        rays = camera.rays(self.K, uv)
+        for p in np.unique(part):
+            on = np.flatnonzero(part == p)
+            item, shape, R, t = self.parts[p], self.shapes[p], *_split(self.poses[p])
+            ray = rays[on]
+            local = (depth[on, None] * ray - t) @ R
+            n = shape.normals(local) @ R.T
+            normals[on] = n
+            towards = np.einsum("ni,ni->n", n, ray)
+            cosine = np.maximum(abs(towards) / np.linalg.norm(ray, axis=1), 0.02)
+            across = depth[on] / self.K[0, 0]
+            footprint = np.maximum(across, across / cosine / TAPS)
+            several = (cosine < TILTED) & (taps > 1)
+            shown = np.empty((len(on), 3), np.float32)
+            shown[~several] = item.colour(shape, local[~several], footprint[~several])
+            if several.any():
+                # direction of foreshortening within the surface
+                along = (ray - towards[:, None] * n)[several]
+                along *= ((across / cosine)[several] / np.linalg.norm(along, axis=1))[:, None]
+                step, start = along @ R, local[several]
+                offsets = (np.arange(taps) + 0.5) / taps - 0.5
+                tap = [item.colour(shape, start + o * step, footprint[several]) for o in offsets]
+                shown[several] = np.mean(tap, axis=0)
+            colour[on] = shown
+        return colour, normals
 
 
-def _may_hit(shape: Shape, camera_from_part: Float, K: Float, uv: Float) -> Int:
-    """Indices of the pixels (N, 2) within the bounding rectangle of a shape's projection."""
-    corners = shape.corners()
-    if corners is not None:
-        seen = corners @ camera_from_part[:3, :3].T + camera_from_part[:3, 3]
-        if seen[:, 2].min() > NEAR:
-            at = camera.project(K, seen)
-            lo, hi = at.min(axis=0) - 1e-6, at.max(axis=0) + 1e-6
-            u, v = uv[:, 0], uv[:, 1]
-            return np.flatnonzero((u >= lo[0]) & (u <= hi[0]) & (v >= lo[1]) & (v <= hi[1]))
-    return np.arange(len(uv))
+def _split(pose: Float) -> tuple[Float, Float]:
+    """Rotation (3, 3) and translation (3,) of a rigid transform (4, 4)."""
+    return pose[:3, :3], pose[:3, 3]
 
 
 def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene") -> Pair:
@@ -202,127 +264,39 @@ def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene")
         pixel centres, or is behind the camera (with a flow of NaN). Every ray must hit a surface,
         such as an infinite plane behind the bodies.
     """
-    uv = camera.pixel_grid(height, width).reshape(-1, 2)
-    depths, images, hits = [], [], []
-    for frame in (0, 1):
-        depth, part = scene.trace(K, uv, frame)
-        images.append(_paint(scene, K, depth, part, (height, width), frame))
-        depths.append(depth)
-        hits.append(part)
-    X = depths[0][:, None] * camera.rays(K, uv)
-    X_next = _move(scene, X, hits[0])
+    size = height, width
+    uv = camera.pixel_grid(*size).reshape(-1, 2)
+    ref, following = View(scene, K, 0), View(scene, K, 1)
+    (depth, part), (depth_next, part_next) = ref.trace(uv), following.trace(uv)
+    motions = scene.motions()
+    X = depth[:, None] * camera.rays(K, uv)
+    X_next = np.empty_like(X)
+    for p in np.unique(part):
+        on = part == p
+        R, t = _split(motions[ref.body[p]])
+        if np.isfinite(t).all():
+            X_next[on] = X[on] @ R.T + t
+        else:
+            (R, t), (R_next, t_next) = _split(ref.poses[p]), _split(following.poses[p])
+            material = ref.shapes[p].material((X[on] - t) @ R)
+            X_next[on] = following.shapes[p].place(material) @ R_next.T + t_next
     in_front = X_next[:, 2] > NEAR
     target = np.full_like(uv, np.nan)
     target[in_front] = camera.project(K, X_next[in_front])
     # tolerates rounding at the border
     edge = np.array([width, height]) - 1 + 1e-6
-    inside = in_front & ((target >= -1e-6) & (target <= edge)).all(axis=1)
-    visible = inside.copy()
-    first, _ = scene.trace(K, target[inside], 1)
-    visible[inside] = X_next[inside, 2] <= first * (1 + SAME_DEPTH)
-    shape = (height, width)
+    visible = in_front & ((target >= -1e-6) & (target <= edge)).all(axis=1)
+    first, _ = following.trace(target[visible])
+    visible[visible] = X_next[visible, 2] <= first * (1 + SAME_DEPTH)
     truth = Truth(
-        depth_ref=depths[0].reshape(shape),
-        depth_next=depths[1].reshape(shape),
-        flow=(target - uv).reshape(*shape, 2),
-        occluded=~visible.reshape(shape),
-        components=scene.body_of_part[hits[0]].reshape(shape),
-        motions=scene.motions(),
-        scene_flow=(X_next - X).reshape(*shape, 3),
+        depth_ref=depth.reshape(size),
+        depth_next=depth_next.reshape(size),
+        flow=(target - uv).reshape(*size, 2),
+        occluded=~visible.reshape(size),
+        components=ref.body[part].reshape(size),
+        motions=motions,
+        scene_flow=(X_next - X).reshape(*size, 3),
         unit="m",
     )
-    return Pair(images[0], images[1], K.copy(), K.copy(), truth=truth, name=name)
-
-
-def _move(scene: Scene, X: Float, part: Int) -> Float:
-    """Next-frame positions (N, 3) of reference points (N, 3) on parts (N,)."""
-    out = np.empty_like(X)
-    before, after = scene.camera_from_part(0), scene.camera_from_part(1)
-    motions = scene.motions()[scene.body_of_part]
-    for p in np.unique(part):
-        on = part == p
-        shape = scene.parts[p].shape
-        if shape.rigid and np.isfinite(motions[p]).all():
-            out[on] = X[on] @ motions[p, :3, :3].T + motions[p, :3, 3]
-        else:
-            local = (X[on] - before[p, :3, 3]) @ before[p, :3, :3]
-            local = shape.place(shape.material(local, 0), 1)
-            out[on] = local @ after[p, :3, :3].T + after[p, :3, 3]
-    return out
-
-
-def _paint(
-    scene: Scene, K: Float, depth: Float, part: Int, shape: tuple[int, int], frame: int
-) -> Image:
-    """The image (H, W, 3); pixels on edges are averages of TAPS x TAPS traced samples."""
-    uv = camera.pixel_grid(*shape).reshape(-1, 2)
-    colour, normals = _shade(scene, K, uv, depth, part, frame, TAPS)
-    edge = np.flatnonzero(_on_edge(part.reshape(shape), normals.reshape(*shape, 3)))
-    steps = (np.arange(TAPS) + 0.5) / TAPS - 0.5
-    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(1, -1, 2)
-    at = (uv[edge, None] + offsets).reshape(-1, 2)
-    z, p = scene.trace(K, at, frame)
-    samples, _ = _shade(scene, K, at, z, p, frame, 1)
-    colour[edge] = np.clip(samples, 0, 1).reshape(-1, TAPS**2, 3).mean(axis=1)
-    return np.round(255 * np.clip(colour, 0, 1)).astype(np.uint8).reshape(*shape, 3)
-
-
-def _on_edge(part: Int, normals: Float) -> Mask:
-    """Pixels (H, W) whose 4-neighbours show another part or another face."""
-    edge = np.zeros(part.shape, bool)
-    for first, second in (np.s_[:-1, :], np.s_[1:, :]), (np.s_[:, :-1], np.s_[:, 1:]):
-        turned = np.einsum("...i,...i", normals[first], normals[second]) < 0.7
-        differ = (part[first] != part[second]) | turned
-        edge[first] |= differ
-        edge[second] |= differ
-    return edge
-
-
-def _shade(
-    scene: Scene, K: Float, uv: Float, depth: Float, part: Int, frame: int, taps: int
-) -> tuple[FloatMap, Float]:
-    """Colours and normals of hits.
-
-    A tilted surface is foreshortened in one image direction only. Its texture has the finer
-    resolution of the other direction, and TAPS samples are averaged along the first.
-
-    Args:
-        scene: The scene.
-        K: (3, 3) intrinsics.
-        uv: (N, 2) pixels.
-        depth: (N,) depth of the surface there.
-        part: (N,) part index.
-        frame: 0 or 1.
-        taps: Samples along the foreshortened direction; 1 if the caller averages samples.
-
-    Returns:
-        Colours (N, 3) and unit normals (N, 3) in camera coordinates.
-    """
-    colour = np.zeros((len(uv), 3), np.float32)
-    normals = np.zeros((len(uv), 3))
-    rays = camera.rays(K, uv)
-    poses = scene.camera_from_part(frame)
-    for p in np.unique(part):
-        on = np.flatnonzero(part == p)
-        item, R, t = scene.parts[p], poses[p, :3, :3], poses[p, :3, 3]
-        ray = rays[on]
-        local = (depth[on, None] * ray - t) @ R
-        n = item.shape.normals(local, frame) @ R.T
-        normals[on] = n
-        towards = np.einsum("ni,ni->n", n, ray)
-        cosine = np.maximum(abs(towards) / np.linalg.norm(ray, axis=1), 0.02)
-        across = depth[on] / K[0, 0]
-        footprint = np.maximum(across, across / cosine / TAPS)
-        several = (cosine < TILTED) & (taps > 1)
-        shown = np.empty((len(on), 3), np.float32)
-        shown[~several] = item.colour(local[~several], footprint[~several], frame)
-        if several.any():
-            # direction of foreshortening within the surface
-            along = (ray - towards[:, None] * n)[several]
-            along *= ((across / cosine)[several] / np.linalg.norm(along, axis=1))[:, None]
-            step, start = along @ R, local[several]
-            offsets = (np.arange(taps) + 0.5) / taps - 0.5
-            samples = [item.colour(start + o * step, footprint[several], frame) for o in offsets]
-            shown[several] = np.mean(samples, axis=0)
-        colour[on] = shown
-    return colour, normals
+    images = ref.image(depth, part, size), following.image(depth_next, part_next, size)
+    return Pair(*images, K.copy(), K.copy(), truth=truth, name=name)

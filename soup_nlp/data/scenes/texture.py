@@ -53,23 +53,17 @@ def value_noise(points: Float, seed: int) -> FloatMap:
     Returns:
         (N,) values in [-1, 1], twice continuously differentiable, period `PERIOD` in each axis.
     """
-    table = _lattice(seed)
     cell = np.floor(points)
     f = (points - cell).astype(np.float32)
     f = f * f * f * (f * (f * 6 - 15) + 10)
-    low = cell.astype(np.int64) & (PERIOD - 1)
-    high = (low + 1) & (PERIOD - 1)
-    fx, fy, fz = f.T
-    planes = []
-    for z in (low[:, 2], high[:, 2]):
-        rows = []
-        for y in (low[:, 1], high[:, 1]):
-            base = (z * PERIOD + y) * PERIOD
-            left, right = table[base + low[:, 0]], table[base + high[:, 0]]
-            rows.append(left + fx * (right - left))
-        planes.append(rows[0] + fy * (rows[1] - rows[0]))
-    out: FloatMap = planes[0] + fz * (planes[1] - planes[0])
-    return out
+    # (2, N) lower and upper neighbour along each axis
+    x, y, z = np.bitwise_and(cell.astype(np.int64).T[:, None] + [[0], [1]], PERIOD - 1)
+    node = (z[:, None, None] * PERIOD + y[:, None]) * PERIOD + x
+    values = _lattice(seed)[node]
+    for share in f.T:
+        low, high = values[..., 0, :], values[..., 1, :]
+        values = low + share * (high - low)
+    return values
 
 
 def fractal_noise(

@@ -206,7 +206,7 @@ class SceneBuilder:
         """A car of three boxes that stands on the ground, nose along +z at yaw 0."""
         at = placed(x, 0, z, yaw=yaw)
         body = self.paint(0.7)
-        tyres = self.plain(((0.12, 0.12, 0.13), (0.2, 0.2, 0.21)), 0.4)
+        tyres = self.plain(DARK, 0.4)
         glass = self.plain((GLASS, (0.3, 0.36, 0.42)), 0.5)
         sizes = [
             # half size, bottom above ground, offset along the car, texture
