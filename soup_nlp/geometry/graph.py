@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from soup_nlp.arrays import Float, Image, Int
+from soup_nlp.arrays import Float, Image, Int, Mask
 from soup_nlp.errors import DataError
 
 BETA = 0.02
@@ -64,6 +64,12 @@ class Segmentation:
         )
 
     __repr__ = __str__
+
+    def nearest(self, mask: Mask) -> Int:
+        """(N,) the nearest superpixel of a mask (N,), which is not empty; in the mask itself."""
+        members = np.flatnonzero(mask)
+        found = members[cKDTree(self.anchors[members]).query(self.anchors)[1]]
+        return np.where(mask, np.arange(len(mask)), found)
 
 
 def build_segmentation(

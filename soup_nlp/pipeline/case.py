@@ -110,9 +110,7 @@ def prepare(
     options = SeededStart(**dict(problem.start), seed=problem.seed)
     fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
     if pair.focal_sigma >= GUESS_SIGMA:
-        views = fitted.views
-        matches = views.ray.reshape(-1, 3), views.target.reshape(-1, 3), views.weight.ravel()
-        better = focal_length(*matches, views.focal[0], pair.focal_sigma, problem.seed)
+        better = focal_length(*fitted.views.matches(), pair.focal_sigma, problem.seed)
         full, pair = full.with_focal(*better), pair.with_focal(*better)
         seen = None if seen is None else seen.with_focal(*better)
         fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
@@ -153,9 +151,7 @@ def _begin(
     problem: Problem, pair: Pair, seg: Segmentation, fitted: FlowFit, options: SeededStart
 ) -> Start:
     """The start on given superpixels, without a depth prior."""
-    flow = pair.flow
-    assert flow is not None
-    start = propose(seg, flow, pair.K_ref, pair.K_next, options, fitted)
+    start = propose(fitted)
     if problem.energy.weights.order > 0:
         start = in_order(start, seg, pair, fitted, options)
     return start

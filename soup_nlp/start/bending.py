@@ -24,14 +24,16 @@ from soup_nlp.start.choice import Choice, dominant
 from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, essential_motion, refine_near
 from soup_nlp.start.merge import candidates
-from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import Views
+from soup_nlp.start.views import FlowFit, Views
 
 SYSTEMATIC, LEAST_PX, MOST_PX = 4.0, 0.01, 0.07
 """Systematic error of a dense flow, in units of its noise, and its limits in pixels."""
 REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
 with the diameter of the superpixel."""
+FIT_PIXELS, LEAST_SCALE = 3000, 0.02
+"""Pixels of a fit of a rotation or of the least median error, and the least scale of the latter's
+refinement, pixels."""
 
 
 def reference_noise(residual: Float) -> float:
@@ -44,28 +46,19 @@ def systematic_error(noise: float) -> float:
     return float(np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX))
 
 
-def turn_alone(views: Views, choice: Choice, usable: Mask, noise: float) -> Float | None:
-    """The camera's rotation, if it explains the flow of the main motion without depth.
+def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
+    """The camera's (3, 3) rotation, if it explains the flow of the main motion without depth.
 
     The rotation does if the main rigid motion, with depths, lowers the error by no more than the
     systematic error of the flow in the median, which movers assigned to that motion do not change.
     The focal length is free in the fit, because a wrong one leaves a residual that depths explain.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        choice: Rigid motion and plane of every superpixel.
-        usable: (N,) True where the flow counts.
-        noise: See `reference_noise`, pixels.
-
-    Returns:
-        The (3, 3) rotation, or None where the camera's translation is seen.
     """
-    at = np.flatnonzero(usable & (choice.label == 0))
+    at = np.flatnonzero(flow.views.usable & (choice.label == 0))
     if not len(at):
         return None
-    turn, error = fit_turn(views.subset(at))
+    turn, error = fit_turn(flow.views.subset(at))
     gain = np.median(error - choice.fit.cost[at, 0])
-    return None if gain > systematic_error(noise) else turn
+    return None if gain > systematic_error(reference_noise(flow.residual)) else turn
 
 
 def turned(x: Float, ray: Float) -> Float:
@@ -82,21 +75,14 @@ def fit_robustly(miss: Callable[[Float], Float], size: int) -> Float:
     return x
 
 
-def fit_turn(views: Views, count: int = 3000) -> tuple[Float, Float]:
-    """Rotation that explains a flow best, the focal length free, and (N,) its mean error, pixels.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        count: Largest number of pixels that are used.
-    """
-    focal = np.asarray(views.focal)
-    step = max(1, views.weight.size // count)
-    ray, target = (v.reshape(-1, 3)[::step] for v in (views.ray, views.target))
-    root = np.sqrt(views.weight.ravel()[::step])[:, None]
+def fit_turn(views: Views) -> tuple[Float, Float]:
+    """Rotation that explains a flow best, focal length free, and (N,) its mean error, pixels."""
+    ray, target, weight, _ = views.matches(most=FIT_PIXELS)
 
     def miss(x: Float) -> Float:
         moved = turned(x, ray)
-        return root * (moved[..., :2] / moved[..., 2:] - target[..., :2]) * focal
+        off = moved[..., :2] / moved[..., 2:] - target[..., :2]
+        return np.sqrt(weight)[:, None] * off * np.asarray(views.focal)
 
     x = fit_robustly(miss, 4)
     return rotation.exp(x[:3]), views.distance(turned(x, views.ray))
@@ -105,38 +91,56 @@ def fit_turn(views: Views, count: int = 3000) -> tuple[Float, Float]:
 ABOVE_NOISE, LEAST_JUMP = 10.0, 0.25
 """Least jump of a flow discontinuity: multiple of the median jump between neighbours (which noise
 and bending cause), and share of `discontinuity_px`."""
+LEAST_SHARE = 0.06
+"""Least share of the superpixels that makes a surface: a smaller one joins a neighbour, because a
+few superpixels with a wrong flow look like a bending one."""
 
 
-def surfaces(jump: Float, seg: Segmentation, discontinuity_px: float) -> Int:
+def surfaces(flow: FlowFit) -> Int:
     """(N,) index of the surface of every superpixel; flow discontinuities separate them.
 
     The size of the jumps varies along an outline, and one small jump would join both sides.
     Surfaces are therefore first separated along smaller jumps. Two of them are joined again if the
     flow is continuous along most of their common outline, longest outline first.
-
-    Args:
-        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
-        seg: Superpixels and graphs.
-        discontinuity_px: Jump that certainly is a discontinuity, pixels.
     """
+    jump, most, seg = flow.jump, flow.options.discontinuity_px, flow.seg
     usual = float(np.median(jump)) if len(jump) else 0.0
-    least = np.clip(ABOVE_NOISE * usual, LEAST_JUMP * discontinuity_px, discontinuity_px)
+    least = np.clip(ABOVE_NOISE * usual, LEAST_JUMP * most, most)
     surface = connected_labels(jump < least, seg)
-    n, (i, k) = len(seg), seg.pairs.T
+    length = seg.boundary_length.astype(float)
     while True:
-        a, b = surface[i], surface[k]
-        outline = np.flatnonzero(a != b)
-        if not len(outline):
+        ends, total, whole = _along_outlines(surface, seg, length, length * (jump < most))
+        length_of = np.where(whole > 0.5 * total, total, 0.0)
+        if not length_of.any():
             return surface
-        a, b = np.minimum(a, b)[outline], np.maximum(a, b)[outline]
-        pairs, which = np.unique(a * n + b, return_inverse=True)
-        length = seg.boundary_length[outline].astype(float)
-        whole = np.bincount(which, length * (jump[outline] < discontinuity_px))
-        total = np.bincount(which, length)
-        join = int(np.argmax(np.where(whole > 0.5 * total, total, 0.0)))
-        if not whole[join] > 0.5 * total[join]:
+        a, b = ends[np.argmax(length_of)]
+        surface = np.where(surface == b, a, surface)
+
+
+def joined(flow: FlowFit, surface: Int) -> Int:
+    """(N,) surfaces; those with too few usable superpixels are joined to a neighbour.
+
+    The smallest joins the neighbour with the longest common outline, until each has `LEAST_SHARE`.
+    """
+    length = flow.seg.boundary_length.astype(float)
+    while True:
+        ends, total = _along_outlines(surface, flow.seg, length)
+        count = np.bincount(surface, flow.views.usable)
+        small = np.unique(ends[count[ends] < LEAST_SHARE * len(surface)])
+        if not len(small):
             return surface
-        surface = np.where(surface == pairs[join] % n, pairs[join] // n, surface)
+        c = small[np.argmin(count[small])]
+        a, b = ends[np.argmax(np.where((ends == c).any(axis=1), total, 0.0))]
+        surface = np.where(surface == c, a + b - c, surface)
+
+
+def _along_outlines(label: Int, seg: Segmentation, *values: Float) -> tuple[Int | Float, ...]:
+    """(Q, 2) labels that touch, in order, and (Q,) the sums of values (P,) along their outlines."""
+    ends = np.sort(label[seg.pairs], axis=1)
+    across = ends[:, 0] != ends[:, 1]
+    key, which = np.unique(ends[across] @ [len(seg), 1], return_inverse=True)
+    sums = (np.bincount(which, v[across], len(key)) for v in values)
+    return np.stack(np.divmod(key, len(seg)), axis=1), *sums
 
 
 def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float]:
@@ -173,22 +177,15 @@ def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float
 NOISES = 0.4
 """Median excess of the error up to which a surface is rigid, beside the systematic error, in units
 of the noise."""
-LEAST_SHARE = 0.06
-"""Least share of the superpixels that makes a surface: a smaller one joins a neighbour, because a
-few superpixels with a wrong flow look like a bending one."""
 LEAST_LEFT = 15
 """Least number of superpixels of a piece split from a rigid surface: large ones mix flows."""
 SURELY = 0.5
 """Share of the limit of a bending surface's excess up to which a motion surely explains a surface,
 so that pieces it does not explain are no errors of the flow."""
-MEDIAN_PIXELS, LEAST_SCALE = 3000, 0.02
-"""Pixels of a fit of the least median error, and the least scale of its refinement, pixels."""
 
 
-def surface_motions(
-    views: Views, seg: Segmentation, surface: Int, residual: Float, usable: Mask, o: SeededStart
-) -> tuple[list[Motion], Mask]:
-    """The best rigid motion of each surface that does not bend, and which surfaces bend.
+def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
+    """The best rigid motion of each surface (N,) that does not bend, and which surfaces bend.
 
     A surface bends if under every rigid motion the median excess of its superpixels' error over the
     residual of an affine flow of their own is above the flow's systematic error plus `NOISES` times
@@ -196,89 +193,46 @@ def surface_motions(
     `LEAST_SHARE`, and `LEAST_LEFT` superpixels: where the flow jumps little along its outline, a
     bending surface is joined to its surroundings.
 
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        seg: Superpixels and graphs.
-        surface: (N,) surface of every superpixel.
-        residual: (N,) mean error of the affine flow of every superpixel, pixels.
-        usable: (N,) True where the flow counts.
-        o: Numbers, inlier distance and seed.
-
     Returns:
         The motions that many pixels share and those of the surfaces, and (N,) True where the
         surface bends.
     """
-    noise = reference_noise(residual)
+    seg, views, usable = flow.seg, flow.views, flow.views.usable
+    noise = reference_noise(flow.residual)
     most = systematic_error(noise) + NOISES * noise
-    motions = dominant(views, o)
+    motions = dominant(flow)
     label = np.argmin(views.fit(motions).penalised(), axis=1)
     whole = surface[seg.pairs[:, 0]] == surface[seg.pairs[:, 1]]
-    surface = joined(surface, usable, seg)
+    surface = joined(flow, surface)
     bends = np.zeros(len(seg), bool)
     left = [np.flatnonzero(surface == c) for c in np.unique(surface[usable])]
     while left:
         members = left.pop()
         at = members[usable[members]]
         present = [motions[c] for c in np.unique(label[at])]
-        tried = candidates(views, at, motions[0], present, noise, o.seed)
-        candidate_count = len(tried)
-        tried += _least_median(views, at, noise, o)
-        excess = views.subset(at).fit(tried).cost - residual[at, None]
+        tried = candidates(flow, at, motions[0], present, noise)
+        # RANSAC has an inlier distance, within which a compromise with the bending part has more
+        # inliers than the motion of the least median error
+        matches, median = views.matches(at, FIT_PIXELS), []
+        r, q, _, focal = matches
+        if (motion := essential_motion(r, q, focal, None, flow.options.seed)) is not None:
+            median = [refine_near(motion, *matches, max(noise, LEAST_SCALE))]
+        excess = views.subset(at).fit(tried + median).cost - flow.residual[at, None]
         middle = np.median(excess, axis=0)
         # where many motions explain half of a surface badly, the one of least median is chance
-        middle[candidate_count:][middle[candidate_count:] > SURELY * most] = np.inf
-        best = int(np.argmin(middle))
-        bends[members] = middle[best] > most
-        if bends[members[0]]:
+        chance = (np.arange(len(middle)) >= len(tried)) & (middle > SURELY * most)
+        best = int(np.argmin(np.where(chance, np.inf, middle)))
+        if middle[best] > most:
+            bends[members] = True
             continue
-        motions.append(tried[best])
+        motions.append((tried + median)[best])
         if middle[best] > SURELY * most:
             continue
         # large pieces that the motion does not explain are surfaces of their own
         unexplained = np.zeros(len(seg), bool)
         unexplained[at[excess[:, best] > most]] = True
         piece = connected_pieces(unexplained, seg, whole)
-        left += [
-            np.flatnonzero(piece == c)
-            for c in np.unique(piece[unexplained])
-            if np.sum(piece == c) >= max(LEAST_SHARE * len(seg), LEAST_LEFT)
-        ]
+        sizes = np.bincount(piece[unexplained], minlength=1)
+        large = np.flatnonzero(sizes >= max(LEAST_SHARE * len(seg), LEAST_LEFT))
+        left += [np.flatnonzero(piece == c) for c in large]
     return motions, bends
-
-
-def _least_median(views: Views, at: Int, noise: float, o: SeededStart) -> list[Motion]:
-    """The motion with the least median error on superpixels `at`, refined, if there is one.
-
-    RANSAC has an inlier distance, within which a compromise with the bending part has more inliers.
-    """
-    step = max(1, len(at) * views.ray.shape[1] // MEDIAN_PIXELS)
-    r, q = (v[at].reshape(-1, 3)[::step] for v in (views.ray, views.target))
-    motion = essential_motion(r, q, views.focal[0], None, o.seed)
-    if motion is None:
-        return []
-    weight = views.weight[at].ravel()[::step]
-    return [refine_near(motion, r, q, weight, views.focal[0], max(noise, LEAST_SCALE))]
-
-
-def joined(surface: Int, usable: Mask, seg: Segmentation) -> Int:
-    """(N,) surfaces; those with too few usable superpixels are joined to a neighbour.
-
-    The smallest joins the neighbour with the longest common outline, until each has `LEAST_SHARE`.
-    """
-    surface, (i, k) = surface.copy(), seg.pairs.T
-    length = seg.boundary_length.astype(float)
-    alone: set[int] = set()
-    while True:
-        count = np.bincount(surface, usable)
-        small = [
-            c for c in np.unique(surface) if count[c] < LEAST_SHARE * len(seg) and c not in alone
-        ]
-        if not small:
-            return surface
-        c = min(small, key=lambda c: (count[c], c))
-        beside = np.where(surface[i] == c, surface[k], surface[i])
-        outline = ((surface[i] == c) != (surface[k] == c)) * length
-        if not outline.any():
-            alone.add(c)
-            continue
-        surface[surface == c] = np.argmax(np.bincount(beside, outline))

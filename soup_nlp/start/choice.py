@@ -7,13 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.components import connected_pieces
 from soup_nlp.start.epipolar import Motion, estimate, fit_translation, repeated
-from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import Views
+from soup_nlp.start.views import FlowFit, Views
 
 CLIP = 3.0
 """Errors are clipped at this many pixels where motions are compared."""
@@ -33,31 +31,18 @@ def least_gain(noise: float) -> float:
     return max(2 * noise, UNEXPLAINED_PX)
 
 
-def dominant(views: Views, o: SeededStart) -> list[Motion]:
-    """Motions that many pixels share, the most frequent first; at least one.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        o: Inlier distance and seed.
-    """
-    rng = np.random.default_rng(o.seed)
-    r, q = views.ray.reshape(-1, 3), views.target.reshape(-1, 3)
-    w = views.weight.ravel()
+def dominant(flow: FlowFit) -> list[Motion]:
+    """Motions that many pixels share, the most frequent first; at least one."""
+    seed = flow.options.seed
+    r, q, w, focal = flow.views.matches()
     good = np.flatnonzero(w > 0.3 * w.max())
+    rng = np.random.default_rng(seed)
     pick = good if len(good) <= 6000 else rng.choice(good, 6000, replace=False)
-    motions = repeated(
-        r[pick],
-        q[pick],
-        w[pick],
-        views.focal[0],
-        count=DOMINANT,
-        threshold=o.threshold_px,
-        seed=o.seed,
-    )
-    if not motions:
-        # nothing determines a motion (no flow at all): a sideways camera keeps depth defined
-        motions = [Motion(np.eye(3), np.array([1.0, 0.0, 0.0]))]
-    return motions
+    threshold = flow.options.threshold_px
+    matches = r[pick], q[pick], w[pick], focal
+    motions = repeated(*matches, count=DOMINANT, threshold=threshold, seed=seed)
+    # nothing determines a motion (no flow at all): a sideways camera keeps depth defined
+    return motions or [Motion(np.eye(3), np.array([1.0, 0.0, 0.0]))]
 
 
 LEAST_NOISE, MOST_NOISE = 0.05, 0.6
@@ -69,41 +54,30 @@ def limited_noise(error: Float) -> float:
     return float(np.clip(np.median(error), LEAST_NOISE, MOST_NOISE))
 
 
-def of_pieces(
-    views: Views,
-    seg: Segmentation,
-    motions: list[Motion],
-    cost: Float,
-    noise: float,
-    o: SeededStart,
-) -> list[Motion]:
+def of_pieces(flow: FlowFit, motions: list[Motion], cost: Float, noise: float) -> list[Motion]:
     """Motions of the connected pieces whose flow the present motions do not explain.
 
     A piece gets two candidates: the motion of its own essential matrix, and a translation with the
     main rotation, because a small patch determines a translation better than a whole motion.
 
     Args:
-        views: Rays, targets and confidence of every superpixel.
-        seg: Superpixels and graphs.
+        flow: The flow of every superpixel.
         motions: The present M motions; the first has the main rotation.
         cost: (N, M) penalised error under them, pixels.
         noise: Flow noise, pixels.
-        o: Seed.
     """
     bad = cost.min(axis=1) > max(3 * noise, UNEXPLAINED_PX)
-    bad &= views.weight.mean(axis=1) > 0.3
-    piece = connected_pieces(bad, seg)
+    bad &= flow.views.weight.mean(axis=1) > 0.3
+    piece = connected_pieces(bad, flow.seg)
     out: list[Motion] = []
     sizes = np.bincount(piece[piece >= 0], minlength=1)
     for c in np.argsort(-sizes)[:PIECES]:
         if sizes[c] < PIECE_SIZE:
             break
-        members = piece == c
-        r, q = views.ray[members].reshape(-1, 3), views.target[members].reshape(-1, 3)
-        flow = r, q, views.weight[members].ravel(), views.focal[0]
-        motion = estimate(*flow, max(3 * noise, 0.3), o.seed)
+        matches = flow.views.matches(np.flatnonzero(piece == c))
+        motion = estimate(*matches, max(3 * noise, 0.3), flow.options.seed)
         out += [] if motion is None else [motion]
-        out.append(fit_translation(motions[0].R, *flow, max(noise, 0.1)))
+        out.append(fit_translation(motions[0].R, *matches, max(noise, 0.1)))
     return out
 
 
@@ -120,53 +94,45 @@ def select(cost: Float, noise: float) -> list[int]:
         Kept columns, the best motion first.
     """
     clipped = np.minimum(cost, CLIP)
-    gain = least_gain(noise)
     kept = [int(np.argmin(clipped.sum(axis=0)))]
     while len(kept) < clipped.shape[1]:
         best = clipped[:, kept].min(axis=1)
-        better = np.maximum(best[:, None] - clipped - gain, 0.0)
-        total = better.sum(axis=0)
-        c = int(np.argmax(total))
+        better = np.maximum(best[:, None] - clipped - least_gain(noise), 0.0)
+        c = int(np.argmax(better.sum(axis=0)))
         if np.sum(better[:, c] > 0) < PIECE_SIZE:
             break
         kept.append(c)
     return kept
 
 
-def smooth_choice(cost: Float, near: Float, seg: Segmentation, price: float) -> Int:
+def smooth_choice(flow: FlowFit, cost: Float, price: float) -> Int:
     """Labels that minimise the costs plus `price` where neighbours differ, by TRW-S.
 
     A superpixel that differs from all its neighbours pays about twice the price. The weight of a
     neighbour is its share of the outlines times its affinity.
 
     Args:
+        flow: The flow of every superpixel.
         cost: (N, M) cost of each superpixel under each label, pixels; +inf forbids one.
-        near: (P,) affinity of two neighbours, 0 to 1.
-        seg: Superpixels and graphs.
         price: Price of two different labels, pixels.
 
     Returns:
         (N,) label of every superpixel.
     """
-    n, m = cost.shape
+    (n, m), seg = cost.shape, flow.seg
     if m == 1 or not len(seg.pairs):
         return np.argmin(cost, axis=1)
     i, k = seg.pairs.T
     length = seg.boundary_length.astype(float)
     outline = np.bincount(i, length, n) + np.bincount(k, length, n)
-    weight = price * near * length * (1 / outline[i] + 1 / outline[k])
+    weight = price * flow_affinity(flow) * length * (1 / outline[i] + 1 / outline[k])
     tables = weight[:, None, None] * (1 - np.eye(m))
     return solve_trws(cost, seg.pairs, tables, max_iter=50).labels
 
 
-def flow_affinity(jump: Float, o: SeededStart) -> Float:
-    """(P,) affinity of two neighbours: 1 where their flow is continuous, towards 0 where it jumps.
-
-    Args:
-        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
-        o: Jump at which a surface ends.
-    """
-    return np.exp(-2 * jump / o.discontinuity_px)
+def flow_affinity(flow: FlowFit) -> Float:
+    """(P,) affinity of two neighbours: 1 where their flow is continuous, towards 0 at jumps."""
+    return np.exp(-2 * flow.jump / flow.options.discontinuity_px)
 
 
 @dataclass(frozen=True)
@@ -177,19 +143,21 @@ class Choice:
         motions: Motions, the most frequent first (`Choice.of`).
         label: (N,) index of the motion of every superpixel.
         fit: Planes (N, 1) under these motions.
+        noise: Noise of the flow under all candidate motions, pixels.
     """
 
     motions: list[Motion]
     label: Int
     fit: PlaneFit
+    noise: float
 
     @classmethod
-    def of(cls, views: Views, motions: list[Motion], label: Int) -> Choice:
+    def of(cls, views: Views, motions: list[Motion], label: Int, noise: float) -> Choice:
         """Motions by indices (N,), which are numbered by frequency, and their planes."""
         used, inverse, count = np.unique(label, return_inverse=True, return_counts=True)
         order = np.argsort(-count, kind="stable")
         motions, label = [motions[c] for c in used[order]], np.argsort(order)[inverse.ravel()]
-        return cls(motions, label, views.fit(motions, label))
+        return cls(motions, label, views.fit(motions, label), noise)
 
     @property
     def error(self) -> Float:
@@ -207,36 +175,27 @@ class Choice:
         return np.clip(alone - self.error, 0.0, CLIP) * views.weight.mean(axis=1)
 
 
-def rigid_choice(
-    views: Views, seg: Segmentation, jump: Float, motions: list[Motion], o: SeededStart
-) -> tuple[Choice, float]:
+def rigid_choice(flow: FlowFit, motions: list[Motion]) -> Choice:
     """One of few rigid motions for every superpixel.
 
     Args:
-        views: Rays, targets and confidence of every superpixel.
-        seg: Superpixels and graphs.
-        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
+        flow: The flow of every superpixel.
         motions: Candidates for the whole image; those of unexplained pieces are added.
-        o: Price of differing neighbours, where a surface ends, and seed.
-
-    Returns:
-        The choice, and the noise of the flow, pixels.
     """
-    with_flow = views.weight.any(axis=1)
+    with_flow = flow.views.weight.any(axis=1)
     for extend in range(ROUNDS + 1):
-        fit = views.fit(motions)
+        fit = flow.views.fit(motions)
         cost = fit.penalised()
         kept = select(cost, limited_noise(cost.min(axis=1)[with_flow]))
-        motions, fit, cost = [motions[c] for c in kept], fit.columns(kept), cost[:, kept]
+        motions, cost = [motions[c] for c in kept], cost[:, kept]
         noise = limited_noise(cost.min(axis=1)[with_flow])
         # motions of the pieces that no motion explains yet
-        extra = of_pieces(views, seg, motions, cost, noise, o) if extend < ROUNDS else []
+        extra = of_pieces(flow, motions, cost, noise) if extend < ROUNDS else []
         if not extra:
             break
         motions = motions + extra
     # the dominant motion is preferred where another is not clearly better
     prefer = np.where(np.arange(len(motions)) == 0, 0.0, max(noise, 0.5 * UNEXPLAINED_PX))
     # beyond 5 pixels one motion is as wrong as another
-    cost = np.minimum(cost + prefer, 5.0)
-    label = smooth_choice(cost, flow_affinity(jump, o), seg, o.smoothness)
-    return Choice.of(views, motions, label), noise
+    label = smooth_choice(flow, np.minimum(cost + prefer, 5.0), flow.options.smoothness)
+    return Choice.of(flow.views, motions, label, noise)

@@ -27,6 +27,11 @@ def connected_labels(hold: Mask, seg: Segmentation) -> Int:
     return connected(seg.pairs[hold], len(seg))
 
 
+def numbered(label: Int) -> Int:
+    """(N,) indices in the same order, without gaps in their numbers."""
+    return np.unique(label, return_inverse=True)[1].ravel()
+
+
 def largest(label: Int) -> int:
     """The most frequent of indices (N,): of components the largest one, the background."""
     return int(np.argmax(np.bincount(label)))

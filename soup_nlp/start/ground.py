@@ -12,13 +12,25 @@ lower border is far behind it.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import GROUND, connected_pieces, largest, outlines, quantile
+from soup_nlp.start.components import (
+    FIXED,
+    GROUND,
+    TIES,
+    connected_pieces,
+    largest,
+    numbered,
+    outlines,
+    quantile,
+)
+from soup_nlp.start.views import FlowFit
 
 LEVEL = 0.92
 """Least cosine between the normal of the ground and the vertical of the image."""
@@ -172,3 +184,32 @@ def floating(
         if behind and above > FLOATS and off > STEP:
             out.append((mine, float(np.exp(above))))
     return out
+
+
+def on_ground(
+    flow: FlowFit, soup: Soup, reliable: Mask, component: Int, tie: Int
+) -> tuple[Soup, Int, Int, Float]:
+    """Soup, components and ties (N,) with what is below the ground lifted and what floats lowered.
+
+    Args:
+        flow: The flow of every superpixel.
+        soup: Start, its components scaled.
+        reliable: (N,) True where the depth is reliable.
+        component: (N,) group that moves as one.
+        tie: (N,) origin of its scale, an index of `TIES`.
+
+    Returns:
+        Soup, components, ties and (N,) inverse depth of the ground, see `ground`.
+    """
+    anchor, area = flow.views.anchor, flow.seg.sizes.astype(float)
+    reliable = reliable & (component == largest(component))
+    floor = ground(1 / soup.depth_at(anchor), anchor, area, reliable, flow.options.seed)
+    soup, lifted = above_ground(soup, anchor, area, reliable, component, floor)
+    tie = np.where(lifted & (tie != FIXED), TIES.index("ground"), tie)
+    lam, component = soup.lam.copy(), component.copy()
+    for region, farther in floating(soup, flow.seg, flow.K_ref, floor, component):
+        # at the depth of the ground its flow shows a motion of its own
+        lam[region] *= farther
+        component[region] = component.max() + 1
+        tie[region] = TIES.index("contact below")
+    return replace(soup, lam=lam), numbered(component), tie, floor

@@ -17,18 +17,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, at_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.epipolar import Motion, essential_motion, sampson
-from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import Views
+from soup_nlp.start.views import LEAST_PIXELS, FlowFit, Views
 
-LEAST_PIXELS = 8
-"""Least number of correspondences of a homography."""
 MOST_PIXELS = 400
 """Largest number of correspondences to which a motion is fitted."""
 JUDGES = 6
@@ -54,34 +49,28 @@ class Patch(NamedTuple):
     m: Float
 
 
-def unorganised(views: Views, seg: Segmentation, o: SeededStart) -> tuple[Soup, Mask]:
+def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
     """The soup of independent superpixels with equal scales, and which of them borrowed.
-
-    Args:
-        views: Rays and targets of every superpixel.
-        seg: Superpixels and graphs.
-        o: Neighbours of a motion, inlier distance, seed.
 
     Returns:
         The soup, not normalised, and (N,) True where the result of another superpixel was taken.
     """
-    patches = [_patch(views, seg, i, o) for i in range(len(seg))]
+    seg, anchor = flow.seg, flow.views.anchor
+    patches = [_patch(flow, i) for i in range(len(seg))]
     fails = np.array([p is None for p in patches])
-    source = np.arange(len(seg))
-    if fails.any() and not fails.all():
-        good = np.flatnonzero(~fails)
-        source[fails] = good[cKDTree(seg.anchors[good]).query(seg.anchors[fails])[1]]
+    source = np.arange(len(seg)) if fails.all() else seg.nearest(~fails)
     sideways = Patch(Motion(np.eye(3), np.array([1.0, 0.0, 0.0])), np.array([0.0, 0.0, 1.0]))
     sources = [patches[s] or sideways for s in source]
     R, t = (np.stack([getattr(p.motion, name) for p in sources]) for name in ("R", "t"))
     # a borrowed plane keeps depth and slopes, since at this anchor it may be behind the camera
-    depth, slope = at_anchor(np.stack([p.m for p in sources]), views.anchor[source])
-    n, D = normal_and_distance(about_anchor(np.ones(len(seg)), slope, views.anchor))
+    depth, slope = at_anchor(np.stack([p.m for p in sources]), anchor[source])
+    n, D = normal_and_distance(about_anchor(np.ones(len(seg)), slope, anchor))
     return Soup(np.ones(len(seg)), n, D, R, t / depth[:, None]), fails
 
 
-def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | None:
+def _patch(flow: FlowFit, i: int) -> Patch | None:
     """Motion and plane of a superpixel; None if its flow does not determine them."""
+    views, knn, o = flow.views, flow.seg.knn[i], flow.options
     inside = matches(views, np.array([i]))
     if len(inside.ray) < LEAST_PIXELS:
         return None
@@ -91,9 +80,9 @@ def _patch(views: Views, seg: Segmentation, i: int, o: SeededStart) -> Patch | N
         choices = [] if H is None else in_front(H, seen)
         if len(choices) < 2:
             return choices[0] if choices else None
-        around = matches(views, seg.knn[i, :JUDGES])
+        around = matches(views, knn[:JUDGES])
         return choices[int(np.argmin([epipolar_error(c.motion, around, focal) for c in choices]))]
-    around = matches(views, np.append(i, seg.knn[i, : o.motion_neighbours]))
+    around = matches(views, np.append(i, knn[: o.motion_neighbours]))
     motion = essential_motion(around.ray, around.target, focal, o.threshold_px, o.seed)
     if motion is None:
         return None

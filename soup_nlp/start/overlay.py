@@ -17,8 +17,7 @@ from soup_nlp.start.choice import PIECE_SIZE, dominant
 from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import BELOW, ground
-from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import LEAST_PARALLAX_PX, Views
+from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
 
 STILL_PX = 1.0
 """Mean displacement up to which a superpixel may stand still, pixels: it may reflect movers."""
@@ -31,49 +30,40 @@ LEAST_SHARE = 0.5
 """Least share of still superpixels in a piece with continuous flow."""
 
 
-def fixed_to_camera(
-    views: Views, seg: Segmentation, jump: Float, o: SeededStart
-) -> tuple[Mask, Float]:
+def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     """(N,) True where the image stands still, which the camera's motion contradicts.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        seg: Superpixels and graphs.
-        jump: (P,) pixels by which the flow of two neighbours differs on their boundary.
-        o: Inlier distance, seed, where a surface ends, and whether there may be ground.
 
     Returns:
         The mask, and (N,) the mean displacement of every superpixel, pixels.
     """
-    none, usable = np.zeros(len(seg), bool), views.usable
-    shift = views.distance(views.ray)
+    seg, views, usable = flow.seg, flow.views, flow.views.usable
+    none, shift = np.zeros(len(seg), bool), views.distance(views.ray)
     may = usable & (shift < STILL_PX)
     if may.sum() < PIECE_SIZE:
         return none, shift
-    camera = dominant(views.without(may | ~usable), o)[0]
-    error = _error_under(camera, views, seg, usable & ~may, o)
+    camera = dominant(flow.without(may | ~usable))[0]
+    error = _error_under(flow, camera, usable & ~may)
     if (error[usable] < CONTRADICTED_PX).sum() < LEAST_SCENE * usable.sum():
         return none, shift
     may &= error - shift > CONTRADICTED_PX
     moves = ~usable | (error > CONTRADICTED_PX)
-    i, k = seg.pairs.T
-    piece = connected_labels(moves[i] & moves[k] & (jump < o.discontinuity_px), seg)
+    continuous = flow.jump < flow.options.discontinuity_px
+    piece = connected_labels(moves[seg.pairs].all(axis=1) & continuous, seg)
     count, still_count = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
     core = may & ((still_count >= PIECE_SIZE) & (still_count >= LEAST_SHARE * count))[piece]
     return core | (moves & towards_border(core, seg)), shift
 
 
-def _error_under(
-    camera: Motion, views: Views, seg: Segmentation, reliable: Mask, o: SeededStart
-) -> Float:
+def _error_under(flow: FlowFit, camera: Motion, reliable: Mask) -> Float:
     """(N,) mean error, pixels, of the best depth up to infinity, or up to that of the ground."""
+    views, o = flow.views, flow.options
     fit = views.fit([camera])
     mu, error = fit.inverse_depth[:, 0], fit.penalised()[:, 0]
     if not (o.upright and o.ground):
         return error
     reliable = reliable & (error < CONTRADICTED_PX) & (mu > 0)
     reliable &= fit.parallax[:, 0] * np.abs(mu) > LEAST_PARALLAX_PX
-    floor = ground(mu, views.anchor, seg.sizes.astype(float), reliable, o.seed)
+    floor = ground(mu, views.anchor, flow.seg.sizes.astype(float), reliable, o.seed)
     least = (1 - BELOW) * floor
     moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t
     return np.where(mu < least, np.maximum(error, views.distance(moved)), error)

@@ -2,33 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.data.pair import Flow
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import (
-    constant_depth,
-    reference_noise,
-    surface_motions,
-    surfaces,
-    turn_alone,
-)
-from soup_nlp.start.choice import LEAST_NOISE, Choice, limited_noise, rigid_choice
+from soup_nlp.start.bending import constant_depth, surface_motions, surfaces, turn_alone
+from soup_nlp.start.choice import CLIP, LEAST_NOISE, Choice, limited_noise, rigid_choice
 from soup_nlp.start.components import (
-    FIXED,
-    TIES,
     borrow,
     connected_labels,
     connected_pieces,
     contact_scales,
     largest,
+    numbered,
 )
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.ground import above_ground, floating, ground
+from soup_nlp.start.ground import on_ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import earned, gather, unmoved
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
@@ -36,7 +27,7 @@ from soup_nlp.start.settle import settle
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import LEAST_PARALLAX_PX, USABLE, FlowFit, Views
 
-__all__ = ["SeededStart", "Start", "propose"]
+__all__ = ["FlowFit", "SeededStart", "Start", "propose"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,108 +88,115 @@ class Start:
 
     __repr__ = __str__
 
+    @classmethod
+    def whole(cls, views: Views, soup: Soup, error: Float, borrowed: Mask, noise: float) -> Start:
+        """A start whose only component and surface is the whole image, without shared motions."""
+        zero, none = np.zeros(len(soup), np.int64), np.zeros(len(soup), bool)
+        return cls(
+            soup=soup,
+            error=error,
+            parallax=views.parallax(soup),
+            borrowed=borrowed,
+            motion=zero - 1,
+            component=zero,
+            part=zero,
+            motions=[],
+            surface=zero,
+            tie=zero,
+            grounded=none,
+            bends=none,
+            wrong=none,
+            noise=noise,
+        )
+
     @property
     def bending(self) -> bool:
         """Whether a region bends."""
         return bool(self.bends.any())
 
 
-def propose(
-    seg: Segmentation,
-    flow: Flow,
-    K_ref: Float,
-    K_next: Float,
-    options: SeededStart | None = None,
-    fitted: FlowFit | None = None,
-) -> Start:
-    """Rotation, translation, plane and scale of every superpixel from its flow.
-
-    Args:
-        seg: Superpixels and graphs.
-        flow: Flow with confidence.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        K_next: (3, 3) intrinsics of the next frame.
-        options: See SeededStart.
-        fitted: The flow as affine maps; computed without it.
-
-    Raises:
-        DataError: fewer than 8 pixels have a usable flow.
-    """
-    o = options or SeededStart()
-    fitted = fitted or FlowFit.of(seg, flow, K_ref, K_next, o)
-    views, poor, _, residual, jump = fitted
+def propose(flow: FlowFit) -> Start:
+    """Rotation, translation, plane and scale of every superpixel from its flow."""
+    seg, views, o = flow.seg, flow.views, flow.options
     if o.method == "homography":
-        return _of_homographies(views, seg, o)
+        soup, borrowed = unorganised(flow)
+        soup = soup.normalised()
+        error = views.distance(soup.moved(soup.points(views.ray)))
+        return Start.whole(views, soup, error, borrowed, limited_noise(error))
     fixed, shift = np.zeros(len(seg), bool), np.zeros(len(seg))
-    if np.array_equal(K_ref, K_next):
-        fixed, shift = fixed_to_camera(views, seg, jump, o)
-    views, poor = views.without(fixed), poor | fixed
-    surface = surfaces(jump, seg, o.discontinuity_px)
-    usable, centre = views.usable, fitted.centre
-    motions, bends = surface_motions(views, seg, surface, residual, usable, o)
+    if np.array_equal(flow.K_ref, flow.K_next):
+        fixed, shift = fixed_to_camera(flow)
+    flow = flow.without(fixed)
+    surface = surfaces(flow)
+    motions, bends = surface_motions(flow, surface)
     bends &= o.bending
-    choice, noise = rigid_motions(views, seg, jump, motions, o)
-    turn = turn_alone(views, choice, usable, reference_noise(residual))
+    choice = gather(flow, rigid_choice(flow, motions))
+    turn = turn_alone(flow, choice)
     if turn is not None or bends.all():
-        return _constant(views, surface, choice, limited_noise(residual), turn)
-    free = constant_depth(views)
+        soup, error = constant_depth(flow.views, turn)
+        every = np.ones(len(seg), bool)
+        start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
+        at_rest = turn is not None
+        return replace(start, motions=choice.motions, surface=surface, bends=every, at_rest=at_rest)
+    rigid = flow.without(bends)
     if bends.any():
         # the flow of bending regions is no evidence of the motions of rigid ones
-        views, poor = views.without(bends), poor | bends
-        choice, noise = rigid_motions(views, seg, jump, motions, o)
+        choice = gather(rigid, rigid_choice(rigid, motions))
     else:
-        surface = connected_labels(jump < o.discontinuity_px, seg)
-    choice, wrong = earned(views, choice, seg, noise)
-    weight = np.where(usable & ~bends, 1.0, 0.0)
-    choice = settle(views, choice, centre, weight, limited_noise(residual))
-    soup, weak = _with_depth(choice, views, poor | wrong, seg)
-    label, parallax = choice.label, choice.parallax
-    component, error = label, choice.fit.cost[:, 0]
-    at_camera = Soup(soup.lam, soup.n, soup.d, 0 * soup.R + np.eye(3), 0 * soup.t)
-    for mask, made, miss in ((bends, *free), (fixed, at_camera, shift)):
+        surface = connected_labels(flow.jump < o.discontinuity_px, seg)
+    choice, wrong = earned(rigid, choice)
+    choice = settle(rigid, choice)
+    soup, weak = _with_depth(rigid, choice, wrong)
+    label = component = choice.label
+    error, parallax = choice.fit.cost[:, 0], choice.parallax
+    at_camera = replace(soup, R=0 * soup.R + np.eye(3), t=0 * soup.t)
+    for mask, made, miss in ((bends, *constant_depth(flow.views)), (fixed, at_camera, shift)):
         if mask.any():
             soup, error = soup.taking(made, mask), np.where(mask, miss, error)
-            parallax = np.where(mask, views.parallax(made), parallax)
+            parallax = np.where(mask, rigid.views.parallax(made), parallax)
             label = np.where(mask, -1, label)
-            component = with_regions(component, mask, seg)
-    wrong |= fixed & (shift > STILL_PX)
-    scale, tie = contact_scales(soup, component, seg, K_ref, o.upright, fixed, usable)
-    soup = Soup(soup.lam * scale, soup.n, soup.d, soup.R, soup.t)
+            # each connected region of the mask is a component
+            regions = component.max() + 1 + connected_pieces(mask, seg)
+            component = numbered(np.where(mask, regions, component))
+    usable = flow.views.usable
+    scale, tie = contact_scales(soup, component, seg, flow.K_ref, o.upright, fixed, usable)
+    soup = replace(soup, lam=soup.lam * scale)
     grounded = np.zeros(len(seg), bool)
     if o.upright and o.ground:
-        reliable = ~weak & views.usable
-        ground_input = views.anchor, seg, K_ref, reliable, component, tie, o
-        soup, component, tie, floor = _on_ground(soup, *ground_input)
+        soup, component, tie, floor = on_ground(
+            flow, soup, ~weak & rigid.views.usable, component, tie
+        )
         grounded = weak & (floor > 0)
-    soup = soup.normalised()
-    moved = (centre - views.anchor)[:, :2] * views.focal
-    mixed = unmoved(component, choice, moved, usable, views, seg) & ~(fixed | bends)
-    part = moving_parts(np.where(mixed, largest(component), component), views, seg, fixed | bends)
-    fields = soup, error, parallax, weak, label, component, part
-    all_fields = *fields, choice.motions, surface, tie, grounded, bends
-    return Start(*all_fields, wrong & ~bends, noise=limited_noise(error[~bends]))
+    mixed = unmoved(flow, choice, component) & ~(fixed | bends)
+    return Start(
+        soup=soup.normalised(),
+        error=error,
+        parallax=parallax,
+        borrowed=weak,
+        motion=label,
+        component=component,
+        part=moving_parts(rigid, np.where(mixed, largest(component), component), fixed | bends),
+        motions=choice.motions,
+        surface=surface,
+        tie=tie,
+        grounded=grounded,
+        bends=bends,
+        wrong=(wrong | fixed & (shift > STILL_PX)) & ~bends,
+        noise=limited_noise(error[~bends]),
+    )
 
 
-def rigid_motions(
-    views: Views, seg: Segmentation, jump: Float, motions: list[Motion], o: SeededStart
-) -> tuple[Choice, float]:
-    """One of few rigid motions for every superpixel, and the noise of the flow, pixels."""
-    choice, noise = rigid_choice(views, seg, jump, motions, o)
-    return gather(views, seg, jump, choice, noise, o), noise
-
-
-def _with_depth(choice: Choice, views: Views, poor: Mask, seg: Segmentation) -> tuple[Soup, Mask]:
+def _with_depth(flow: FlowFit, choice: Choice, wrong: Mask) -> tuple[Soup, Mask]:
     """Planes under the chosen motions, and (N,) True where they are borrowed from neighbours.
 
     Args:
+        flow: The flow of every superpixel.
         choice: Motion and plane of every superpixel.
-        views: Rays, targets and confidence of every superpixel.
-        poor: (N,) True where the views are a neighbour's or have no confidence.
-        seg: Superpixels and graphs.
+        wrong: (N,) True where the motion does not explain the flow.
     """
-    fit, parallax = choice.fit, choice.parallax
+    fit, parallax, views = choice.fit, choice.parallax, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
-    weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | (fit.cost[:, 0] > 3.0) | poor
+    weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | (fit.cost[:, 0] > CLIP) | flow.poor | wrong
     weak |= views.weight.sum(axis=1) < 2.0
     if weak.all():
         # where all parallax is little, it is used as long as it exceeds rounding
@@ -206,32 +204,15 @@ def _with_depth(choice: Choice, views: Views, poor: Mask, seg: Segmentation) -> 
     if weak.all():
         # no depth is known: all depths are one, with translations that move the image as before
         length = np.where(mu > 0, mu, 0.0)
-        mu, slope = np.ones(len(seg)), np.zeros((len(seg), 2))
+        mu, slope = np.ones(len(mu)), np.zeros((len(mu), 2))
     else:
-        length = np.ones(len(seg))
-        mu, slope = borrow(mu, slope, choice.label, weak, seg)
+        length = np.ones(len(mu))
+        mu, slope = borrow(mu, slope, choice.label, weak, flow.seg)
     R, t = (np.stack([getattr(m, v) for m in choice.motions])[choice.label] for v in ("R", "t"))
     return views.soup(mu, slope, R, t * length[:, None]), weak
 
 
-def _constant(
-    views: Views, surface: Int, choice: Choice, noise: float, turn: Float | None
-) -> Start:
-    """Start without relief, where everything bends or the camera is at rest (`turn` is given)."""
-    soup, error = constant_depth(views, turn)
-    zero, everywhere = np.zeros(len(surface), np.int64), np.ones(len(surface), bool)
-    fields = soup, error, views.parallax(soup), everywhere, zero - 1, zero, zero
-    all_fields = *fields, choice.motions, surface, zero, ~everywhere, everywhere
-    return Start(*all_fields, ~everywhere, at_rest=turn is not None, noise=noise)
-
-
-def with_regions(component: Int, mask: Mask, seg: Segmentation) -> Int:
-    """(N,) components without gaps in their numbers; each connected region of a mask is one."""
-    component = np.where(mask, component.max() + 1 + connected_pieces(mask, seg), component)
-    return np.unique(component, return_inverse=True)[1].ravel()
-
-
-def moving_parts(component: Int, views: Views, seg: Segmentation, kept: Mask) -> Int:
+def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
     """(N,) component of every superpixel, the largest one in pieces without usable flow.
 
     A part that leaves the image or is hidden has the same wrong flow over several superpixels. As a
@@ -239,60 +220,17 @@ def moving_parts(component: Int, views: Views, seg: Segmentation, kept: Mask) ->
     Beside a piece that does move it is taken to be part of that piece.
 
     Args:
+        flow: The flow of every superpixel.
         component: (N,) rigid component of every superpixel.
-        views: Confidence of the flow of every superpixel.
-        seg: Superpixels and graphs.
         kept: (N,) True in components that stay.
     """
     main = largest(component)
-    i, k = seg.pairs.T
+    i, k = flow.seg.pairs.T
     same = component[i] == component[k]
-    piece = connected_labels(same, seg)
-    weight = np.bincount(piece, views.weight.mean(axis=1)) / np.bincount(piece)
+    piece = connected_labels(same, flow.seg)
+    weight = np.bincount(piece, flow.views.weight.mean(axis=1)) / np.bincount(piece)
     moves = kept | ((component != main) & (weight >= USABLE)[piece])
     beside = np.zeros(len(weight), bool)
     for first, second in ((i, k), (k, i)):
         beside[piece[first[~same & moves[second]]]] = True
     return np.where(moves | beside[piece], component, main)
-
-
-def _of_homographies(views: Views, seg: Segmentation, o: SeededStart) -> Start:
-    """The paper's initialisation, which has no components: all superpixels are one."""
-    soup, borrowed = unorganised(views, seg, o)
-    soup = soup.normalised()
-    error = views.distance(soup.moved(soup.points(views.ray)))
-    parallax, whole = views.parallax(soup), np.zeros(len(seg), np.int64)
-    noise = limited_noise(error)
-    none = np.zeros(len(seg), bool)
-    fields = soup, error, parallax, borrowed, whole - 1, whole, whole
-    return Start(*fields, [], whole, whole, none, none, none, noise=noise)
-
-
-def _on_ground(
-    soup: Soup,
-    anchor: Float,
-    seg: Segmentation,
-    K_ref: Float,
-    reliable: Mask,
-    component: Int,
-    tie: Int,
-    o: SeededStart,
-) -> tuple[Soup, Int, Int, Float]:
-    """Soup, components, ties and (N,) inverse depth of the ground, see `ground`.
-
-    Superpixels below the ground are lifted, and regions that float above it are lowered.
-    """
-    reliable = reliable & (component == largest(component))
-    area = seg.sizes.astype(float)
-    floor = ground(1 / soup.depth_at(anchor), anchor, area, reliable, o.seed)
-    soup, lifted = above_ground(soup, anchor, area, reliable, component, floor)
-    tie = np.where(lifted & (tie != FIXED), TIES.index("ground"), tie)
-    lam, component = soup.lam.copy(), component.copy()
-    for region, farther in floating(soup, seg, K_ref, floor, component):
-        # at the depth of the ground its flow shows a motion of its own
-        lam[region] *= farther
-        component[region] = component.max() + 1
-        tie[region] = TIES.index("contact below")
-    # components are numbered without gaps
-    component = np.unique(component, return_inverse=True)[1].ravel()
-    return Soup(lam, soup.n, soup.d, soup.R, soup.t), component, tie, floor

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float
-from soup_nlp.start.choice import PIECE_SIZE, Choice
+from soup_nlp.start.choice import PIECE_SIZE, Choice, limited_noise
 from soup_nlp.start.epipolar import Motion, around, sampson, triangulate
-from soup_nlp.start.views import Views
+from soup_nlp.start.views import FlowFit
 
 SYSTEMATIC, MOST_SYSTEMATIC_PX = 1.5, 0.15
 """Error of the flow that is the same over large parts of the image, in units of its noise, and its
@@ -31,25 +31,18 @@ CLIP_PX = 0.3
 """Scale of the Cauchy loss of epipolar distances, pixels."""
 
 
-def settle(views: Views, choice: Choice, centre: Float, usable: Float, noise: float) -> Choice:
-    """The choice with the most probable motion of every rigid component.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        choice: Motion and plane of every superpixel.
-        centre: (N, 3) rays of the next frame to which the anchors move, by affine flow.
-        usable: (N,) weight of every superpixel; 0 where the flow is not known.
-        noise: Noise of the flow, pixels.
-    """
-    if not usable.any() or np.median(choice.error[usable > 0]) < EXACT_PX:
+def settle(flow: FlowFit, choice: Choice) -> Choice:
+    """The choice with the most probable motion of every rigid component."""
+    views, usable, motions = flow.views, flow.views.usable, list(choice.motions)
+    if not usable.any() or np.median(choice.error[usable]) < EXACT_PX:
         return choice
-    motions = list(choice.motions)
+    error = min(SYSTEMATIC * limited_noise(flow.residual), MOST_SYSTEMATIC_PX)
     for c, motion in enumerate(motions):
-        at = np.flatnonzero((choice.label == c) & (usable > 0))
+        at = np.flatnonzero((choice.label == c) & usable)
         if len(at) >= PIECE_SIZE:
-            data = views.anchor[at], centre[at], usable[at], views.focal[0]
-            motions[c] = most_probable([motion], *data, min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX))
-    return Choice.of(views, motions, choice.label)
+            data = views.anchor[at], flow.centre[at], np.ones(len(at)), views.focal[0], error
+            motions[c] = most_probable([motion], *data)
+    return Choice.of(views, motions, choice.label, choice.noise)
 
 
 def most_probable(

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.data.pair import Flow
@@ -24,6 +23,8 @@ USABLE = 0.5
 """Mean confidence above which the flow of a superpixel counts."""
 LEAST_PARALLAX_PX = 0.25
 """Parallax from which the flow of a superpixel determines its depth, pixels."""
+LEAST_PIXELS = 8
+"""Least number of usable pixels of a superpixel that has views of its own, and of an image."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +88,19 @@ class Views:
         """(N,) distance in pixels between the moved and the merely rotated anchor."""
         return np.linalg.norm(soup.parallax(self.anchor) * np.asarray(self.focal), axis=1)
 
-    def without(self, mask: Mask) -> Views:
-        """The views with confidence 0 in the superpixels of a mask (N,)."""
-        return replace(self, weight=np.where(mask[:, None], 0.0, self.weight))
+    def matches(
+        self, at: Int | None = None, most: int | None = None
+    ) -> tuple[Float, Float, Float, float]:
+        """Rays (M, 3) of both frames, confidence (M,) and focal length of superpixels `at`, or all.
+
+        Of more than `most` pixels about as many are taken, evenly.
+        """
+        ray, target, weight = (
+            v if at is None else v[at] for v in (self.ray, self.target, self.weight)
+        )
+        step = max(1, weight.size // most) if most else 1
+        r, q = (v.reshape(-1, 3)[::step] for v in (ray, target))
+        return r, q, weight.ravel()[::step], self.focal[0]
 
     def subset(self, at: Int) -> Views:
         """The views of superpixels `at`."""
@@ -97,70 +108,25 @@ class Views:
         return Views(ray, target, weight, self.anchor[at], self.radius[at], self.focal)
 
 
-def look(
-    seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
-) -> tuple[Views, Mask]:
-    """Rays and targets of sampled pixels, and (N,) True where a neighbour's are used.
-
-    Args:
-        seg: Superpixels and graphs.
-        flow: Flow with confidence.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        K_next: (3, 3) intrinsics of the next frame.
-        o: Samples and seed.
-
-    Raises:
-        DataError: fewer than 8 pixels have a usable flow.
-    """
-    width = seg.labels.shape[1]
-    index, filled = sample_pixels(seg.labels, flow, o.samples, o.seed)
-    if filled.sum() < 8:
-        raise DataError(
-            "too few pixels have a usable flow",
-            where=f"flow {flow.source}",
-            found=int(filled.sum()),
-            expected="at least 8",
-            hint="check the flow file, or lower the confidence threshold",
-        )
-    index, filled, poor = _fill_poor(seg, index, filled)
-    uv = np.stack([index % width, index // width], axis=-1).astype(float)
-    displacement = flow.uv.reshape(-1, 2)[index].astype(float)
-    weight = np.where(filled, flow.confidence.ravel()[index].astype(float), 0.0)
-    ray, target = rays(K_ref, uv), rays(K_next, uv + np.where(filled[..., None], displacement, 0.0))
-    anchor = rays(K_ref, seg.anchors)
-    rim = rays(K_ref, seg.rim)
-    radius = np.linalg.norm((rim - anchor[:, None])[..., :2], axis=-1).max(axis=1)
-    radius = np.maximum(radius, 1.0 / K_ref[0, 0])
-    focal = (float(K_next[0, 0]), float(K_next[1, 1]))
-    return Views(ray, target, weight, anchor, radius, focal), poor
-
-
-def _fill_poor(
-    seg: Segmentation, index: Int, filled: Mask, least: int = 8
-) -> tuple[Int, Mask, Mask]:
-    """Replace the samples of superpixels with few usable pixels by their nearest neighbour's."""
-    count = filled.sum(axis=1)
-    poor = count < least
-    if not poor.any() or poor.all():
-        return index, filled, poor
-    rich = np.flatnonzero(~poor)
-    _, nearest = cKDTree(seg.anchors[rich]).query(seg.anchors[poor])
-    index, filled = index.copy(), filled.copy()
-    index[poor], filled[poor] = index[rich[nearest]], filled[rich[nearest]]
-    return index, filled, poor
-
-
 class FlowFit(NamedTuple):
     """The flow of every superpixel at sampled pixels, and an affine map fitted to it.
 
     Attributes:
+        seg: Superpixels and graphs.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        K_next: (3, 3) intrinsics of the next frame.
+        options: Options of the start, with the seed.
         views: Rays, targets and confidence of every superpixel.
-        poor: (N,) True where a neighbour's views are used: too few pixels have a usable flow.
+        poor: (N,) True where the views are a neighbour's, or do not count.
         fit: (N, 3, 2) affine flow, see `affine_flow`.
         residual: (N,) its mean error, pixels.
         jump: (P,) mean difference of the affine flows of two neighbours on their boundary, pixels.
     """
 
+    seg: Segmentation
+    K_ref: Float
+    K_next: Float
+    options: SeededStart
     views: Views
     poor: Mask
     fit: Float
@@ -169,14 +135,49 @@ class FlowFit(NamedTuple):
 
     @classmethod
     def of(
-        cls, seg: Segmentation, flow: Flow, K_ref: Float, K_next: Float, o: SeededStart
+        cls,
+        seg: Segmentation,
+        flow: Flow,
+        K_ref: Float,
+        K_next: Float,
+        options: SeededStart | None = None,
     ) -> FlowFit:
-        """Fit a flow; arguments and errors are those of `look`."""
-        views, poor = look(seg, flow, K_ref, K_next, o)
-        fitted = cls(views, poor, *affine_flow(views), np.zeros(0))
+        """Sample and fit a flow with confidence.
+
+        Raises:
+            DataError: fewer than 8 pixels have a usable flow.
+        """
+        o = options or SeededStart()
+        index, filled = sample_pixels(seg.labels, flow, o.samples, o.seed)
+        if filled.sum() < LEAST_PIXELS:
+            raise DataError(
+                "too few pixels have a usable flow",
+                where=f"flow {flow.source}",
+                found=int(filled.sum()),
+                expected=f"at least {LEAST_PIXELS}",
+                hint="check the flow file, or lower the confidence threshold",
+            )
+        poor = filled.sum(axis=1) < LEAST_PIXELS
+        if not poor.all():
+            source = seg.nearest(~poor)
+            index, filled = index[source], filled[source]
+        uv = np.stack(np.divmod(index, seg.labels.shape[1])[::-1], axis=-1).astype(float)
+        shift = np.where(filled[..., None], flow.uv.reshape(-1, 2)[index].astype(float), 0.0)
+        weight = np.where(filled, flow.confidence.ravel()[index].astype(float), 0.0)
+        anchor = rays(K_ref, seg.anchors)
+        reach = (rays(K_ref, seg.rim) - anchor[:, None])[..., :2]
+        radius = np.maximum(np.linalg.norm(reach, axis=-1).max(axis=1), 1.0 / K_ref[0, 0])
+        focal = (float(K_next[0, 0]), float(K_next[1, 1]))
+        views = Views(rays(K_ref, uv), rays(K_next, uv + shift), weight, anchor, radius, focal)
+        fitted = cls(seg, K_ref, K_next, o, views, poor, *affine_flow(views), np.zeros(0))
         edge = rays(K_ref, seg.boundary)
         first, second = (fitted.followed(which, edge) for which in seg.pairs.T)
         return fitted._replace(jump=np.linalg.norm(first - second, axis=-1).mean(axis=1))
+
+    def without(self, mask: Mask) -> FlowFit:
+        """The flow without that of the superpixels of a mask (N,)."""
+        weight = np.where(mask[:, None], 0.0, self.views.weight)
+        return self._replace(views=replace(self.views, weight=weight), poor=self.poor | mask)
 
     def followed(self, which: Int, ray: Float) -> Float:
         """(M, ..., 2) targets of rays (M, ..., 3) by the affine flows of superpixels `which` (M,).
@@ -193,6 +194,11 @@ class FlowFit(NamedTuple):
         """(N, 3) rays of the next frame to which the anchors move."""
         moved = self.fit[:, 0] / self.views.focal
         return np.concatenate([moved, np.ones((len(moved), 1))], axis=1)
+
+    @property
+    def displacement(self) -> Float:
+        """(N, 2) pixels from the anchors to their targets, each from its principal point."""
+        return self.fit[:, 0] - self.views.anchor[:, :2] * self.views.focal
 
 
 def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Float, Float]:

@@ -18,6 +18,7 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.verdict import verdict
 from soup_nlp.start.propose import propose
+from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow
 
@@ -43,7 +44,7 @@ def turned(angle: float) -> np.ndarray:
 @pytest.mark.parametrize("angle", [0.0, 0.02])
 def test_a_start_without_parallax_borrows_depth_but_fits_flow(tiles, angle):
     flow = Flow(turned(angle).astype(np.float32), np.ones((120, 160), np.float32), "turn")
-    start = propose(tiles, flow, K, K)
+    start = propose(FlowFit.of(tiles, flow, K, K))
     assert start.borrowed.all()
     data = build_energy_data(tiles, flow, K, K)
     error = oracle.reprojection(start.soup, data, Weights())

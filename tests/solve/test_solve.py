@@ -36,6 +36,7 @@ from soup_nlp.solve.kkt import constraint_residuals, optimality
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, _near, solve_soup
 from soup_nlp.start.propose import propose
+from soup_nlp.start.views import FlowFit
 from soup_nlp.storage.progress import Progress, Watch
 
 pytestmark = pytest.mark.slow
@@ -101,7 +102,7 @@ class Problem:
         seg = build_segmentation(labels, pair.image_ref, neighbours=6)
         noise = np.random.default_rng(5).normal(0, 0.2, pair.flow.uv.shape)
         flow = replace(pair.flow, uv=pair.flow.uv + noise)
-        self.start = propose(seg, flow, pair.K_ref, pair.K_next).soup
+        self.start = propose(FlowFit.of(seg, flow, pair.K_ref, pair.K_next)).soup
         data = build_energy_data(seg, flow, pair.K_ref, pair.K_next, 8, 0)
         self.data: EnergyData = in_pixels(data, self.start, seg)
 

@@ -21,11 +21,18 @@ from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import build_energy, prepare, solver_options
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.start.bending import constant_depth, fit_turn, joined, surfaces, turn_alone
-from soup_nlp.start.choice import LEAST_NOISE, dominant
-from soup_nlp.start.propose import rigid_motions
+from soup_nlp.start.bending import (
+    REFERENCE,
+    constant_depth,
+    fit_turn,
+    joined,
+    surfaces,
+    turn_alone,
+)
+from soup_nlp.start.choice import LEAST_NOISE, dominant, rigid_choice
+from soup_nlp.start.merge import gather
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import look
+from soup_nlp.start.views import FlowFit, Views
 
 pytestmark = pytest.mark.slow
 
@@ -61,6 +68,11 @@ def case(scene: str, *overrides: str) -> Case:
     data, weights = build_energy(chosen, c.pair, c.segmentation, c.start)
     options = solver_options(chosen, c.start)
     return replace(c, problem=chosen, data=data, weights=weights, options=options)
+
+
+def fitted(c: Case) -> FlowFit:
+    """The flow of a case's superpixels."""
+    return FlowFit.of(c.segmentation, c.pair.flow, c.pair.K_ref, c.pair.K_next)
 
 
 @pytest.mark.parametrize("scene", ["street", "room", "orbit"])
@@ -115,11 +127,15 @@ def test_small_surfaces_join_the_neighbour_with_the_longest_outline():
     column = (seg.anchors[:, 0] // 8).astype(int)
     surface = np.where(column < 10, 0, np.where(column == 10, 1, 2))
     usable = np.ones(len(seg), bool)
+
+    def joined_where(usable: np.ndarray) -> np.ndarray:
+        return joined(flow_of(seg, np.zeros(len(seg.pairs)), usable), surface)
+
     # two superpixels of sixty: both outlines are equally long, so the first neighbour is taken
-    np.testing.assert_array_equal(joined(surface, usable, seg), np.where(column < 11, 0, 2))
+    np.testing.assert_array_equal(joined_where(usable), np.where(column < 11, 0, 2))
     # without usable flow a surface is small, however many superpixels it has
-    np.testing.assert_array_equal(joined(surface, column >= 11, seg), 2)
-    np.testing.assert_array_equal(joined(surface, ~usable, seg), joined(surface, ~usable, seg)[0])
+    np.testing.assert_array_equal(joined_where(column >= 11), 2)
+    np.testing.assert_array_equal(joined_where(~usable), joined_where(~usable)[0])
 
 
 def test_a_bending_surface_is_found_beside_rigid_ones():
@@ -182,7 +198,7 @@ def test_depth_starts_constant_where_the_camera_is_at_rest():
 @pytest.mark.parametrize("longer", [1.0, 1.4])
 def test_a_turn_is_found_despite_wrong_focal_length_and_movers(turn, longer):
     c = case("street")
-    views, _ = look(c.segmentation, c.pair.flow, c.pair.K_ref, c.pair.K_next, SeededStart())
+    views = fitted(c).views
     R = rotation.exp(np.array(turn))
     scale = np.array([longer, longer, 1.0])
     target = (views.ray * scale) @ R.T / scale
@@ -208,15 +224,16 @@ def test_a_camera_that_moves_is_not_at_rest(scene):
 
 def test_depth_that_explains_the_flow_is_no_turn():
     c = case("orbit")
-    views, _ = look(c.segmentation, c.pair.flow, c.pair.K_ref, c.pair.K_next, SEEDED)
-    still = np.zeros(len(c.segmentation.pairs))
-    choice, _ = rigid_motions(views, c.segmentation, still, dominant(views, SEEDED), SEEDED)
-    usable = np.ones(len(c), bool)
-    assert turn_alone(views, choice, usable, 0.02) is None
+    # without jumps, with a noise of 0.02 px
+    residual = np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c)))
+    flow = fitted(c)._replace(jump=np.zeros(len(c.segmentation.pairs)), residual=residual)
+    choice = gather(flow, rigid_choice(flow, dominant(flow)))
+    assert flow.views.usable.all()
+    assert turn_alone(flow, choice) is None
     # the same flow with the depths taken out of it
-    turned = views.ray @ choice.motions[0].R.T
-    still = replace(views, target=turned / turned[..., 2:])
-    assert turn_alone(still, choice, usable, 0.02) is not None
+    turned = flow.views.ray @ choice.motions[0].R.T
+    still = replace(flow.views, target=turned / turned[..., 2:])
+    assert turn_alone(flow._replace(views=still), choice) is not None
 
 
 def test_noise_where_surfaces_bend_is_that_of_affine_flows():
@@ -331,6 +348,16 @@ def strip(count: int) -> Segmentation:
     return build_segmentation(labels, np.zeros((*labels.shape, 3), np.uint8), neighbours=2)
 
 
+def flow_of(seg: Segmentation, jump: np.ndarray, usable: np.ndarray | None = None) -> FlowFit:
+    """The flow of superpixels, `usable` (N,) ones, that jumps by (P,) pixels."""
+    n = len(seg)
+    weight = np.ones((n, 1)) if usable is None else usable[:, None].astype(float)
+    ray = np.ones((n, 1, 3))
+    views = Views(ray, ray, weight, ray[:, 0], np.ones(n), (1.0, 1.0))
+    K, none = np.eye(3), np.zeros(n)
+    return FlowFit(seg, K, K, SEEDED, views, none > 0, np.zeros((n, 3, 2)), none, jump)
+
+
 def jumps(seg: Segmentation, column: float, size: np.ndarray, noise: float) -> np.ndarray:
     """(P,) jump of `size` (rows,) between columns before and after `column`, else noise."""
     i, k = seg.pairs.T
@@ -341,10 +368,10 @@ def jumps(seg: Segmentation, column: float, size: np.ndarray, noise: float) -> n
 def test_a_gap_in_a_discontinuity_does_not_join_two_surfaces():
     seg = strip(10)
     left = seg.anchors[:, 0] < 40
-    surface = surfaces(jumps(seg, 40, np.array([2.0, 0.6]), 0.01), seg, 1.0)
+    surface = surfaces(flow_of(seg, jumps(seg, 40, np.array([2.0, 0.6]), 0.01)))
     # one of two rows jumps by more than 1 px: half of the outline is a discontinuity
     np.testing.assert_array_equal(surface == surface[0], left)
-    whole = surfaces(jumps(seg, 40, np.array([0.9, 0.6]), 0.01), seg, 1.0)
+    whole = surfaces(flow_of(seg, jumps(seg, 40, np.array([0.9, 0.6]), 0.01)))
     assert (whole == whole[0]).all()
 
 
@@ -352,7 +379,9 @@ def test_noise_does_not_cut_a_surface():
     seg = strip(10)
     rng = np.random.default_rng(0)
     jump = np.where(rng.random(len(seg.pairs)) < 0.3, 0.9, 0.4)
-    assert (surfaces(jump, seg, 1.0) == surfaces(jump, seg, 1.0)[0]).all()
+    whole = surfaces(flow_of(seg, jump))
+    assert (whole == whole[0]).all()
     # and it does not hide a discontinuity
-    surface = surfaces(np.maximum(jump, jumps(seg, 40, np.array([3.0, 2.0]), 0.0)), seg, 1.0)
+    jump = np.maximum(jump, jumps(seg, 40, np.array([3.0, 2.0]), 0.0))
+    surface = surfaces(flow_of(seg, jump))
     np.testing.assert_array_equal(surface == surface[0], seg.anchors[:, 0] < 40)

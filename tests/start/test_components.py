@@ -26,6 +26,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.start import components as components_module
 from soup_nlp.start.components import contact_scales, depth_from_inside
 from soup_nlp.start.propose import SeededStart, propose
+from soup_nlp.start.views import FlowFit
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 
@@ -263,7 +264,7 @@ def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, mon
         context.setattr(components_module, "nearer_where_cut_off", lambda *_: 0.0)
         options = SeededStart(**dict(problem.start), seed=problem.seed)
         data = case.segmentation, case.pair.flow, pair.K_ref, pair.K_next
-        contact = cut_errors(case, propose(*data, options).soup)
+        contact = cut_errors(case, propose(FlowFit.of(*data, options)).soup)
     moved = contact != shipped
     assert shipped[moved].mean() < 0.7 * contact[moved].mean()
 

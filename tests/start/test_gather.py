@@ -27,7 +27,7 @@ OPTIONS = SeededStart()
 
 @pytest.fixture(scope="module")
 def world():
-    """A wedge that moves in a room: views, superpixels, jumps, true component and motions."""
+    """A wedge that moves in a room: flow of superpixels, true component and motions."""
     scene = corner_scene(CAMERA, WEDGE, turn=10)
     pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
     labels, _ = cut_by_part(scene, pair, 100)
@@ -36,7 +36,7 @@ def world():
     component = np.array(
         [np.bincount(pair.truth.components[labels == i]).argmax() for i in range(len(seg))]
     )
-    return fitted.views, seg, fitted.jump, component, unit(pair.truth.motions)
+    return fitted, component, unit(pair.truth.motions)
 
 
 def unit(M: np.ndarray) -> list[Motion]:
@@ -67,12 +67,12 @@ def off(choice: Choice, component: np.ndarray, m: Motion) -> float:
 
 
 def test_a_component_with_three_motions_is_gathered(world):
-    views, seg, jump, component, (room, wedge) = world
+    flow, component, (room, wedge) = world
     several = [room, turned(wedge, 0.4, 0), turned(wedge, -0.4, 1), turned(wedge, 0.4, 2)]
-    part = 1 + np.arange(len(seg)) % 3
-    before = Choice.of(views, several, np.where(component == 1, part, 0))
+    part = 1 + np.arange(len(flow.seg)) % 3
+    before = Choice.of(flow.views, several, np.where(component == 1, part, 0), 0.05)
     assert agreement(before, component)[0] < 0.5
-    after = gather(views, seg, jump, before, 0.05, OPTIONS)
+    after = gather(flow, before)
     assert min(agreement(after, component)) > 0.85
     assert off(after, component, wedge) < 0.3
     assert off(after, component, wedge) < off(before, component, wedge)
@@ -80,54 +80,56 @@ def test_a_component_with_three_motions_is_gathered(world):
 
 
 def test_superpixels_with_motions_of_their_own_are_gathered(world):
-    views, seg, jump, component, (room, wedge) = world
+    flow, component, (room, wedge) = world
     rng = np.random.default_rng(0)
-    motions, label = [room], np.zeros(len(seg), int)
+    motions, label = [room], np.zeros(len(component), int)
     for i in np.flatnonzero(component == 1):
         motions.append(turned(wedge, rng.uniform(-0.5, 0.5), int(rng.integers(3))))
         label[i] = len(motions) - 1
-    before = Choice.of(views, motions, label)
-    after = gather(views, seg, jump, before, 0.05, OPTIONS)
+    before = Choice.of(flow.views, motions, label, 0.05)
+    after = gather(flow, before)
     assert min(agreement(after, component)) > 0.85
     assert off(after, component, wedge) < 0.3
     count = np.bincount(after.label)
     assert len(after.motions) == len(count) < 5
     assert (np.diff(count) <= 0).all()
-    np.testing.assert_allclose(views.fit(after.motions, after.label).cost, after.fit.cost)
+    np.testing.assert_allclose(flow.views.fit(after.motions, after.label).cost, after.fit.cost)
 
 
 def test_half_a_component_with_the_rooms_motion_comes_back(world):
-    views, seg, jump, component, (room, wedge) = world
-    left = seg.anchors[:, 0] < np.median(seg.anchors[component == 1, 0])
-    before = Choice.of(views, [room, wedge], np.where((component == 1) & left, 1, 0))
+    flow, component, (room, wedge) = world
+    x = flow.seg.anchors[:, 0]
+    left = x < np.median(x[component == 1])
+    before = Choice.of(flow.views, [room, wedge], np.where((component == 1) & left, 1, 0), 0.05)
     assert agreement(before, component)[0] < 0.7
-    after = gather(views, seg, jump, before, 0.05, OPTIONS)
+    after = gather(flow, before)
     assert min(agreement(after, component)) > 0.85
 
 
 def test_one_rigid_world_stays_as_it_is(world):
-    views, seg, jump, component, (room, _) = world
-    before = Choice.of(views, [room], np.zeros(len(component), int))
-    after = gather(views, seg, jump, before, 0.05, OPTIONS)
+    flow, component, (room, _) = world
+    before = Choice.of(flow.views, [room], np.zeros(len(component), int), 0.05)
+    after = gather(flow, before)
     assert after.motions == before.motions
     assert (after.label == 0).all()
 
 
 def test_neighbours_agree_unless_the_flow_jumps(world):
-    _, seg, jump, component, _ = world
+    flow, component, _ = world
+    seg = flow.seg
     rng = np.random.default_rng(1)
     n = len(seg)
     # each component prefers its own label by 0.3 pixels, a fifth of the superpixels the wrong one
     wrong = rng.random(n) < 0.2
     cost = np.where(np.arange(2) == np.where(wrong, 1 - component, component)[:, None], 0.0, 0.3)
-    near = flow_affinity(jump, OPTIONS)
+    near = flow_affinity(flow)
     assert near.max() <= 1
-    assert near[jump > 3 * OPTIONS.discontinuity_px].max() < 0.01
-    label = smooth_choice(cost, near, seg, 0.5)
+    assert near[flow.jump > 3 * OPTIONS.discontinuity_px].max() < 0.01
+    label = smooth_choice(flow, cost, 0.5)
     assert (label == component).mean() > 0.95
     # without a price each takes its own; a high price leaves one
-    np.testing.assert_array_equal(smooth_choice(cost, near, seg, 0.0), np.argmin(cost, axis=1))
-    assert len(np.unique(smooth_choice(cost, np.ones_like(near), seg, 1e3))) == 1
+    np.testing.assert_array_equal(smooth_choice(flow, cost, 0.0), np.argmin(cost, axis=1))
+    assert len(np.unique(smooth_choice(flow._replace(jump=0 * near), cost, 1e3))) == 1
     # no single change is better
     i, k = seg.pairs.T
     length = seg.boundary_length.astype(float)
@@ -142,14 +144,15 @@ def test_neighbours_agree_unless_the_flow_jumps(world):
 
 
 def test_one_label_is_the_only_choice(world):
-    seg = world[1]
-    assert (smooth_choice(np.ones((len(seg), 1)), np.ones(len(seg.pairs)), seg, 1.0) == 0).all()
+    flow = world[0]
+    assert (smooth_choice(flow, np.ones((len(flow.seg), 1)), 1.0) == 0).all()
 
 
 def test_a_motion_without_known_depth_borrows_from_another(world):
-    label = np.arange(len(world[1])) % 2
+    seg = world[0].seg
+    label = np.arange(len(seg)) % 2
     mu, weak = np.where(label == 1, 0.5, 0.001), label == 0
-    new, flat = borrow(mu, np.ones((len(mu), 2)), label, weak, world[1])
+    new, flat = borrow(mu, np.ones((len(mu), 2)), label, weak, seg)
     np.testing.assert_array_equal(new, 0.5)
     np.testing.assert_array_equal(flat, np.where(weak, 0.0, 1.0)[:, None] * [1, 1])
 
@@ -161,7 +164,7 @@ def test_a_camera_at_rest_starts_near_its_flow():
     labels, _ = cut_by_part(scene, pair, 100)
     seg = build_segmentation(labels, pair.image_ref, neighbours=10)
 
-    start = propose(seg, pair.flow, K, K)
+    start = propose(FlowFit.of(seg, pair.flow, K, K))
     anchor = camera.rays(K, seg.anchors)
     X = start.soup.depth_at(anchor)[:, None] * anchor
     X = np.einsum("nij,nj->ni", start.soup.R, X) + start.soup.translation

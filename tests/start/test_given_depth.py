@@ -42,7 +42,7 @@ class Seen:
         self.pair = pair.with_flow(flow_from_truth(pair))
         self.seg = build_segmentation(segment(pair.image_ref, 150), pair.image_ref)
         flow_data = self.pair.flow, pair.K_ref, pair.K_next
-        self.start: Start = propose(self.seg, *flow_data, SeededStart())
+        self.start: Start = propose(FlowFit.of(self.seg, *flow_data, SeededStart()))
         self.depth = pair.truth.depth_ref
         self.anchor = rays(pair.K_ref, self.seg.anchors)
 

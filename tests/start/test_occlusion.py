@@ -97,7 +97,7 @@ def test_a_vote_needs_several_strips_and_agreement():
 @pytest.mark.parametrize("covers", [True, False])
 def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     pair, seg = sliding(covers)
-    before = propose(seg, pair.flow, K, K, SeededStart())
+    before = propose(FlowFit.of(seg, pair.flow, K, K, SeededStart()))
     start = ordered(before, seg, pair)
     assert before.at_rest
     z = np.log(start.soup.depth_at(camera.rays(K, seg.anchors)))
@@ -125,7 +125,7 @@ def swing() -> tuple[Pair, Segmentation]:
 
 def test_a_swinging_object_comes_before_the_wall(swing):
     pair, seg = swing
-    before = propose(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
+    before = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart()))
     start = ordered(before, seg, pair)
     u, v = np.rint(seg.anchors).astype(int).T
     truth = np.log(pair.truth.depth_ref[v, u])
@@ -150,7 +150,7 @@ def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
     pair = render_scene("room", 1, 512, 218)
     pair = pair.with_flow(flow_from_truth(pair))
     seg = build_segmentation(segment(pair.image_ref, 300), pair.image_ref)
-    before = propose(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
+    before = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart()))
     one = fitted(pair, seg)
 
     def changed() -> int:
@@ -165,7 +165,7 @@ def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
 
 def test_small_pieces_have_no_order(monkeypatch):
     pair, seg = sliding(True)
-    before = propose(seg, pair.flow, K, K, SeededStart())
+    before = propose(FlowFit.of(seg, pair.flow, K, K, SeededStart()))
     monkeypatch.setattr(occlusion, "SMALL", 5 / len(seg))
     assert ordered(before, seg, pair) is not before
     monkeypatch.setattr(occlusion, "SMALL", 6 / len(seg))
@@ -175,7 +175,7 @@ def test_small_pieces_have_no_order(monkeypatch):
 def test_an_image_without_discontinuities_keeps_its_start(swing):
     pair, seg = swing
     still = pair.with_flow(Flow(0 * pair.flow.uv, pair.flow.confidence, "zero"))
-    start = propose(seg, still.flow, pair.K_ref, pair.K_next, SeededStart())
+    start = propose(FlowFit.of(seg, still.flow, pair.K_ref, pair.K_next, SeededStart()))
     assert ordered(start, seg, still) is start
 
 

@@ -11,6 +11,7 @@ from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.start.components import FIXED
 from soup_nlp.start.overlay import towards_border
 from soup_nlp.start.propose import SeededStart, propose
+from soup_nlp.start.views import FlowFit
 
 K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
 H, W, TILE = 120, 160, 10
@@ -42,7 +43,7 @@ def scene_flow(turn=TURN, shift=AHEAD):
 
 def start_of(seg, flow, **options):
     confidence = np.ones(flow.shape[:2], np.float32)
-    return propose(seg, Flow(flow, confidence, "made"), K, K, SeededStart(**options))
+    return propose(FlowFit.of(seg, Flow(flow, confidence, "made"), K, K, SeededStart(**options)))
 
 
 def share(start, seg, mask):

@@ -24,6 +24,7 @@ from soup_nlp.geometry.superpixels import segment
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import FlowFit
 
 WIDTH, HEIGHT = 192, 144
 K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -101,7 +102,7 @@ def assert_usable(start: Start, seg: Segmentation) -> None:
 @pytest.mark.parametrize("shift", [(0.35, 0.05, 0.1), (1.0, 0.1, 0.2), (-0.2, 0.0, 0.5)])
 def test_one_motion_is_recovered_exactly(shift):
     pair, seg, pure = cut(corner_scene(motion((0.5, -1.5, 0.3), shift)))
-    start = propose(seg, pair.flow, K, K)
+    start = propose(FlowFit.of(seg, pair.flow, K, K))
     assert_usable(start, seg)
     assert pure.mean() > 0.85
     e = compare(start, pair, seg, pure)
@@ -121,7 +122,7 @@ def test_one_motion_is_recovered_exactly(shift):
 def test_two_motions_are_told_apart():
     component = motion((0, 3, 0), (-0.15, 0.02, 0.1))
     pair, seg, pure = cut(corner_scene(CAMERA, component, turn=10))
-    start = propose(seg, pair.flow, K, K)
+    start = propose(FlowFit.of(seg, pair.flow, K, K))
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
     for b, (turn, direction, normal, depth) in enumerate(
@@ -143,7 +144,7 @@ def test_noise_makes_it_worse_but_not_wild():
     """Half a pixel of noise raises the errors, but to a limit."""
     pair, seg, pure = cut(corner_scene(CAMERA))
     noise = np.random.default_rng(99).normal(0, 0.5, pair.flow.uv.shape)
-    start = propose(seg, replace(pair.flow, uv=pair.flow.uv + noise), K, K)
+    start = propose(FlowFit.of(seg, replace(pair.flow, uv=pair.flow.uv + noise), K, K))
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
     ratio = np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1)
@@ -158,7 +159,7 @@ def test_confident_pixels_decide():
     rng = np.random.default_rng(99)
     bad = rng.random(pair.size) < 0.4
     uv = np.where(bad[..., None], rng.normal(0, 50, pair.flow.uv.shape), pair.flow.uv)
-    start = propose(seg, Flow(uv, (~bad).astype(float), "test"), K, K)
+    start = propose(FlowFit.of(seg, Flow(uv, (~bad).astype(float), "test"), K, K))
     e = compare(start, pair, seg, pure)
     assert e.rotation.max() < 1e-5
     assert np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1).max() < 2e-3
@@ -171,7 +172,7 @@ def test_outliers_of_full_confidence_are_outvoted():
     uv = np.where(
         bad[..., None], pair.flow.uv + rng.normal(0, 20, pair.flow.uv.shape), pair.flow.uv
     )
-    start = propose(seg, replace(pair.flow, uv=uv), K, K)
+    start = propose(FlowFit.of(seg, replace(pair.flow, uv=uv), K, K))
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
     assert np.median(e.rotation) < 0.1
@@ -183,7 +184,7 @@ def test_two_cameras_with_different_intrinsics():
     K_next = camera.intrinsics(230.0, 210.0, 80.0, 60.0)
     grid = camera.pixel_grid(*pair.size)
     target = camera.project(K_next, camera.rays(K, grid + pair.flow.uv))
-    start = propose(seg, replace(pair.flow, uv=target - grid), K, K_next)
+    start = propose(FlowFit.of(seg, replace(pair.flow, uv=target - grid), K, K_next))
     e = compare(start, pair, seg, pure)
     assert e.rotation.max() < 1e-5
     assert np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1).max() < 2e-3
@@ -196,8 +197,8 @@ def test_the_start_is_a_function_of_its_seed():
     pair, seg, _ = cut(corner_scene(CAMERA, motion((0, 3, 0), (-0.15, 0.02, 0.1))))
     noise = np.random.default_rng(99).normal(0, 0.3, pair.flow.uv.shape)
     flow = replace(pair.flow, uv=pair.flow.uv + noise)
-    one, two = (propose(seg, flow, K, K, SeededStart(seed=3)) for _ in range(2))
-    other = propose(seg, flow, K, K, SeededStart(seed=4))
+    one, two = (propose(FlowFit.of(seg, flow, K, K, SeededStart(seed=3))) for _ in range(2))
+    other = propose(FlowFit.of(seg, flow, K, K, SeededStart(seed=4)))
     for f in fields(one.soup):
         np.testing.assert_array_equal(getattr(one.soup, f.name), getattr(two.soup, f.name))
     np.testing.assert_array_equal(one.motion, two.motion)
@@ -217,11 +218,11 @@ def corner() -> tuple[Pair, Segmentation, np.ndarray]:
 
 def test_zero_flow_everywhere_is_finite(corner):
     seg = corner[1]
-    assert_usable(propose(seg, ZERO, K, K), seg)
+    assert_usable(propose(FlowFit.of(seg, ZERO, K, K)), seg)
 
 
 def test_zero_flow_everywhere_is_flagged(corner):
-    assert propose(corner[1], ZERO, K, K).borrowed.all()
+    assert propose(FlowFit.of(corner[1], ZERO, K, K)).borrowed.all()
 
 
 def test_superpixels_without_confidence_borrow(corner):
@@ -229,7 +230,7 @@ def test_superpixels_without_confidence_borrow(corner):
     blind = np.zeros(len(seg), bool)
     blind[[0, 7, 20, 21, 22, 40]] = True
     confidence = np.where(blind[seg.labels], 0.0, 1.0)
-    start = propose(seg, Flow(pair.flow.uv, confidence, "test"), K, K)
+    start = propose(FlowFit.of(seg, Flow(pair.flow.uv, confidence, "test"), K, K))
     assert_usable(start, seg)
     assert start.borrowed[blind].all()
     assert not start.borrowed[~blind & pure].any()
@@ -246,7 +247,7 @@ def test_a_superpixel_without_parallax_borrows_its_depth(corner):
     grid = camera.pixel_grid(*pair.size)
     turned = camera.project(K, camera.rays(K, grid) @ CAMERA[:3, :3].T) - grid
     uv = np.where((seg.labels == far)[..., None], turned, pair.flow.uv)
-    start = propose(seg, replace(pair.flow, uv=uv), K, K)
+    start = propose(FlowFit.of(seg, replace(pair.flow, uv=uv), K, K))
     assert_usable(start, seg)
     assert start.borrowed[far]
     z = start.soup.depth_at(camera.rays(K, seg.anchors))
@@ -255,7 +256,9 @@ def test_a_superpixel_without_parallax_borrows_its_depth(corner):
 
 def test_one_confident_superpixel_is_enough_to_go_on(corner):
     pair, seg, _ = corner
-    start = propose(seg, Flow(pair.flow.uv, (seg.labels == 11).astype(float), "test"), K, K)
+    start = propose(
+        FlowFit.of(seg, Flow(pair.flow.uv, (seg.labels == 11).astype(float), "test"), K, K)
+    )
     assert_usable(start, seg)
     assert start.borrowed[np.arange(len(seg)) != 11].all()
 
@@ -267,14 +270,14 @@ def test_superpixels_of_one_column_or_row_are_finite():
         np.tile(np.arange(48)[:, None], (1, 64)),
     ):
         seg = build_segmentation(labels.astype(np.int32), pair.image_ref, neighbours=6)
-        start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
+        start = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next))
         assert_usable_of(start, seg, pair)
 
 
 def test_superpixels_of_four_pixels_are_finite():
     pair = plane_world(plane_pose(3.0, yaw=20), CAMERA, 64, 48)
     seg = build_segmentation(segment(pair.image_ref, 768, "grid"), pair.image_ref, neighbours=8)
-    start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
+    start = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next))
     assert_usable_of(start, seg, pair)
 
 
@@ -290,7 +293,7 @@ def assert_usable_of(start: Start, seg: Segmentation, pair: Pair) -> None:
 @pytest.mark.parametrize("turn", [(0.0, 2.0, 0.0), (1.0, -1.0, 3.0)])
 def test_pure_rotation_is_finite_and_explains_the_flow(turn):
     pair, seg, _ = cut(corner_scene(motion(turn, (0, 0, 0))))
-    start = propose(seg, pair.flow, K, K)
+    start = propose(FlowFit.of(seg, pair.flow, K, K))
     assert_usable(start, seg)
     assert np.median(start.error) < 0.3
 
@@ -299,14 +302,14 @@ def test_pure_rotation_is_finite_and_explains_the_flow(turn):
 def test_pure_rotation_is_flagged(turn):
     """The flow does not determine any depth."""
     pair, seg, _ = cut(corner_scene(motion(turn, (0, 0, 0))))
-    assert propose(seg, pair.flow, K, K).borrowed.mean() > 0.9
+    assert propose(FlowFit.of(seg, pair.flow, K, K)).borrowed.mean() > 0.9
 
 
 def test_a_single_plane_is_finite():
     # the homography of one plane has two rigid explanations; either is a start
     pair = plane_world(plane_pose(3.0, yaw=20, pitch=10), CAMERA, WIDTH, HEIGHT)
     seg = build_segmentation(segment(pair.image_ref, 40, "grid"), pair.image_ref, neighbours=8)
-    start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
+    start = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next))
     assert_usable_of(start, seg, pair)
     assert np.median(start.error) < 0.05
 
@@ -315,19 +318,19 @@ def test_a_single_plane_is_finite():
 def test_random_flow_is_finite(corner):
     _, seg, _ = corner
     uv = np.random.default_rng(99).normal(0, 30, (HEIGHT, WIDTH, 2))
-    assert_usable(propose(seg, Flow(uv, np.ones((HEIGHT, WIDTH)), "noise"), K, K), seg)
+    assert_usable(propose(FlowFit.of(seg, Flow(uv, np.ones((HEIGHT, WIDTH)), "noise"), K, K)), seg)
 
 
 def test_one_superpixel_is_finite(corner):
     pair, _, _ = corner
     seg = build_segmentation(np.zeros((HEIGHT, WIDTH), np.int32), pair.image_ref)
-    assert_usable(propose(seg, pair.flow, K, K), seg)
+    assert_usable(propose(FlowFit.of(seg, pair.flow, K, K)), seg)
 
 
 def test_two_superpixels_are_finite(corner):
     pair, _, _ = corner
     seg = build_segmentation(segment(pair.image_ref, 2, "grid"), pair.image_ref, neighbours=1)
-    assert_usable(propose(seg, pair.flow, K, K), seg)
+    assert_usable(propose(FlowFit.of(seg, pair.flow, K, K)), seg)
 
 
 @pytest.mark.parametrize("usable", [0, 7])
@@ -336,7 +339,7 @@ def test_too_few_usable_pixels_are_an_error(corner, usable):
     confidence = np.zeros((HEIGHT, WIDTH))
     confidence[70, 50 : 50 + usable] = 1
     with pytest.raises(DataError, match="too few pixels") as caught:
-        propose(seg, Flow(pair.flow.uv, confidence, "thin"), K, K)
+        propose(FlowFit.of(seg, Flow(pair.flow.uv, confidence, "thin"), K, K))
     assert "thin" in str(caught.value)
     assert str(usable) in str(caught.value)
 
@@ -345,13 +348,13 @@ def test_eight_usable_pixels_are_finite(corner):
     pair, seg, _ = corner
     confidence = np.zeros((HEIGHT, WIDTH))
     confidence[70, 50:58] = 1
-    start = propose(seg, Flow(pair.flow.uv, confidence, "thin"), K, K)
+    start = propose(FlowFit.of(seg, Flow(pair.flow.uv, confidence, "thin"), K, K))
     assert_usable(start, seg)
     assert start.borrowed.mean() > 0.9
 
 
 def test_the_start_prints_itself(corner):
     pair, seg, _ = corner
-    text = str(propose(seg, pair.flow, K, K))
+    text = str(propose(FlowFit.of(seg, pair.flow, K, K)))
     assert text.startswith(f"Start({len(seg)} superpixels, ")
     assert "borrowed" in text

@@ -36,6 +36,7 @@ from soup_nlp.start.components import (
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.propose import propose
 from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import USABLE, FlowFit, Views
 
 OPTIONS = SeededStart()
 PER_RADIAN = 10.0
@@ -60,6 +61,7 @@ class Turns:
     def __post_init__(self) -> None:
         n = len(self.true)
         self.ray = self.target = np.zeros((n, 4, 3))
+        self.anchor = np.tile([0.0, 0.0, 1.0], (n, 1))
         self.weight = np.ones((n, 4)) if self.weight is None else self.weight
 
     def planes(self, R: np.ndarray) -> PlaneFit:
@@ -75,6 +77,26 @@ class Turns:
     def subset(self, at: np.ndarray) -> Turns:
         return Turns(self.true[at])
 
+    matches = Views.matches
+
+    @property
+    def usable(self) -> np.ndarray:
+        return self.weight.mean(axis=1) > USABLE
+
+
+def flow_of(
+    views: Turns,
+    seg: Segmentation,
+    jump: np.ndarray | float = 0.0,
+    shift: np.ndarray | float = 0.0,
+) -> FlowFit:
+    """The flow of superpixels whose anchors move by pixels (N, 2) and jump by (P,)."""
+    fit = np.zeros((len(seg), 3, 2))
+    fit[:, 0] = shift
+    none = np.zeros(len(seg))
+    jump = np.broadcast_to(jump, len(seg.pairs))
+    return FlowFit(seg, K, K, OPTIONS, views, none > 0, fit, none, jump)
+
 
 def turn(angle: float | np.ndarray) -> np.ndarray:
     return rotation.exp(np.asarray(angle)[..., None] * np.array([0.0, 0.0, 1.0]))
@@ -83,7 +105,7 @@ def turn(angle: float | np.ndarray) -> np.ndarray:
 def taken(views: Turns, angle: np.ndarray) -> Choice:
     """Superpixels that turn by angles (N,)."""
     angles, label = np.unique(angle, return_inverse=True)
-    return Choice.of(views, turning(*angles), label)
+    return Choice.of(views, turning(*angles), label, 0.05)
 
 
 def turning(*angles: float) -> list[Motion]:
@@ -97,7 +119,7 @@ def test_a_small_motion_counts_where_the_flow_is_exact(error, kept):
     block = seg.anchors[:, 0] > 48
     views = Turns(np.where(block, 0.1 / PER_RADIAN, 0.0))
     angle = np.where(block, 0.1 + error, error) / PER_RADIAN
-    choice, _ = gathering.earned(views, taken(views, angle), seg, 0.05)
+    choice, _ = gathering.earned(flow_of(views, seg), taken(views, angle))
     np.testing.assert_array_equal(choice.label, block.astype(int) * kept)
 
 
@@ -122,7 +144,7 @@ def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, truste
     )
     cost = np.where(odd, 3.0, 0.0)[:, None]
     main = [Motion(np.eye(3), np.array([1.0, 0, 0]))]
-    assert bool(of_pieces(views, seg, main, cost, 0.05, OPTIONS)) == trusted
+    assert bool(of_pieces(flow_of(views, seg), main, cost, 0.05)) == trusted
 
 
 # --- components ----------------------------------------------------------------------------------
@@ -154,7 +176,7 @@ def test_a_contradicted_motion_is_not_the_components(monkeypatch, enough):
     before = taken(views, true)
     offered(monkeypatch, 0.2)
     jump = np.where(across(seg, component), 10.0, 0.0)
-    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    after = gathering.gather(flow_of(views, seg, jump), before)
     assert (after.label[~component] == 0).all()
     if enough:
         assert (after.label[agree] > 0).all()
@@ -178,7 +200,7 @@ def test_components_with_a_gap_in_their_discontinuity_are_parted_there(monkeypat
     between = 0.5 * (least + most) * OPTIONS.discontinuity_px
     jump = np.where(across(seg, component), between, 0.0)
     jump[across(seg, component > 0)] = 10.0
-    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    after = gathering.gather(flow_of(views, seg, jump), before)
     for b in (1, 2):
         assert len(np.unique(after.label[component == b])) == 1
         assert after.error[component == b].max() < 1e-9
@@ -199,7 +221,7 @@ def test_one_of_a_component_goes_with_its_neighbours():
     label[odd] = 0
     before = taken(views, np.where(label == 1, 0.2, 0.0))
     jump = np.where(across(seg, right), 10.0, 0.0)
-    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    after = gathering.gather(flow_of(views, seg, jump), before)
     np.testing.assert_array_equal(after.label, right)
 
 
@@ -211,12 +233,12 @@ def test_the_main_motion_wins_between_equal_ones():
     views = Turns(np.where(right, middle, 0.0))
     before = taken(views, np.where(right, 0.2, 0.0))
     jump = np.full(len(seg.pairs), 10.0)
-    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    after = gathering.gather(flow_of(views, seg, jump), before)
     assert (after.label == 0).all()
     # where it is clearly better it stays
     views = Turns(np.where(right, 0.12, 0.0))
     before = taken(views, np.where(right, 0.2, 0.0))
-    after = gathering.gather(views, seg, jump, before, 0.05, OPTIONS)
+    after = gathering.gather(flow_of(views, seg, jump), before)
     np.testing.assert_array_equal(after.label, right)
 
 
@@ -278,7 +300,9 @@ def test_superpixels_of_hardly_any_confidence_borrow():
     seg = build_segmentation(segment(pair.image_ref, 30, "grid"), pair.image_ref, neighbours=8)
     faint = np.isin(np.arange(len(seg)), [8, 9, 20])
     confidence = np.where(faint[seg.labels], 0.01, 1.0)
-    start = propose(seg, Flow(pair.flow.uv, confidence, "test"), pair.K_ref, pair.K_next)
+    start = propose(
+        FlowFit.of(seg, Flow(pair.flow.uv, confidence, "test"), pair.K_ref, pair.K_next)
+    )
     assert start.borrowed[faint].all()
     assert start.borrowed[~faint].mean() < 0.2
 
@@ -291,12 +315,12 @@ def test_motions_that_are_hardly_different_do_not_mix(monkeypatch):
     exact = Motion(move[:3, :3], move[:3, 3] / np.linalg.norm(move[:3, 3]))
     near = Motion(turn(4e-4) @ exact.R, exact.t)
     monkeypatch.setattr(choosing, "of_pieces", lambda *a: [])
-    monkeypatch.setattr(proposing, "settle", lambda views, choice, *a: choice)
+    monkeypatch.setattr(proposing, "settle", lambda flow, choice: choice)
 
     def taken(motion: Motion, *motions: Motion) -> np.ndarray:
         result = list(motions), np.zeros(len(seg), bool)
         monkeypatch.setattr(proposing, "surface_motions", lambda *a: result)
-        start = propose(seg, pair.flow, pair.K_ref, pair.K_next)
+        start = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next))
         return np.abs(start.soup.R - motion.R).max(axis=(1, 2)) < 1e-9
 
     assert taken(exact, near, exact).all()
@@ -316,7 +340,7 @@ def test_only_a_piece_with_usable_flow_moves():
     weight = np.where(np.isin(component, (0, 1)), 1.0, 0.2)
     weight[[22, 23]] = 0.2
     views = Turns(np.zeros(32), np.repeat(weight[:, None], 4, axis=1))
-    part = proposing.moving_parts(component, views, seg, component == 4)
+    part = proposing.moving_parts(flow_of(views, seg), component, component == 4)
     expected = np.where(np.isin(np.arange(32), (16, 17, 22, 23)), 0, component)
     np.testing.assert_array_equal(part, expected)
 
@@ -340,7 +364,7 @@ def test_a_mixture_of_two_flows_does_not_move(shift, own_error, size, mixed):
     choice = taken(views, np.where(piece, 0.1 - own_error / PER_RADIAN, 0.0))
     flow = np.zeros((len(seg), 2))
     flow[:, 0] = np.where(piece, shift, np.where(row < 8, 0.0, 4.0))
-    still = gathering.unmoved(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
+    still = gathering.unmoved(flow_of(views, seg, shift=flow), choice, piece.astype(int))
     np.testing.assert_array_equal(still, piece & mixed)
 
 
@@ -353,7 +377,7 @@ def test_a_motion_that_explains_little_more_is_dropped(gain, moves):
     views = Turns(np.where(piece, gain / PER_RADIAN, 0.0))
     choice = taken(views, np.where(piece, gain / PER_RADIAN, 0.0))
     flow = np.where(piece, 9.0, 0.0)[:, None] * [1.0, 0.0]
-    still = gathering.unmoved(piece.astype(int), choice, flow, np.ones(len(seg), bool), views, seg)
+    still = gathering.unmoved(flow_of(views, seg, shift=flow), choice, piece.astype(int))
     np.testing.assert_array_equal(still, piece & (not moves))
 
 
