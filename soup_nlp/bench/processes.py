@@ -22,9 +22,8 @@ from unittest import mock
 import psutil
 
 from soup_nlp.errors import SolverError, SoupError
-from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.rows import ONE_THREAD, Row, attempt, failure
-from soup_nlp.storage.system import end_with_parent
+from soup_nlp.storage.system import end_with_parent, scratch
 from soup_nlp.storage.versions import code_version, versions
 
 GRACE = 5.0

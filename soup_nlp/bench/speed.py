@@ -27,8 +27,8 @@ from soup_nlp.pipeline.run import make_run
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
-from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.rows import Row
+from soup_nlp.storage.system import scratch
 
 REFERENCE_ITERATIONS = 100
 """Limit of the steps of Levenberg-Marquardt for every smoothing width."""

@@ -18,8 +18,8 @@ from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.frames import Frames, find_depths, find_images, scene_frames
 from soup_nlp.sequence.score import score
 from soup_nlp.sequence.solve import ROWS, solve_pairs
-from soup_nlp.storage.folders import scratch
 from soup_nlp.storage.rows import Row, read_rows
+from soup_nlp.storage.system import scratch
 
 NOTE = (
     "MRE (no cap) of sequences whose pairs are put on one scale (`soup-nlp chain`), mean over the"

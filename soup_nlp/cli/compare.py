@@ -32,9 +32,10 @@ from soup_nlp.export.verify import Limits
 from soup_nlp.family.describe import write_results
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.files import write_text
-from soup_nlp.storage.folders import claim, default_folder, scratch, staged
+from soup_nlp.storage.folders import claim, default_folder, staged
 from soup_nlp.storage.rows import Row
 from soup_nlp.storage.store import write_json
+from soup_nlp.storage.system import scratch
 
 FILES = ("README.md", "profile.png")
 """Files that are made from all rows."""

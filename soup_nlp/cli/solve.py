@@ -25,8 +25,9 @@ from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import missed, verdict
 from soup_nlp.sequence.frames import IMAGES
 from soup_nlp.storage.files import as_path, is_file
-from soup_nlp.storage.folders import default_folder, scratch
+from soup_nlp.storage.folders import default_folder
 from soup_nlp.storage.progress import interruptible
+from soup_nlp.storage.system import scratch
 
 SOURCE = "Two images, or a problem file or name (`soup-nlp list`)."
 FLOW: Mapping[str, Any] = {"rich_help_panel": "Flow"}

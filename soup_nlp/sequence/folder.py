@@ -23,8 +23,9 @@ from soup_nlp.sequence.fused import fuse, projected
 from soup_nlp.sequence.page import RATE, chain_page, depth_pictures, write_animation
 from soup_nlp.sequence.score import score
 from soup_nlp.storage.files import as_path, is_file, read_json, write_bytes, write_text
-from soup_nlp.storage.folders import scratch, staged
+from soup_nlp.storage.folders import staged
 from soup_nlp.storage.store import write_json
+from soup_nlp.storage.system import scratch
 
 CHAIN = "chain.json"
 """File that makes a folder that of a chain."""

@@ -1,13 +1,17 @@
-"""Functions of the operating system: free memory, delayed signals, end with the parent."""
+"""Functions of the operating system: memory, signals, end with the parent, temporary folders."""
 
 from __future__ import annotations
 
 import ctypes
+import os
+import re
+import shutil
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -76,3 +80,56 @@ def end_with_parent() -> None:
     if sys.platform == "linux":
         pr_set_pdeathsig = 1
         ctypes.CDLL(None).prctl(pr_set_pdeathsig, int(signal.SIGKILL))
+
+
+_in_use: set[Path] = set()
+"""Temporary folders of this process."""
+
+
+@contextmanager
+def temporary_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """An empty folder that is removed when the block ends, or after a kill by a later call.
+
+    The number of this process follows the prefix in its name. It may be renamed in the block, and
+    is then kept.
+    """
+    sweep(parent, prefix)
+    with tempfile.TemporaryDirectory(
+        prefix=f"{prefix}{os.getpid()}-", dir=parent, ignore_cleanup_errors=True
+    ) as name:
+        _in_use.add(Path(name))
+        try:
+            yield Path(name)
+        finally:
+            _in_use.discard(Path(name))
+
+
+def sweep(parent: Path, prefix: str) -> None:
+    """Remove temporary folders of ended processes, also if this process has the same number."""
+    for path in parent.glob(f"{prefix}*"):
+        number = re.match(r"(\d{1,9})-", path.name.removeprefix(prefix))
+        if number is None or path in _in_use:
+            continue
+        if int(number[1]) == os.getpid() or not psutil.pid_exists(int(number[1])):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """A temporary folder in the system's folder for these.
+
+    Raises:
+        DataError: it cannot be made.
+    """
+    root = Path(tempfile.gettempdir())
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(temporary_folder(root, f"soup_nlp-{os.getuid()}-"))
+        except OSError as error:
+            raise DataError(
+                "no temporary folder can be made",
+                where=root,
+                found=error.strerror,
+                hint="set TMPDIR",
+            ) from error
+        yield folder

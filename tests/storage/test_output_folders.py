@@ -15,17 +15,8 @@ import pytest
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage import folders
-from soup_nlp.storage.folders import (
-    MARK,
-    claim,
-    digest_of,
-    files_in,
-    made_files,
-    recover,
-    scratch,
-    staged,
-)
-from soup_nlp.storage.system import deferred_signals
+from soup_nlp.storage.folders import MARK, claim, digest_of, files_in, made_files, recover, staged
+from soup_nlp.storage.system import deferred_signals, scratch
 
 
 def write(folder: Path, whole: bool = True, **files: str) -> None:
@@ -273,8 +264,7 @@ def test_permissions_are_those_of_the_old_files(tmp_path):
 
 
 KILLED = """
-import os, signal, sys
-from soup_nlp.storage import folders
+import os, shutil, signal, sys
 from soup_nlp.storage.folders import staged
 moves = int(sys.argv[2])
 def killing(function):
@@ -286,7 +276,7 @@ def killing(function):
         function(*args, **options)
     return wrapped
 os.replace = killing(os.replace)
-folders.shutil.rmtree = killing(folders.shutil.rmtree)
+shutil.rmtree = killing(shutil.rmtree)
 with staged(sys.argv[1], True) as new:
     for name in "acd":
         (new / name).write_text("2")
@@ -339,6 +329,19 @@ def test_a_move_that_fails_is_finished_later(tmp_path, monkeypatch):
             write(target, a="2", c="2")
     recover(target)
     assert content(target) == {"a": "2", "c": "2"}
+
+
+def test_files_that_another_process_moves_first_are_not_lost(tmp_path, monkeypatch):
+    replace = os.replace
+
+    def moved_twice(source, destination):
+        replace(source, destination)
+        if Path(destination) == tmp_path / "a":
+            replace(source, destination)
+
+    monkeypatch.setattr(os, "replace", moved_twice)
+    write(tmp_path, a="1", c="1")
+    assert content(tmp_path) == {"a": "1", "c": "1"}
 
 
 def test_scratch_folders_are_removed(tmp_path, monkeypatch):
