@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.linalg import norm
 
 from soup_nlp.arrays import Float, Int
 
@@ -36,73 +37,60 @@ def lift(s: State, ray: Float, superpixel: Int) -> tuple[Float, Float]:
 
 def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, float]:
     """Exact E and its weighted terms (paper Eq. 1 to 6 as in docs/formulation.md)."""
-    index = np.arange(len(s["lam"]))
-    A, B = (x[:, 0] for x in lift(s, e["anchor_ray"][:, None], index))
+    A, B = (x[:, 0] for x in lift(s, e["anchor_ray"][:, None], np.arange(len(s["lam"]))))
     T = s["lam"][:, None] * s["t"]
-    scene = float((e["share"] * s["lam"] * s["d"]).sum())
+    rho = 1 / A[:, 2]
+
+    def near(pairs: Int) -> Float:
+        """Power mean of the inverse depths of two anchors."""
+        return np.asarray((rho[pairs] ** 4).mean(axis=1) ** 0.25)
 
     def unit(pairs: Int) -> Float:
-        if bool(e["local_units"]):
-            return np.asarray((1 / A[pairs, 2] ** 4).mean(axis=1) ** -0.25)
-        return np.full(len(pairs), scene)
+        scene = (e["share"] * s["lam"] * s["d"]).sum()
+        return 1 / near(pairs) if bool(e["local_units"]) else np.full(len(pairs), scene)
 
     i, k = e["edges"].T
     length = unit(e["edges"]) * e["edge_unit"]
-    dR = s["R"][i] - s["R"][k]
-    shift = T[i] - T[k]
+    dR, shift = s["R"][i] - s["R"][k], T[i] - T[k]
     if bool(e["arap_at_anchors"]):
         shift = shift + np.einsum("eij,ej->ei", dR, (A[i] + A[k]) / 2)
-    stretch = _length(A[i] - A[k]) - _length(B[i] - B[k])
+    stretch = norm(A[i] - A[k], axis=-1) - norm(B[i] - B[k], axis=-1)
     parts = (
-        e["rotation_scale"] * np.sqrt((dR**2).sum((1, 2))),
-        _length(shift) / length,
+        e["rotation_scale"] * norm(dR, axis=(1, 2)),
+        norm(shift, axis=-1) / length,
         np.abs(stretch) / length,
     )
     leak = w["leak_arap"]
     cut = sum((1 - leak) * np.minimum(p, w["sigma_arap"]) + leak * p for p in parts)
-    arap = float((e["edge_weight"] * cut).sum())
-    distance = _length(e["anchor_ray"][i] - e["anchor_ray"][k])
-    rho = 1 / A[:, 2]
-    change = (rho[i] - rho[k]) / ((rho[i] ** 4 + rho[k] ** 4) / 2) ** 0.25
-    change = np.abs(change - e["prior_relief"])
-    prior = float((e["prior_weight"] * change / distance).sum())
+    relief = np.abs((rho[i] - rho[k]) / near(e["edges"]) - e["prior_relief"])
+    relief /= norm(e["anchor_ray"][i] - e["anchor_ray"][k], axis=-1)
     off = np.abs(np.log(A[i, 2]) - np.log(A[k, 2]) - e["depth_change"])
-    depth = float((e["depth_weight"] * off).sum())
-
-    image = lift(s, e["pixel_ray"], index)[1] @ e["K_next"].T
-    miss = _length(image[..., :2] / image[..., 2:] - e["pixel_target"])
-    proj = float((e["pixel_weight"] * np.minimum(miss, w["sigma_proj"])).sum())
+    image = lift(s, e["pixel_ray"], np.arange(len(A)))[1] @ e["K_next"].T
+    miss = norm(image[..., :2] / image[..., 2:] - e["pixel_target"], axis=-1)
 
     i, k = e["pairs"].T
-    Xi, Yi = lift(s, e["boundary_ray"], i)
-    Xk, Yk = lift(s, e["boundary_ray"], k)
+    gaps = [a - b for a, b in zip(lift(s, e["boundary_ray"], i), lift(s, e["boundary_ray"], k))]
     factor = e["pair_factor"] / (unit(e["pairs"]) * e["pair_unit"])
-    before = factor * np.sqrt(((Xi - Xk) ** 2).sum((1, 2)))
-    after = factor * np.sqrt(((Yi - Yk) ** 2).sum((1, 2)))
-    gap = np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
-    cont = float((e["pair_weight"] * gap).sum())
+    before, after = (factor * norm(gap, axis=(1, 2)) for gap in gaps)
     turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
-    orient = float((e["orient_weight"] * np.minimum(turn, w["sigma_orient"])).sum())
     # along the mean ray, whose length does not matter
     middle = e["boundary_ray"].sum(axis=1, keepdims=True)
     rhos = [1 / lift(s, middle, superpixel)[0][:, 0, 2] for superpixel in (i, k)]
-    sign = np.sign(e["order_weight"])
-    behind, front = np.where(sign > 0, rhos, rhos[::-1])
-    near = ((A[i, 2] ** -4 + A[k, 2] ** -4) / 2) ** 0.25
-    lack = ((1 + e["order_step"]) * behind - front) / near
+    behind, front = np.where(e["order_weight"] > 0, rhos, rhos[::-1])
+    lack = ((1 + e["order_step"]) * behind - front) / near(e["pairs"])
     hinge = (lack + np.sqrt(lack**2 + 0.01**2)) / 2
-    order = float((sign * e["order_weight"] * hinge).sum())
-    terms = {"arap": arap, "proj": proj, "cont": cont, "orient": orient, "prior": prior}
-    if e["depth_weight"].any():
-        terms["depth"] = depth
-    if e["order_weight"].any():
-        terms["order"] = order
-    terms = {name: w[name] * value for name, value in terms.items()}
+    gap = np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
+    costs = {
+        "arap": e["edge_weight"] * cut,
+        "proj": e["pixel_weight"] * np.minimum(miss, w["sigma_proj"]),
+        "cont": e["pair_weight"] * gap,
+        "orient": e["orient_weight"] * np.minimum(turn, w["sigma_orient"]),
+        "prior": e["prior_weight"] * relief,
+        **({"depth": e["depth_weight"] * off} if e["depth_weight"].any() else {}),
+        **({"order": np.abs(e["order_weight"]) * hinge} if e["order_weight"].any() else {}),
+    }
+    terms = {name: w[name] * float(cost.sum()) for name, cost in costs.items()}
     return {"total": sum(terms.values()), **terms}
-
-
-def _length(v: Float) -> Float:
-    return np.asarray(np.sqrt((v**2).sum(-1)))
 
 
 def constraints(s: State, rim_ray: Float, min_facing: float) -> dict[str, Float]:
@@ -150,15 +138,16 @@ def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float
     z, gt = z[compared], gt[compared]
     if not len(z):
         return {"coverage": 0.0, "n_pixels": 0.0}
-    ratio = gt / z
+    ratio, factor = gt / z, 1.0
     if rule == "median":
         factor = float(np.median(ratio))
     elif rule == "mre":
+        # the weighted median of the ratios
         order = np.argsort(ratio)
         mass = np.cumsum(1.0 / ratio[order])
         factor = float(ratio[order][np.searchsorted(mass, 0.5 * mass[-1])])
-    else:
-        factor = float((z * gt).sum() / (z * z).sum()) if rule == "lsq" else 1.0
+    elif rule == "lsq":
+        factor = float((z * gt).sum() / (z * z).sum())
     off = np.abs(gt - factor * z)
     fold = np.maximum(gt / (factor * z), factor * z / gt)
     return {

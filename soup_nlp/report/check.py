@@ -7,7 +7,7 @@ shares no code with the solver. Everything else is compared with a SHA-256 or a 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,6 @@ from soup_nlp.storage.files import as_path, read_json
 from soup_nlp.storage.folders import digest_of, recover
 from soup_nlp.storage.h5_files import DIGEST, RECORD, read_attrs, read_digest, read_h5
 from soup_nlp.storage.store import require
-
-Entries = Mapping[str, Any]
 
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
 """Rounding of a recomputed number: relative to it or to its sum, and absolute."""
@@ -106,24 +104,14 @@ class CheckReport:
 
 @dataclass(frozen=True)
 class Stored:
-    """Contents of a result folder: summary.json, arrays and attributes of result.h5."""
+    """Contents of a result folder: entries of summary.json, arrays of result.h5."""
 
     folder: Path
-    claims: Entries
-    tree: Entries
-    attrs: Entries
-
-    @property
-    def weights(self) -> dict[str, float]:
-        """Constants of the energy and of the visibility constraint."""
-        return {k: float(v) for k, v in self.tree["weights"].items()}
+    claims: Mapping[str, Any]
+    tree: dict[str, Any]
 
     def soup(self, which: str) -> dict[str, Float]:
-        """Arrays of a soup.
-
-        Raises:
-            DataError: one is missing.
-        """
+        """Arrays of a soup; DataError if one is missing."""
         keys = ("lam", "n", "d", "R", "t")
         return {k: np.asarray(require(self.tree, f"{which}/{k}"), float) for k in keys}
 
@@ -137,10 +125,9 @@ def check_folder(folder: str | Path) -> CheckReport:
     folder = as_path(folder, "result folder")
     recover(folder)
     claims = read_json(folder / "summary.json", "summary.json")
-    tree, attrs = read_h5(folder / "result.h5"), read_attrs(folder / "result.h5")
+    stored = Stored(folder, claims, read_h5(folder / "result.h5"))
     try:
-        require_layout(tree)
-        stored = Stored(folder, claims, tree, attrs)
+        require_layout(stored.tree)
         return CheckReport(tuple(claim for check in CHECKS for claim in check(stored)))
     except MISFITS as error:
         lacks = isinstance(error, KeyError)
@@ -155,40 +142,36 @@ def _number(value: Any) -> float:
 
 def _energies(r: Stored) -> Iterator[Claim]:
     """Exact E by term of start, NLP and solution, from planes, motions and pixels."""
-    e, weights = r.tree["energy"], r.weights
+    e, weights = r.tree["energy"], {k: float(v) for k, v in r.tree["weights"].items()}
     # E sums differences of numbers as large as pixel coordinates and focal lengths
     used = np.abs(e["pixel_target"][e["pixel_weight"] > 0])
     size = max(float(used.max(initial=1.0)), float(np.abs(e["K_next"]).max()))
     slack = ROUNDINGS * float(np.finfo(float).eps) * len(e["anchor_ray"]) * size
     for which in ("start", "nlp", "solution"):
-        found = recompute.energy(r.soup(which), e, weights)
+        found, claimed = recompute.energy(r.soup(which), e, weights), r.claims["energy"][which]
         factor = max(1.0, *(weights[term] for term in found if term != "total"))
+        tolerance = RELATIVE * abs(found["total"]) + slack * factor
         for term, value in found.items():
-            claimed = _number(r.claims["energy"][which][term])
-            tolerance = RELATIVE * abs(found["total"]) + slack * factor
-            yield Claim(f"energy {which} {term}", claimed, value, tolerance)
+            yield Claim(f"energy {which} {term}", _number(claimed[term]), value, tolerance)
 
 
 def _constraints(r: Stored) -> Iterator[Claim]:
     """Largest violation of every kind, of the solution, the NLP's soup and Ipopt's answer."""
-    limits = {"solution": ("residuals", LIMITS)}
-    within = 0.0
+    rim, facing = require(r.tree, "energy/rim_ray"), float(r.tree["weights"]["min_facing"])
+    claimed, limits, within = {"solution": r.claims["residuals"]}, {"solution": LIMITS}, 0.0
     if r.claims["status"] != "Skipped":
+        claimed |= {which: r.claims[f"{which}_residuals"] for which in ("nlp", "answer")}
         # the limit of Ipopt's answer is the claimed violation
         within = float(r.claims["residuals"]["nlp_infeasibility"]) * (1 + 1e-6) + ABSOLUTE
-        answer = dict.fromkeys(("so3", "normal", "simplex"), within)
-        limits |= {"nlp": ("nlp_residuals", LIMITS), "answer": ("answer_residuals", answer)}
-    rim = require(r.tree, "energy/rim_ray")
-    for which, (key, most) in limits.items():
-        violations = recompute.constraints(r.soup(which), rim, r.weights["min_facing"])
-        for name, limit in most.items():
+        limits |= {"nlp": LIMITS, "answer": dict.fromkeys(("so3", "normal", "simplex"), within)}
+    for which, kinds in limits.items():
+        violations = recompute.constraints(r.soup(which), rim, facing)
+        for name, limit in kinds.items():
             # NaN counts as an infinite violation
             violation = np.nan_to_num(violations[name], nan=np.inf, posinf=np.inf)
-            value = float(violation.max())
-            claimed = _number(r.claims[key][name])
+            value, claim = float(violation.max()), _number(claimed[which][name])
             note = "" if name == "simplex" else _worst(violation, limit)
-            tolerance = 1e-3 * value + ABSOLUTE
-            yield Claim(f"{which} {name}", claimed, value, tolerance, limit, note)
+            yield Claim(f"{which} {name}", claim, value, 1e-3 * value + ABSOLUTE, limit, note)
     if r.claims["delivered"] == "constrained NLP":
         a, b = r.soup("answer"), r.soup("nlp")
         # the gauge decides the unit of length and how a distance is split into lam and d
@@ -212,16 +195,16 @@ def _depths(r: Stored) -> Iterator[Claim]:
     """Largest relative difference of the depth maps of the reference frame from the planes."""
     labels, K = require(r.tree, "segmentation/labels"), require(r.tree, "input/K_ref")
     for which in ("solution", "nlp", "start"):
-        if DEPTHS[which] in r.tree["depth"]:
-            depth = require(r.tree, f"depth/{DEPTHS[which]}")
-            z = recompute.depth_map(r.soup(which), labels, K)
-            both = np.isfinite(depth) & np.isfinite(z)
-            lost = float((np.isfinite(depth) != np.isfinite(z)).mean())
-            off = float(np.abs(z[both] / depth[both] - 1).max(initial=0.0))
-            note = f"{lost:.1%} of the pixels are known in one only" if lost > LOST else ""
-            yield Claim(
-                f"depth map {which}", 0.0, off if lost <= LOST else 1.0, RELATIVE, note=note
-            )
+        if DEPTHS[which] not in r.tree["depth"]:
+            continue
+        depth = require(r.tree, f"depth/{DEPTHS[which]}")
+        z = recompute.depth_map(r.soup(which), labels, K)
+        both = np.isfinite(depth) & np.isfinite(z)
+        off, note = float(np.abs(z[both] / depth[both] - 1).max(initial=0.0)), ""
+        lost = float((np.isfinite(depth) != np.isfinite(z)).mean())
+        if lost > LOST:
+            off, note = 1.0, f"{lost:.1%} of the pixels are known in one only"
+        yield Claim(f"depth map {which}", 0.0, off, RELATIVE, note=note)
 
 
 def _scores(r: Stored) -> Iterator[Claim]:
@@ -235,17 +218,16 @@ def _scores(r: Stored) -> Iterator[Claim]:
         constant = mre if name == "constant" else constant
         if "skill" in claim and constant > 0:
             found["skill"] = 1 - mre / constant
-        first, *rows = [
-            Claim(k, _number(claim[k]), v, RELATIVE * abs(v) + ABSOLUTE)
-            for k, v in {"mre": mre, **found}.items()
-        ]
+        every = {"mre": mre, **found}
+        slack = {k: RELATIVE * abs(v) + ABSOLUTE for k, v in every.items()}
+        first, *rows = [Claim(k, _number(claim[k]), v, slack[k]) for k, v in every.items()]
         yield replace(first, name=f"mre {name}")
         note = ", ".join(f"{c.name} is {c.found:.6g}" for c in rows if not c.ok)
         right = float(sum(c.ok for c in rows))
         yield Claim(f"other scores {name}", float(len(rows)), right, note=note)
 
 
-def _compared(tree: Entries, name: str) -> tuple[Float, Float]:
+def _compared(tree: Mapping[str, Any], name: str) -> tuple[Float, Float]:
     """Estimate and truth of a row of scores."""
     if name == "solution_next":
         return require(tree, "depth/next"), require(tree, "truth/depth_next")
@@ -263,15 +245,6 @@ def _compared(tree: Entries, name: str) -> tuple[Float, Float]:
     return (np.ones_like(gt) if name == "constant" else z), gt
 
 
-def _entries(r: Stored) -> Iterator[Claim]:
-    """Every entry of summary.json against the copy in result.h5."""
-    written = _leaves(json.loads(str(require(r.tree, f"{RECORD}/summary"))))
-    now = _leaves(r.claims)
-    changed = sorted(k for k in written.keys() | now.keys() if written.get(k, k) != now.get(k, k))
-    note = ", ".join(changed[:3])
-    yield Claim("entries of summary.json", 1.0, float(not changed), note=note, how=WRITTEN)
-
-
 def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
     """Leaves of nested mappings and lists by their dotted place."""
     if isinstance(tree, Mapping | list) and tree:
@@ -280,30 +253,26 @@ def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
     return {place.removeprefix("."): tree}
 
 
-def _files(r: Stored) -> Iterator[Claim]:
-    """Every other file against its SHA-256, and the arrays and attributes of result.h5."""
-    digest = read_digest(r.folder / "result.h5")
-    notes = {"contents of result.h5": "" if r.attrs.get(DIGEST) == digest else "changed"}
+def _written(r: Stored) -> Iterator[Claim]:
+    """Entries of summary.json against their copy, all of result.h5 and other files by SHA-256."""
+    copy, now = _leaves(json.loads(str(require(r.tree, f"{RECORD}/summary")))), _leaves(r.claims)
+    changed = sorted(k for k in copy.keys() | now.keys() if copy.get(k, k) != now.get(k, k))
+    same = read_attrs(r.folder / "result.h5").get(DIGEST) == read_digest(r.folder / "result.h5")
+    notes = {
+        "entries of summary.json": ", ".join(changed[:3]),
+        "contents of result.h5 as written": "" if same else "changed",
+    }
     files = recorded_files(r.tree)
     if not files:
-        notes["files"] = "result.h5 has no record of the files"
-    # another claim compares the entries of summary.json
+        notes["files as written"] = "result.h5 has no record of the files"
     for name in sorted(files.keys() - {"summary.json"}):
-        path = r.folder / name
-        if ".." in name or not path.is_file():
-            notes[name] = "missing"
-        else:
-            notes[name] = "" if digest_of(path) == files[name] else "changed"
+        path, note = r.folder / name, "missing"
+        if ".." not in name and path.is_file():
+            note = "" if digest_of(path) == files[name] else "changed"
+        notes[f"{name} as written"] = note
     for name, note in notes.items():
-        yield Claim(f"{name} as written", 1.0, float(not note), note=note, how=WRITTEN)
+        yield Claim(name, 1.0, float(not note), note=note, how=WRITTEN)
 
 
-CHECKS: tuple[Callable[[Stored], Iterator[Claim]], ...] = (
-    _energies,
-    _constraints,
-    _depths,
-    _scores,
-    _entries,
-    _files,
-)
+CHECKS = (_energies, _constraints, _depths, _scores, _written)
 """The table of the check; each function says in its first line what it recomputes."""

@@ -19,12 +19,7 @@ from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import DataError
 from soup_nlp.pipeline import run as pipeline
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.figures import (
-    overview,
-    write_clipped_depth_png16,
-    write_picture,
-    write_png,
-)
+from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture, write_png
 from soup_nlp.report.findings import summary
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import record_of, recorded_files, result_tree

@@ -10,13 +10,7 @@ import numpy as np
 from soup_nlp.evaluate.metrics import DepthMetrics, skill
 from soup_nlp.evaluate.scoring import SURE
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import (
-    certainty,
-    certainty_lines,
-    flow_words,
-    found_words,
-    hints,
-)
+from soup_nlp.report.findings import certainty, certainty_lines, flow_words, found_words, hints
 from soup_nlp.report.result import PAGE
 
 STATUS = {
