@@ -16,14 +16,7 @@ from soup_nlp.evaluate import recompute
 from soup_nlp.export.artefact import CHOICES, STUB, fingerprint, read_manifest
 from soup_nlp.export.nl import readable_names
 from soup_nlp.export.sol import Sol, read_sol
-from soup_nlp.export.verify import (
-    ENERGY_SLACK,
-    Kind,
-    Limits,
-    examine,
-    kind,
-    violations,
-)
+from soup_nlp.export.verify import ENERGY_SLACK, Kind, Limits, examine, kind, violations
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout, TangentLayout

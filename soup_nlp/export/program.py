@@ -163,17 +163,12 @@ def split(group: Group, theta: Float) -> Split:
     r, c = jacobian.sparsity().get_triplet()
     row, column = np.asarray(r, np.int64), np.asarray(c, np.int64)
     entries = ca.vertcat(*jacobian.nonzeros()) if len(row) else ca.SX(0, 1)
-    linear = np.zeros(len(row), bool)
-    if len(row):
-        linear = ~np.asarray(ca.which_depends(entries, kernel.x, 1, True), bool)
-    coefficient = np.zeros((group.size, len(row)))
-    if linear.any():
-        kept = ca.vertcat(*[entries[int(k)] for k in np.flatnonzero(linear)])
-        function = ca.Function("c", [kernel.x, kernel.row, kernel.theta], [kept])
-        nowhere = np.zeros((kernel.nx, group.size))
-        shared = np.repeat(np.asarray(theta, float)[:, None], group.size, axis=1)
-        value = function.map(group.size)(nowhere, table.data.T, shared)
-        coefficient[:, linear] = np.asarray(value).reshape(-1, group.size).T
+    linear = ~np.asarray(ca.which_depends(entries, kernel.x, 1, True), bool)
+    function = ca.Function("c", [kernel.x, kernel.row, kernel.theta], [entries])
+    shared = np.repeat(np.asarray(theta, float)[:, None], group.size, axis=1)
+    value = function.map(group.size)(np.zeros((kernel.nx, group.size)), table.data.T, shared)
+    # nonlinear entries are not constant, and may be NaN at 0
+    coefficient = np.where(linear, np.asarray(value).T, 0.0)
     parts = []
     for k in range(out.numel()):
         part, gone = out[k], column[linear & (row == k)]
