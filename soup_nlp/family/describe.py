@@ -67,10 +67,10 @@ def classification(nlp: NLP, kinds: dict[str, Any]) -> str:
     It has letters for the objective and the constraints, R for twice differentiable, 2 for second
     derivatives, M for a modelling exercise, Y if there are slack variables, n and m.
     """
-    place = {word: number for number, word in CLASSES.items()}
-    rows = max(place[c["class"]] for c in kinds["constraint_classes"].values())
+    number_of = {word: number for number, word in CLASSES.items()}
+    rows = max(number_of[c["class"]] for c in kinds["constraint_classes"].values())
     internal = nlp.x_names()[-1].startswith("s_")
-    letters = LETTERS[place[kinds["objective_class"]]] + LETTERS[max(rows, 1)]
+    letters = LETTERS[number_of[kinds["objective_class"]]] + LETTERS[max(rows, 1)]
     return f"{letters}R2-M{'Y' if internal else 'N'}-{nlp.nx}-{nlp.ng}"
 
 
@@ -82,28 +82,28 @@ def rank(matrix: sparse.csr_matrix) -> int:
     """
     left = sparse.csr_matrix(matrix)
     left.eliminate_zeros()
-    found = 0
+    independent = 0
     while left.shape[0]:
         count = np.bincount(left.indices, minlength=left.shape[1])
         largest = np.abs(left).max() if left.nnz else 0.0
-        alone = (count == 1)[left.indices] & (np.abs(left.data) > RANK * largest)
+        single = (count == 1)[left.indices] & (np.abs(left.data) > RANK * largest)
         owner = np.repeat(np.arange(left.shape[0]), np.diff(left.indptr))
-        gone = np.zeros(left.shape[0], bool)
-        gone[owner[alone]] = True
-        if not gone.any():
+        removed = np.zeros(left.shape[0], bool)
+        removed[owner[single]] = True
+        if not removed.any():
             break
-        found += int(gone.sum())
-        left = left[~gone]
+        independent += int(removed.sum())
+        left = left[~removed]
     if not left.nnz:
-        return found
+        return independent
     _, block = connected_components(left @ left.T, directed=False)
     order = np.argsort(block, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(block[order])) + 1):
         part = left[rows]
         used = np.unique(part.indices)
         if len(used):
-            found += int(np.linalg.matrix_rank(part[:, used].toarray(), rtol=RANK))
-    return found
+            independent += int(np.linalg.matrix_rank(part[:, used].toarray(), rtol=RANK))
+    return independent
 
 
 def qualification(nlp: NLP, x: Float) -> dict[str, Any]:

@@ -246,8 +246,8 @@ def _share(best: Entry) -> str:
 
 def _reached(entries: Sequence[Entry]) -> list[str]:
     """What each solver reached from each start: objective above the best known one, CPU seconds."""
-    known = [e for e in entries if e["runs"]]
-    solvers = list(dict.fromkeys(s for e in known for s in e["runs"]))
+    measured = [e for e in entries if e["runs"]]
+    solvers = list(dict.fromkeys(s for e in measured for s in e["runs"]))
     if not solvers:
         return []
 
@@ -261,7 +261,7 @@ def _reached(entries: Sequence[Entry]) -> list[str]:
         gap = f"{100 * (objective - best) / abs(best):+.2g} %"
         return f"{f'**{gap}**' if verified else gap}, {seconds:g} of {limit:g} s"
 
-    rows = [[e["short"], *(cell(e, s) for s in solvers)] for e in known]
+    rows = [[e["short"], *(cell(e, s) for s in solvers)] for e in measured]
     return [
         "",
         "## What solvers reached",

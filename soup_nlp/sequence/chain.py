@@ -65,14 +65,14 @@ class SolvedPair:
         return self.result.depths[1], carried(self.static, self.result.reconstruction) > 0
 
 
-def read_pair(first: int, second: int, place: Path) -> SolvedPair:
+def read_pair(first: int, second: int, folder: Path) -> SolvedPair:
     """The pair of two frames from its result folder."""
-    result = load(place)
+    result = load(folder)
     tree = result.tree
     parallax = float(np.median(tree["start"]["parallax"][result.components.of_superpixel == 0]))
     # a chain holds many pairs, whose other arrays it does not need
-    kept = replace(result, tree={})
-    return SolvedPair(first, second, kept, dict(tree.get("truth", {})), parallax)
+    without_arrays = replace(result, tree={})
+    return SolvedPair(first, second, without_arrays, dict(tree.get("truth", {})), parallax)
 
 
 def carried(of_pixel: NDArray[np.generic], rec: Reconstruction) -> NDArray[Any]:
@@ -233,25 +233,25 @@ class Chain:
 
     def depth(self, frame: int) -> Float:
         """(H, W) z of a frame in the unit of the chain."""
-        pair, place = self.seen(frame)
-        return self.scales[pair] * self.pairs[pair].result.depths[place]
+        pair, side = self.seen(frame)
+        return self.scales[pair] * self.pairs[pair].result.depths[side]
 
     def image(self, frame: int) -> Image:
         """(H, W, 3) uint8 RGB of a frame."""
-        pair, place = self.seen(frame)
-        return self.pairs[pair].result.images[place]
+        pair, side = self.seen(frame)
+        return self.pairs[pair].result.images[side]
 
     def camera(self, frame: int) -> Float:
         """(3, 3) intrinsics of a frame, pixels."""
-        pair, place = self.seen(frame)
-        return self.pairs[pair].result.K[place]
+        pair, side = self.seen(frame)
+        return self.pairs[pair].result.K[side]
 
     def labels(self, frame: int) -> Labels:
         """(H, W) components of a frame; -1 at pixels that only the last frame shows."""
-        pair, place = self.seen(frame)
+        pair, side = self.seen(frame)
         result = self.pairs[pair].result
         labels = result.components.of_pixel
-        return np.asarray(carried(labels, result.reconstruction) if place else labels, np.int32)
+        return np.asarray(carried(labels, result.reconstruction) if side else labels, np.int32)
 
     def points(self, frame: int) -> Float:
         """(H, W, 3) points of a frame but the last, in world coordinates."""
@@ -331,8 +331,8 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
     Returns:
         Label after by label before.
     """
-    known = before >= 0
-    share = overlap_shares(before[known], after[known])
+    visible = before >= 0
+    share = overlap_shares(before[visible], after[visible])
     # the background has no track
     share[0], share[:, 0] = 0, 0
     share[share < SAME] = 0
@@ -348,9 +348,9 @@ def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dic
         counts: Number of components of every pair, with the background.
     """
     out: list[dict[int, int]] = []
-    fresh = count(1)
-    for known, total in zip([{}, *matches], counts, strict=True):
-        numbers = {new: out[-1][old] for old, new in known.items()}
-        rest = {label: next(fresh) for label in range(1, total) if label not in numbers}
+    new_number = count(1)
+    for match, total in zip([{}, *matches], counts, strict=True):
+        numbers = {new: out[-1][old] for old, new in match.items()}
+        rest = {label: next(new_number) for label in range(1, total) if label not in numbers}
         out.append({0: 0, **numbers, **rest})
     return out

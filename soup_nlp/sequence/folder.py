@@ -131,11 +131,11 @@ def convert_chain(
     Raises:
         ConfigError: a format is not one of a chain.
     """
-    wrong = [name for name in names if name not in FORMATS]
-    if wrong or not names:
+    unknown = [name for name in names if name not in FORMATS]
+    if unknown or not names:
         raise ConfigError(
             "a chain has no such format",
-            found=", ".join(wrong) or "no format",
+            found=", ".join(unknown) or "no format",
             expected=", ".join(FORMATS),
             hint="formats of single pairs: soup-nlp convert DIR/pairs/000_001 --to ...",
         )
@@ -244,17 +244,17 @@ def write_video(path: Path, pictures: list[Image]) -> None:
     # encoders need even sides
     size = width - width % 2, height - height % 2
     # OpenCV needs a name in UTF-8
-    with scratch() as place:
-        made = place / "video.mp4"
+    with scratch() as folder:
+        file = folder / "video.mp4"
         coder = cv2.VideoWriter.fourcc(*"mp4v")
-        video = cv2.VideoWriter(str(made), coder, RATE, size)
+        video = cv2.VideoWriter(str(file), coder, RATE, size)
         for picture in pictures:
             # the encoder would drop frames of another size
             same = picture.shape[:2] == (height, width)
-            shown = picture[: size[1], : size[0]] if same else cv2.resize(picture, size)
-            video.write(cv2.cvtColor(shown, cv2.COLOR_RGB2BGR))
+            resized = picture[: size[1], : size[0]] if same else cv2.resize(picture, size)
+            video.write(cv2.cvtColor(resized, cv2.COLOR_RGB2BGR))
         video.release()
-        write_bytes(path, made.read_bytes())
+        write_bytes(path, file.read_bytes())
 
 
 def _cloud(path: Path, chain: Chain, frame: int, name: str) -> None:

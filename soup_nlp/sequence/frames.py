@@ -101,8 +101,8 @@ def find_images(source: Path) -> list[Path]:
     root = next(folder for folder in (source, *source.parents) if folder.is_dir())
     # glob leaves out hidden files and folders
     if root == source:
-        every = [root / name for name in glob("*", root_dir=root)]
-        images = [p for p in every if p.suffix.lower() in IMAGES]
+        files = [root / name for name in glob("*", root_dir=root)]
+        images = [p for p in files if p.suffix.lower() in IMAGES]
         chosen = [p for p in images if p.match(LAYOUT)] or images
     else:
         matches = glob(str(source.relative_to(root)), root_dir=root, recursive=True)
@@ -139,8 +139,8 @@ def depth_files(folder: Path) -> list[Path]:
         DataError: there is none.
     """
     folder = as_path(folder, "folder of depth maps")
-    every = [p for p in folder.glob("*") if p.suffix.lower() in DEPTHS]
-    depths = [p for p in every if p.name.startswith("depth_")] or every
+    maps = [p for p in folder.glob("*") if p.suffix.lower() in DEPTHS]
+    depths = [p for p in maps if p.name.startswith("depth_")] or maps
     if not depths:
         raise DataError(
             "folder holds no depth maps", where=folder, expected="one for every frame of the chain"
@@ -252,15 +252,15 @@ def key_frames(images: Sequence[Path], K: Float, most: int | None = None) -> lis
     chosen, last = [0], len(images) - 1
     while chosen[-1] < last and (most is None or len(chosen) < most):
         current = chosen[-1]
-        one, scale = read(images[current])
+        image, scale = read(images[current])
         camera = np.diag([scale, scale, 1.0]) @ K
         best = current + 1
-        for other in range(current + 1, min(current + MAX_STEP, last) + 1):
-            moved = parallax(one, read(images[other])[0], camera)
-            if moved is None:
+        for candidate in range(current + 1, min(current + MAX_STEP, last) + 1):
+            shift = parallax(image, read(images[candidate])[0], camera)
+            if shift is None:
                 break
-            best = other
-            if moved >= KEY_PARALLAX:
+            best = candidate
+            if shift >= KEY_PARALLAX:
                 break
         chosen.append(best)
     return chosen
@@ -284,20 +284,20 @@ def parallax(one: Image, other: Image, K: Float) -> float | None:
         return None
     options = {"winSize": (21, 21), "maxLevel": 4}
     end, forward, _ = cv2.calcOpticalFlowPyrLK(one, other, start, None, **options)
-    again, backward, _ = cv2.calcOpticalFlowPyrLK(other, one, end, None, **options)
-    error = np.linalg.norm(start - again, axis=2).ravel()
-    good = (forward.ravel() > 0) & (backward.ravel() > 0) & (error < 1)
-    if good.sum() < max(MIN_POINTS, MIN_TRACKED * len(good)):
+    back, backward, _ = cv2.calcOpticalFlowPyrLK(other, one, end, None, **options)
+    error = np.linalg.norm(start - back, axis=2).ravel()
+    tracked = (forward.ravel() > 0) & (backward.ravel() > 0) & (error < 1)
+    if tracked.sum() < max(MIN_POINTS, MIN_TRACKED * len(tracked)):
         return None
-    p, q = (x.reshape(-1, 2)[good].astype(np.float64) for x in (start, end))
+    p, q = (x.reshape(-1, 2)[tracked].astype(np.float64) for x in (start, end))
     rays = np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(K).T
 
-    def left(turn: Float) -> Float:
+    def residual(turn: Float) -> Float:
         seen = rays @ exp(turn).T @ K.T
         return np.asarray(seen[:, :2] / seen[:, 2:] - q)
 
-    turn = least_squares(lambda w: left(w).ravel(), np.zeros(3), loss="soft_l1").x
-    return float(np.median(np.linalg.norm(left(turn), axis=1))) / max(one.shape)
+    turn = least_squares(lambda w: residual(w).ravel(), np.zeros(3), loss="soft_l1").x
+    return float(np.median(np.linalg.norm(residual(turn), axis=1))) / max(one.shape)
 
 
 def _small(path: Path) -> tuple[Image, float]:

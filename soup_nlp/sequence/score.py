@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,11 @@ from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import depth_metrics, true_pixels
 from soup_nlp.sequence.chain import Chain
+
+LINK_HEADS = ["pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", ""]
+"""Heads of the columns of `link_rows`."""
+WIDTHS = (16, 13, 11, 9, 8)
+"""Characters of these columns in the terminal, after the first one, which has ten."""
 
 
 def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any] | None:
@@ -28,53 +32,44 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     stored = [*(pair.truth.get("depth_ref") for pair in chain.pairs)]
     stored.append(chain.pairs[-1].truth.get("depth_next"))
     given = enumerate(stored if truths is None else truths)
-    known = {k: z for k, z in given if z is not None and true_pixels(z, None).any()}
-    if not known:
+    true = {k: z for k, z in given if z is not None and true_pixels(z, None).any()}
+    if not true:
         return None
-    depths = {k: chain.depth(k) for k in known}
-    for k, z in known.items():
-        if z.shape != depths[k].shape:
+    depths, ratios = {k: chain.depth(k) for k in true}, []
+    for k, z in depths.items():
+        if z.shape != true[k].shape:
             raise DataError(
                 "truth and frame differ in size",
                 where=f"frame {k}",
-                found=z.shape,
-                expected=depths[k].shape,
+                found=true[k].shape,
+                expected=z.shape,
             )
-    ratio = []
-    for k, z in depths.items():
-        good = true_pixels(known[k], None) & (z > 0)
-        ratio.append(known[k][good] / z[good])
-    one = float(np.median(np.concatenate(ratio)))
+        compared = true_pixels(true[k], None) & (z > 0)
+        ratios.append(true[k][compared] / z[compared])
+    scale = float(np.median(np.concatenate(ratios)))
     frames = []
     for k, z in depths.items():
-        alone = depth_metrics(z, known[k])
-        shared = depth_metrics(one * z, known[k], scale="none")
-        row = {"frame": k, "mre_own_scale": alone.mre, "mre_one_scale": shared.mre}
-        frames.append({**row, "own_scale": alone.scale, "coverage": alone.coverage})
-    means = {key: float(np.mean([f[key] for f in frames])) for key in _KEYS}
-    links = []
-    for k, (a, b) in enumerate(pairwise(chain.pairs)):
-        if k in known and k + 1 in known:
-            true = [
-                depth_metrics(p.result.depths[0], known[i]).scale for i, p in ((k, a), (k + 1, b))
-            ]
-            estimated = chain.scales[k + 1] / chain.scales[k]
-            links.append({"pairs": [k, k + 1], "estimated": estimated, "true": true[1] / true[0]})
+        separate = depth_metrics(z, true[k])
+        common = depth_metrics(scale * z, true[k], scale="none")
+        row = {"frame": k, "mre_own_scale": separate.mre, "mre_one_scale": common.mre}
+        frames.append({**row, "own_scale": separate.scale, "coverage": separate.coverage})
+    mre = {key: float(np.mean([f[key] for f in frames])) for key in list(row)[1:]}
+    own = {f["frame"]: f["own_scale"] for f in frames}
+    # the true ratio is that of the pairs' own depths, without the scales of the chain
+    ratio = chain.scales[1:] / chain.scales[:-1]
+    links = [
+        {"pairs": [k, k + 1], "estimated": r, "true": r * own[k + 1] / own[k]}
+        for k, r in enumerate(ratio)
+        if own.keys() >= {k, k + 1}
+    ]
     return {
-        "scale": one,
+        "scale": scale,
         "frames": frames,
-        **means,
-        "cost": means[_KEYS[1]] / means[_KEYS[0]] - 1,
+        **mre,
+        "cost": mre["mre_one_scale"] / mre["mre_own_scale"] - 1,
         "links": links,
         "path": path_error(chain),
     }
-
-
-_KEYS = ("mre_own_scale", "mre_one_scale")
-
-
-LINK_HEADS = ["pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", ""]
-"""Heads of the columns of `link_rows`."""
 
 
 def link_rows(contents: Mapping[str, Any]) -> list[list[str]]:
@@ -83,9 +78,9 @@ def link_rows(contents: Mapping[str, Any]) -> list[list[str]]:
     rows = []
     for k in contents["links"]:
         a, b = k["pairs"]
-        known = f"{true[a, b]:.3f}" if (a, b) in true else ""
+        true_ratio = f"{true[a, b]:.3f}" if (a, b) in true else ""
         note = "bridge" if k["bridge"] else "a guess" if k["flagged"] else ""
-        numbers = [f"{k['ratio']:.3f}", f"{k['spread']:.3f}", known, str(k["pixels"])]
+        numbers = [f"{k['ratio']:.3f}", f"{k['spread']:.3f}", true_ratio, str(k["pixels"])]
         rows.append([f"{a}, {b}", *numbers, note])
     return rows
 
@@ -103,12 +98,10 @@ def score_text(scores: Mapping[str, Any]) -> str:
 
 def chain_lines(chain: Chain, contents: Mapping[str, Any]) -> list[str]:
     """Scales, links and, with a truth, errors of a chain for the terminal."""
-    widths = (10, 16, 13, 11, 9, 8)
-    rows = [LINK_HEADS, *link_rows(contents)]
     lines = [str(chain)]
-    for first, *rest in rows:
-        cells = "".join(f"{cell:>{width}}" for cell, width in zip(rest, widths[1:]))
-        lines.append(f"{first:<{widths[0]}}{cells}".rstrip())
+    for pairs, *cells in [LINK_HEADS, *link_rows(contents)]:
+        padded = [f"{cell:>{width}}" for cell, width in zip(cells, WIDTHS, strict=True)]
+        lines.append(f"{pairs:<10}{''.join(padded)}".rstrip())
     long = [track for track in contents["tracks"] if len(track["path"]) > 2]
     lines.append(f"tracks      {len(long)} components followed over two pairs or more")
     if contents["score"]:
@@ -131,20 +124,19 @@ def score_lines(scores: Mapping[str, Any] | None) -> list[str]:
 
 def path_error(chain: Chain) -> dict[str, float] | None:
     """Error of the camera positions after a similarity; None if the true path is unknown."""
-    motions = [p.truth.get("motions") for p in chain.pairs]
-    if any(m is None or not np.isfinite(m[0]).all() for m in motions):
-        return None
-    pose, true = np.eye(4), [np.zeros(3)]
-    for m in motions:
-        assert m is not None
+    pose, positions = np.eye(4), [np.zeros(3)]
+    for pair in chain.pairs:
         # component 0 of a truth is the static scene
-        pose = pose @ np.linalg.inv(m[0])
-        true.append(pose[:3, 3])
-    target = np.array(true)
-    length = float(np.linalg.norm(np.diff(target, axis=0), axis=1).sum())
-    if length == 0 or len(target) < 3:
+        motions = pair.truth.get("motions")
+        if motions is None or not np.isfinite(motions[0]).all():
+            return None
+        pose = pose @ np.linalg.inv(motions[0])
+        positions.append(pose[:3, 3])
+    true = np.array(positions)
+    length = float(np.linalg.norm(np.diff(true, axis=0), axis=1).sum())
+    if length == 0 or len(true) < 3:
         return None
-    error = target - aligned(np.array([m.t for m in chain.world_from_camera]), target)
+    error = true - aligned(np.array([m.t for m in chain.world_from_camera]), true)
     rmse = float(np.sqrt((error**2).sum(axis=1).mean()))
     return {"rmse": rmse, "length": length, "share": rmse / length}
 

@@ -100,11 +100,9 @@ def solve_chain(
     name, subject = named(frames, folder)
     if intrinsics is not None and fov is not None:
         raise ConfigError("two cameras are named", found="intrinsics and fov", expected="one")
-    camera: Raw = {"undistort": True} if undistort else {}
-    if fov is not None:
-        camera["fov"] = fov
-    if intrinsics is not None:
-        camera["intrinsics"] = intrinsics if isinstance(intrinsics, str) else [*intrinsics]
+    values = intrinsics if isinstance(intrinsics, str | None) else [*intrinsics]
+    keys: Raw = {"undistort": undistort or None, "fov": fov, "intrinsics": values}
+    camera = {key: value for key, value in keys.items() if value is not None}
     step = _step(stride)
     # frames of a video, or of arrays, are written before their number is known
     claim(folder, SINGLE, overwrite, subject)
@@ -144,51 +142,50 @@ def solve_pairs(
     Raises:
         SolverError: a pair cannot be solved.
     """
-    jobs, places = [], []
+    jobs = []
     overrides = [*OF_PAIRS, *overrides]
+    paths = [folder.resolve() / "pairs" / f"{first:03d}_{second:03d}" for first, second in which]
     # the last row of a pair describes its folder
     last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
-    for first, second in which:
-        place = folder.resolve() / "pairs" / f"{first:03d}_{second:03d}"
-        raw = {"name": place.name, "input": frames.pair(first, second), "base": str(Path.cwd())}
-        name = {"key": place.name, "input": raw["input"], "overrides": overrides}
-        stored = last.get(place.name, {})
-        same = (place / "result.h5").is_file() and all(stored.get(k) == name[k] for k in name)
-        work = partial(attempt, partial(_solve, raw, tuple(overrides), place))
+    for pair, path in zip(which, paths, strict=True):
+        raw = {"name": path.name, "input": frames.pair(*pair), "base": str(Path.cwd())}
+        name = {"key": path.name, "input": raw["input"], "overrides": overrides}
+        stored = last.get(path.name, {})
+        same = (path / "result.h5").is_file() and all(stored.get(k) == name[k] for k in name)
+        work = partial(attempt, partial(_solve, raw, tuple(overrides), path))
         jobs.append(Job(name, work, stale=not same))
-        places.append(place)
 
-    def told(done: int, total: int, row: Row) -> None:
+    def report(done: int, total: int, row: Row) -> None:
         # those of a worker process would be printed as Python prints them
         for text in row.get("warnings", ()):
             warnings.warn(text, DataWarning, stacklevel=2)
         if say:
             say(done, total, row)
 
-    rows = measure_all(jobs, folder / ROWS, workers, say=told)
-    wrong = [row for row in rows if failed(row)]
-    if wrong:
+    rows = measure_all(jobs, folder / ROWS, workers, say=report)
+    failures = [row for row in rows if failed(row)]
+    if failures:
         raise SolverError(
-            f"{len(wrong)} of {len(rows)} pairs cannot be solved",
-            where=wrong[0]["key"],
-            found=wrong[0]["error"],
+            f"{len(failures)} of {len(rows)} pairs cannot be solved",
+            where=failures[0]["key"],
+            found=failures[0]["error"],
             hint="the others are kept: the same command goes on",
         )
-    return [read_pair(*pair, place) for pair, place in zip(which, places, strict=True)]
+    return [read_pair(*pair, path) for pair, path in zip(which, paths, strict=True)]
 
 
-def _solve(raw: Raw, overrides: tuple[str, ...], place: Path) -> Row:
+def _solve(raw: Raw, overrides: tuple[str, ...], folder: Path) -> Row:
     """Solve a pair into its folder."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        done = run(make_problem(raw, overrides, where="sequence"))
-        done.save(place)
-    said = {str(w.message): None for w in caught if issubclass(w.category, DataWarning)}
+        solved = run(make_problem(raw, overrides, where="sequence"))
+        solved.save(folder)
+    texts = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, DataWarning))
     return {
-        "warnings": [*said],
-        "converged": done.solution.converged,
-        "components": len(done.components),
-        "mre": done.metrics["solution"].mre if "solution" in done.metrics else None,
+        "warnings": [*texts],
+        "converged": solved.solution.converged,
+        "components": len(solved.components),
+        "mre": solved.metrics["solution"].mre if "solution" in solved.metrics else None,
     }
 
 
@@ -207,9 +204,8 @@ def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:
         if not first.focal_sigma > 0:
             return frames
         last = len(frames) - 2
-        some = np.unique(np.linspace(0, last, min(last + 1, PROBED)).astype(int))
         pairs = []
-        for k in some:
+        for k in np.unique(np.linspace(0, last, min(last + 1, PROBED)).astype(int)):
             with suppress(SoupError):
                 pairs.append(prepare(_problem(frames, int(k), overrides)).pair)
     if not pairs:
@@ -245,15 +241,15 @@ def named(frames: Source, folder: Path | None = None) -> tuple[str, str]:
     """
     if isinstance(frames, str) and frames.startswith(SCENE):
         return title(frames.removeprefix(SCENE)), frames
-    one = isinstance(frames, str | Path)
     first = frames if isinstance(frames, str | Path) else next(iter(frames), None)
     if not isinstance(first, str | Path):
-        place = Path(folder or "chain").absolute()
-        return place.name, f"sequence of images in memory for {place}"
+        folder = Path(folder or "chain").absolute()
+        return folder.name, f"sequence of images in memory for {folder}"
     path = as_path(first, "frames", home=True).absolute()
     # several images, or a pattern, are named after their folder
-    place = path if one and path.exists() else path.parent
-    return title(place.stem if place.is_file() else place.name), f"sequence {place}"
+    if first is not frames or not path.exists():
+        path = path.parent
+    return title(path.stem if path.is_file() else path.name), f"sequence {path}"
 
 
 def _step(stride: int | str) -> int | None:
