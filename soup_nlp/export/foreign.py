@@ -74,28 +74,21 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
         **manifest["formulation"], **manifest["smoothing"], hessian="exact", compiled=False
     )
     nlp, layout = case.nlp(form)
-    _require_same_problem(folder, manifest, fingerprint(case, nlp, layout))
+    for key, now in fingerprint(case, nlp, layout).items():
+        then = float(manifest["fingerprint"][key])
+        if abs(now - then) > SAME * max(1.0, abs(then)):
+            raise ExportError(
+                "problem is not the one that was exported",
+                where=folder,
+                found=f"{key} {now!r}",
+                expected=repr(then),
+                hint="its images, its problem.yaml or the program have changed; export again",
+            )
     answer = read_sol(sol, *file_orders(folder, nlp, layout))
     # values at an arbitrary point may be infinite or NaN; such an answer is not verified
     with np.errstate(all="ignore"):
         run = foreign_run(case, form, nlp, layout, answer, source=Path(sol).name)
     return Imported(run, answer, manifest, violations(nlp, answer.x))
-
-
-def _require_same_problem(
-    folder: Path, manifest: Mapping[str, Any], now: Mapping[str, float]
-) -> None:
-    """Raise ExportError unless the problem has the fingerprint of the export."""
-    for key, value in now.items():
-        then = float(manifest["fingerprint"][key])
-        if abs(value - then) > SAME * max(1.0, abs(then)):
-            raise ExportError(
-                "problem is not the one that was exported",
-                where=folder,
-                found=f"{key} {value!r}",
-                expected=repr(then),
-                hint="its images, its problem.yaml or the program have changed; export again",
-            )
 
 
 def sol_table(imported: Imported) -> list[Kind]:

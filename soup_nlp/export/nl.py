@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -55,10 +55,6 @@ class NLFile:
     counts: dict[str, Any]
 
 
-Of = Literal["variables", "rows"]
-OF: tuple[Of, Of] = ("variables", "rows")
-
-
 @dataclass(frozen=True)
 class Suffix:
     """Numbers of variables or rows that a solver may ask for by name; 0 is not written.
@@ -70,7 +66,7 @@ class Suffix:
     """
 
     name: str
-    of: Of
+    of: str
     values: Float | Int
 
 
@@ -279,7 +275,7 @@ def suffixes_of(
     """
     kinds: dict[str, list[str]] = {}
     out = []
-    for of, own in zip(OF, names):
+    for of, own in zip(("variables", "rows"), names):
         stems = [name.partition("[")[0] for name in own]
         kinds[of] = list(dict.fromkeys(stems))
         place = {stem: k + 1 for k, stem in enumerate(kinds[of])}
@@ -290,7 +286,7 @@ def suffixes_of(
         if group.kernel.name == "ridge":
             factor = np.ones(nlp.nx)
             factor[group.table.index[:, 0]] = np.sqrt(group.table.data[:, 0])
-            out.append(Suffix("scaling_factor", OF[0], factor))
+            out.append(Suffix("scaling_factor", "variables", factor))
     return kinds, out
 
 

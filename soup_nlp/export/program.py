@@ -12,7 +12,7 @@ from scipy import sparse
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.errors import ExportError
 from soup_nlp.export.template import Template, make_template, trace
-from soup_nlp.model.kernel import Group, Kernel
+from soup_nlp.model.kernel import Group
 
 OBJECTIVE = -1
 """Row number of the objective."""
@@ -140,12 +140,6 @@ class Split:
     objective: bool
 
 
-def outputs(kernel: Kernel) -> ca.SX:
-    """(m,) objective, if any, and constraints."""
-    parts = [p for p in (kernel.objective, kernel.constraints) if p is not None]
-    return ca.densify(ca.vertcat(*parts)) if parts else ca.SX(0, 1)
-
-
 def split(group: Group, theta: Float) -> Split:
     """Split the outputs of a kernel.
 
@@ -155,7 +149,8 @@ def split(group: Group, theta: Float) -> Split:
         ExportError: an operation has no opcode.
     """
     kernel, table = group.kernel, group.table
-    out = outputs(kernel)
+    given = [part for part in (kernel.objective, kernel.constraints) if part is not None]
+    out = ca.densify(ca.vertcat(ca.SX(0, 1), *given))
     # before the split, since a piecewise constant part such as sign(a) has a zero derivative and
     # would look linear
     trace(kernel.name, out, group, theta)

@@ -52,34 +52,29 @@ class _Graph:
     variable: dict[int, int] = field(default_factory=dict)
     number: dict[int, Float] = field(default_factory=dict)
     roots: list[int] = field(default_factory=list)
-
     known: dict[object, int] = field(default_factory=dict)
 
-    def leaf(self, key: object, number: Float | None = None, variable: int | None = None) -> int:
-        """Node of a number or a variable, created unless the key is known."""
+    def node(self, key: object, op: int = -1, args: tuple[int, ...] = ()) -> int:
+        """Node of a key, created unless the key is known."""
         if key not in self.known:
-            node = self._add(key, -1, ())
-            if number is not None:
-                self.number[node] = number
-            if variable is not None:
-                self.variable[node] = variable
+            self.known[key] = len(self.op)
+            self.op.append(op)
+            self.args.append(args)
         return self.known[key]
+
+    def constant(self, key: object, value: Float) -> int:
+        """Node of a number."""
+        node = self.node(key)
+        self.number[node] = value
+        return node
 
     def apply(self, op: int, args: tuple[int, ...]) -> int:
-        """Node of an operation, created unless it exists; a number if no argument is variable."""
+        """Node of an operation, a number if no argument is variable."""
         key = (op, tuple(sorted(args)) if op in COMMUTATIVE else args)
-        if key in self.known:
-            return self.known[key]
         if not all(a in self.number for a in args):
-            return self._add(key, op, args)
+            return self.node(key, op, args)
         with np.errstate(all="ignore"):
-            return self.leaf(key, OPERATIONS[op].numpy(*(self.number[a] for a in args)))
-
-    def _add(self, key: object, op: int, args: tuple[int, ...]) -> int:
-        self.op.append(op)
-        self.args.append(args)
-        self.known[key] = len(self.op) - 1
-        return self.known[key]
+            return self.constant(key, OPERATIONS[op].numpy(*(self.number[a] for a in args)))
 
 
 def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
@@ -100,13 +95,14 @@ def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
         target = function.instruction_output(k)[0]
         if op == ca.OP_CONST:
             value = function.instruction_constant(k)
-            work[target] = graph.leaf(("const", value), np.asarray(value, float))
+            work[target] = graph.constant(("const", value), np.asarray(value, float))
         elif op == ca.OP_INPUT and inputs[0] == 0:
-            work[target] = graph.leaf((0, inputs[1]), variable=inputs[1])
+            work[target] = graph.node((0, inputs[1]))
+            graph.variable[work[target]] = inputs[1]
         elif op == ca.OP_INPUT:
             which, place = inputs
             values = table.data[:, place] if which == 1 else np.asarray(theta[place])
-            work[target] = graph.leaf((which, place), values)
+            work[target] = graph.constant((which, place), values)
         elif op == ca.OP_ASSIGN:
             work[target] = work[inputs[0]]
         elif op in OPERATIONS and OPERATIONS[op].nl:
