@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import RowProgress, SolveLog, resumable
+from soup_nlp.cli.options import option
 from soup_nlp.sequence.folder import CHAIN, SINGLE
 from soup_nlp.sequence.frames import Frames
 from soup_nlp.sequence.score import chain_lines
@@ -23,26 +23,21 @@ def chain(
     source: Annotated[
         list[str], typer.Argument(help="Folder, images, 'pattern/*.jpg', video, or scene:NAME.")
     ],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default out/chain-SOURCE.")
-    ] = None,
+    out: Annotated[Path | None, options.out_option("out/chain-SOURCE")] = None,
     intrinsics: options.Intrinsics = None,
     fov: options.Fov = None,
     undistort: options.Undistort = False,
     stride: Annotated[
-        str, typer.Option(help="Take every n-th frame; auto: the next with enough parallax.")
+        str, option("Take every n-th frame; auto: the next with enough parallax.")
     ] = "1",
     frames: Annotated[
-        int | None, typer.Option(help="Largest number of frames; 10 of a scene by default.", min=2)
+        int | None, option("Largest number of frames; 10 of a scene by default.", min=2)
     ] = None,
     two_frame: Annotated[
-        bool, typer.Option("--two-frame", help="Solve frames k and k + 2 too, for more links.")
+        bool, option("Solve frames k and k + 2 too, for more links.", "--two-frame")
     ] = False,
     depth_scale: Annotated[
-        float | None,
-        typer.Option(
-            help="Values per unit of length of true depth_*.png (KITTI 256); default 1000."
-        ),
+        float | None, option(options.DEPTH_SCALE.format("true depth_*.png"))
     ] = None,
     preset: options.PresetName = None,
     overrides: options.Set = None,
@@ -70,9 +65,9 @@ def chain(
         "segmentation.neighbours": neighbours,
         "max_size": max_size,
     }
-    kept = resumable("the pairs that were finished are kept", f"{out}/pairs")
+    kept = options.resumable("the pairs that were finished are kept", f"{out}/pairs")
     with kept, warnings.catch_warnings():
-        warnings.showwarning = SolveLog(quiet).warn
+        warnings.showwarning = options.SolveLog(quiet).warn
         done = solve_chain(
             frames_of,
             out,
@@ -87,7 +82,7 @@ def chain(
             workers=workers,
             overwrite=overwrite,
             begin=begin,
-            say=RowProgress(quiet),
+            say=options.RowProgress(quiet),
         )
     print("\n".join(chain_lines(done, read_json(out / CHAIN, CHAIN))))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "points/", "pairs/"]))

@@ -24,7 +24,8 @@ from soup_nlp.bench.solvers.page import (
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
 from soup_nlp.bench.solvers.runner import family_tasks, is_family, make_task
-from soup_nlp.cli.options import Coordinates, Overwrite, Set, listed, resumable
+from soup_nlp.cli import options
+from soup_nlp.cli.options import option, out_option
 from soup_nlp.config.problem import load_problem, title
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import parse_formulations
@@ -48,16 +49,14 @@ def compare(
         list[Path], typer.Argument(help="Problem files, or a folder of `soup-nlp family`.")
     ],
     solvers: Annotated[
-        str, typer.Option(help="Comma-separated, or all; a program that reads .nl may be named.")
+        str, option("Comma-separated, or all; a program that reads .nl may be named.")
     ] = "all",
-    coordinates: Coordinates = "matrix",
-    seconds: Annotated[float, typer.Option(help="CPU time limit of a run.")] = 60.0,
-    iterations: Annotated[int, typer.Option(help="Iteration limit of a run.")] = 300,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default out/solvers-NAMES.")
-    ] = None,
-    overrides: Set = None,
-    overwrite: Overwrite = False,
+    coordinates: options.Coordinates = "matrix",
+    seconds: Annotated[float, option("CPU time limit of a run.")] = 60.0,
+    iterations: Annotated[int, option("Iteration limit of a run.")] = 300,
+    out: Annotated[Path | None, out_option("out/solvers-NAMES")] = None,
+    overrides: options.Set = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Run real solvers on problems, verify their claims, write table and profiles."""
     if not (seconds > 0 and iterations > 0):
@@ -66,7 +65,7 @@ def compare(
             where="compare",
             found=f"{seconds:g} s, {iterations} iterations",
         )
-    names = [*available()] if solvers == "all" else listed(solvers)
+    names = [*available()] if solvers == "all" else options.listed(solvers)
     if not names:
         raise ConfigError("no solver is named", where="--solvers", found=solvers)
     for name in names:
@@ -100,7 +99,7 @@ def compare(
         with staged(folder, subject=subject) as new:
             write_text(new / "README.md", page(frame_of_runs(rows)))
 
-    kept = resumable("the runs that were finished are kept, with a page of them", folder)
+    kept = options.resumable("the runs that were finished are kept, with a page of them", folder)
     try:
         with kept, scratch() as temporary:
             for tasks_of_problem in tasks():
@@ -113,8 +112,7 @@ def compare(
     print("\n".join(conclusion(frame_of_runs(rows))))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     verified = sum(bool(r["verified"]) for r in rows)
-    print(f"exit code   {int(not verified)}: {verified} of {len(rows)} runs are verified")
-    raise typer.Exit(int(not verified))
+    options.finish(bool(verified), f"{verified} of {len(rows)} runs are verified")
 
 
 def _write(folder: Path, frame: pd.DataFrame, limits: Limits, subject: str) -> None:

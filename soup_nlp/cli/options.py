@@ -9,8 +9,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -26,73 +27,62 @@ from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.progress import Progress
 from soup_nlp.storage.rows import Row, failed, reason
 
-INPUT: Mapping[str, Any] = {"rich_help_panel": "Input"}
-SIZE: Mapping[str, Any] = {"rich_help_panel": "Size"}
-METHOD: Mapping[str, Any] = {"rich_help_panel": "Method"}
-OUTPUT: Mapping[str, Any] = {"rich_help_panel": "Output"}
 
-Intrinsics = Annotated[
-    str | None,
-    typer.Option(
-        help="fx,fy,cx,cy in pixels, or a file; default K.txt of a sequence, EXIF, a guess.",
-        **INPUT,
-    ),
-]
+def option(text: str, *names: str, panel: str | None = None, **rules: Any) -> Any:
+    """An option with its help, in a panel of the help page."""
+    return typer.Option(*names, help=text, rich_help_panel=panel, **rules)
+
+
+in_input, in_size, in_method, in_output = (
+    partial(option, panel=panel) for panel in ("Input", "Size", "Method", "Output")
+)
+
+
+def out_option(default: str) -> Any:
+    """The output folder of a command, with its default as text."""
+    return in_output(f"Output folder; default {default}.", "--out", "-o")
+
+
+Words = list[str] | None
+CAMERA = "fx,fy,cx,cy in pixels, or a file; default K.txt of a sequence, EXIF, a guess."
+Intrinsics = Annotated[str | None, in_input(CAMERA)]
 Fov = Annotated[
-    float | None,
-    typer.Option(help="Horizontal field of view, degrees, instead of --intrinsics.", **INPUT),
+    float | None, in_input("Horizontal field of view, degrees, instead of --intrinsics.")
 ]
-Undistort = Annotated[
-    bool, typer.Option("--undistort", help="Remove the camera file's distortion.", **INPUT)
-]
-Wanted = Annotated[
-    int | None, typer.Option("--superpixels", help="Number N of superpixels; default 1000.", **SIZE)
-]
-Neighbours = Annotated[int | None, typer.Option(help="K of the K-NN graph; default 15.", **SIZE)]
+Undistort = Annotated[bool, in_input("Remove the camera file's distortion.", "--undistort")]
+Wanted = Annotated[int | None, in_size("Number N of superpixels; default 1000.", "--superpixels")]
+Neighbours = Annotated[int | None, in_size("K of the K-NN graph; default 15.")]
 MaxSize = Annotated[
-    float | None,
-    typer.Option(help="Megapixels to which larger images are reduced; default 1.5.", **SIZE),
+    float | None, in_size("Megapixels to which larger images are reduced; default 1.5.")
 ]
-Set = Annotated[
-    list[str] | None, typer.Option("--set", help="Set any key, e.g. solver.max_iter=200.", **METHOD)
-]
+Set = Annotated[Words, in_method("Set any key, e.g. solver.max_iter=200.", "--set")]
 PresetName = Annotated[
-    str | None,
-    typer.Option(help=f"Options below the problem's own: {', '.join(PRESETS)}.", **METHOD),
+    str | None, in_method(f"Options below the problem's own: {', '.join(PRESETS)}.")
 ]
-Out = Annotated[Path, typer.Option("--out", "-o", help="Output folder.", **OUTPUT)]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.", **OUTPUT)]
-Overwrite = Annotated[
-    bool,
-    typer.Option(
-        "--overwrite",
-        help="Also over files of others, or the result of another input.",
-        **OUTPUT,
-    ),
-]
+Out = Annotated[Path, in_output("Output folder.", "--out", "-o")]
+Quiet = Annotated[bool, in_output("Print no progress.", "--quiet", "-q")]
+OTHERS = "Also over files of others, or the result of another input."
+Overwrite = Annotated[bool, in_output(OTHERS, "--overwrite")]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
 Problem = Annotated[Path, typer.Argument(help=PROBLEM)]
-Presolve = Annotated[
-    bool, typer.Option(help="Start at the presolve's answer, not at the initialisation.")
-]
-Formulations = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--formulation", help="gauge/norm, e.g. unit-translation/epigraph; may be repeated."
-    ),
-]
-Coordinates = Annotated[
-    str,
-    typer.Option(
-        help="matrix, or tangent: nine per superpixel about the initialisation, without gauge."
-    ),
-]
+Folder = Annotated[Path, typer.Argument(help="Folder of a result or a chain.")]
+Presolve = Annotated[bool, option("Start at the presolve's answer, not at the initialisation.")]
+FORMULATIONS = "gauge/norm, e.g. unit-translation/epigraph; may be repeated."
+Formulations = Annotated[Words, option(FORMULATIONS, "--formulation")]
+COORDINATES = "matrix, or tangent: nine per superpixel about the initialisation, without gauge."
+Coordinates = Annotated[str, option(COORDINATES)]
 Superpixels = Annotated[
-    list[int] | None, typer.Option(help="Number of superpixels, 50 to 2000; may be repeated.")
+    list[int] | None, option("Number of superpixels, 50 to 2000; may be repeated.")
 ]
-Data = Annotated[Path | None, typer.Option(help="Root folder of the dataset.")]
-Workers = Annotated[int, typer.Option(help="Processes of this machine.", min=1)]
-AnyCode = Annotated[bool, typer.Option(help="Also take stored rows of other code versions.")]
+Data = Annotated[Path | None, option("Root folder of the dataset.")]
+DEPTH_SCALE = "Values per unit of length of {} (KITTI 256); default 1000."
+Workers = Annotated[int, option("Processes of this machine.", min=1)]
+
+
+def finish(good: bool, reason_text: str) -> NoReturn:
+    """Print the exit code of a command with its reason, and end with it."""
+    print(f"exit code   {int(not good)}: {reason_text}")
+    raise typer.Exit(int(not good))
 
 
 def changed(

@@ -9,21 +9,8 @@ from typing import Annotated
 
 import typer
 
-from soup_nlp.cli.options import (
-    PROBLEM,
-    Coordinates,
-    Formulations,
-    Overwrite,
-    PresetName,
-    Presolve,
-    Problem,
-    Quiet,
-    Set,
-    Superpixels,
-    changed,
-    listed,
-    numbers,
-)
+from soup_nlp.cli import options
+from soup_nlp.cli.options import option
 from soup_nlp.config.presets import PRESETS, dump_preset
 from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
 from soup_nlp.errors import ConfigError, DataError, printable
@@ -42,12 +29,10 @@ from soup_nlp.storage.folders import claim, default_folder, staged
 
 
 def show(
-    problem: Annotated[Path | None, typer.Argument(help=PROBLEM)] = None,
-    overrides: Set = None,
-    preset: PresetName = None,
-    all_options: Annotated[
-        bool, typer.Option("--all", help="Every option, also the unusual ones.")
-    ] = False,
+    problem: Annotated[Path | None, typer.Argument(help=options.PROBLEM)] = None,
+    overrides: options.Set = None,
+    preset: options.PresetName = None,
+    all_options: Annotated[bool, option("Every option, also the unusual ones.", "--all")] = False,
 ) -> None:
     """Print the merged problem and its hash; without a problem, the options of a preset."""
     if problem is None:
@@ -60,7 +45,7 @@ def show(
             )
         print(dump_preset(preset), end="")
         return
-    chosen = load_problem(problem, changed(preset, overrides))
+    chosen = load_problem(problem, options.changed(preset, overrides))
     footer = "" if all_options else "# all other options have their defaults: soup-nlp show --all\n"
     print(f"{dump_problem(chosen, all_options)}{footer}# hash {chosen.digest()}")
 
@@ -91,28 +76,25 @@ def _first_line(path: Path) -> str:
 
 
 def export(
-    problem: Problem,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default out/export-NAME.")
-    ] = None,
-    formulation: Formulations = None,
-    coordinates: Coordinates = "matrix",
-    superpixels: Superpixels = None,
+    problem: options.Problem,
+    out: Annotated[Path | None, options.out_option("out/export-NAME")] = None,
+    formulation: options.Formulations = None,
+    coordinates: options.Coordinates = "matrix",
+    superpixels: options.Superpixels = None,
     format_: Annotated[
         list[str] | None,
-        typer.Option("--format", help=f"{', '.join(FORMATS)} (casadi has h5); may be repeated."),
+        option(f"{', '.join(FORMATS)} (casadi has h5); may be repeated.", "--format"),
     ] = None,
-    presolve: Presolve = True,
+    presolve: options.Presolve = True,
     suffixes: Annotated[
         bool,
-        typer.Option(
-            "--suffixes",
-            help="Write suffixes kind, superpixel, scaling_factor (not read by CasADi).",
+        option(
+            "Write suffixes kind, superpixel, scaling_factor (not read by CasADi).", "--suffixes"
         ),
     ] = False,
-    overrides: Set = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    overrides: options.Set = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Write the NLP for other solvers; several sizes or formulations make a folder each."""
     forms = parse_formulations(formulation, coordinates)
@@ -156,13 +138,7 @@ def export(
 QUICK = "100,250"
 """Default sizes, which take about a minute."""
 
-TABLES = (
-    "index.json",
-    "instancedata.csv",
-    "run.py",
-    "README.md",
-    "LICENSE.txt",
-)
+TABLES = ("index.json", "instancedata.csv", "run.py", "README.md", "LICENSE.txt")
 """Files of a set beside its instances."""
 
 
@@ -174,19 +150,21 @@ def family(
     out: Annotated[
         Path, typer.Argument(help="Folder of the set; new, empty or of an earlier one.")
     ],
-    sizes: Annotated[str, typer.Option(help=f"Superpixels, of {_list(SIZES)}.")] = QUICK,
-    scenes: Annotated[str, typer.Option(help="Rendered scenes.")] = _list(SCENES),
-    formulation: Formulations = None,
-    coordinates: Coordinates = "matrix",
+    sizes: Annotated[str, option(f"Superpixels, of {_list(SIZES)}.")] = QUICK,
+    scenes: Annotated[str, option("Rendered scenes.")] = _list(SCENES),
+    formulation: options.Formulations = None,
+    coordinates: options.Coordinates = "matrix",
     starts: Annotated[
-        str, typer.Option(help="easy (presolved), hard (initialisation), cold (constant depth).")
+        str, option("easy (presolved), hard (initialisation), cold (constant depth).")
     ] = _list(STARTS),
-    overwrite: Overwrite = False,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
-    wanted = numbers(sizes, "--sizes")
+    wanted = options.numbers(sizes, "--sizes")
     forms = ["/".join(form.values()) for form in parse_formulations(formulation, coordinates)]
-    chosen = select(wanted, listed(scenes), [form or STANDARD for form in forms], listed(starts))
+    chosen = select(
+        wanted, options.listed(scenes), [form or STANDARD for form in forms], options.listed(starts)
+    )
     if out.is_dir() and any(out.iterdir()) and not (out / "index.json").is_file():
         raise DataError(
             "folder holds other files", where=out, expected="a new or empty folder, or a set"

@@ -11,7 +11,8 @@ from typing import Annotated, cast, get_args
 import numpy as np
 import typer
 
-from soup_nlp.cli.options import Overwrite, listed
+from soup_nlp.cli import options
+from soup_nlp.cli.options import in_output, option, out_option
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.errors import ConfigError, DataError, ExportError
@@ -42,8 +43,7 @@ from soup_nlp.storage.files import is_folder
 def check(
     folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain, or a .sol file.")],
     export_: Annotated[
-        Path | None,
-        typer.Option("--export", help="Exported folder of a .sol; default where the .sol lies."),
+        Path | None, option("Exported folder of a .sol; default where the .sol lies.", "--export")
     ] = None,
 ) -> None:
     """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
@@ -67,22 +67,17 @@ def check(
         print(foreign_verdict(imported))
         good, claim = all(r.ok for r in rows), "constraint"
     conclusion = f"every {claim} holds" if good else f"a {claim} does not hold"
-    print(f"exit code   {int(not good)}: {conclusion}")
-    raise typer.Exit(int(not good))
+    options.finish(good, conclusion)
 
 
 def evaluate(
-    folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain.")],
+    folder: options.Folder,
     depth: Annotated[
-        Path,
-        typer.Option(help="True depth: .dpt, .npy, .pfm, 16-bit .png; of a chain their folder."),
+        Path, option("True depth: .dpt, .npy, .pfm, 16-bit .png; of a chain their folder.")
     ],
-    scale: Annotated[str, typer.Option(help="median, mre, lsq or none.")] = "median",
-    cap: Annotated[float | None, typer.Option(help="Drop truth beyond this depth.")] = None,
-    depth_scale: Annotated[
-        float | None,
-        typer.Option(help="Values per unit of length of a .png (KITTI 256); default 1000."),
-    ] = None,
+    scale: Annotated[str, option("median, mre, lsq or none.")] = "median",
+    cap: Annotated[float | None, option("Drop truth beyond this depth.")] = None,
+    depth_scale: Annotated[float | None, option(options.DEPTH_SCALE.format("a .png"))] = None,
 ) -> None:
     """Score a result against a truth file."""
     rules = get_args(Scale)
@@ -104,9 +99,9 @@ def import_(
     sol: Annotated[Path, typer.Argument(help="The solver's .sol file.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Result folder; default DIR/result, or DIR/result-SOL."),
+        in_output("Result folder; default DIR/result, or DIR/result-SOL.", "--out", "-o"),
     ] = None,
-    overwrite: Overwrite = False,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Make a result folder of a foreign solver's answer: depth maps, points, residuals."""
     imported = import_sol(folder, sol)
@@ -127,10 +122,7 @@ def import_(
     print(text)
     print(f"files       {target}/")
     print(f"next        soup-nlp check {target}")
-    print(
-        f"exit code   {int(not s.converged)}: the answer is {'' if s.converged else 'not '}verified"
-    )
-    raise typer.Exit(int(not s.converged))
+    options.finish(s.converged, f"the answer is {'' if s.converged else 'not '}verified")
 
 
 def foreign_verdict(imported: Imported) -> str:
@@ -154,14 +146,13 @@ def foreign_verdict(imported: Imported) -> str:
 
 
 def view(
-    folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain.")],
+    folder: options.Folder,
     serve: Annotated[
-        int | None,
-        typer.Option(help="Serve the folder to this machine at a port instead; 0 chooses one."),
+        int | None, option("Serve the folder to this machine at a port instead; 0 chooses one.")
     ] = None,
-    renew: Annotated[bool, typer.Option("--renew", help="Generate the page again.")] = False,
+    renew: Annotated[bool, option("Generate the page again.", "--renew")] = False,
     no_open: Annotated[
-        bool, typer.Option("--no-open", help="Do not open a browser, print the address.")
+        bool, option("Do not open a browser, print the address.", "--no-open")
     ] = False,
 ) -> None:
     """Open the page of a result in a browser, or serve it."""
@@ -200,15 +191,13 @@ _NAMES = "; ".join(f"{name}: {text}" for name, (_, text) in FORMATS.items())
 
 
 def convert(
-    folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain.")],
-    to: Annotated[str, typer.Option("--to", help=f"Comma separated. {_NAMES}.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default the result's own.")
-    ] = None,
-    overwrite: Overwrite = False,
+    folder: options.Folder,
+    to: Annotated[str, option(f"Comma separated. {_NAMES}.", "--to")],
+    out: Annotated[Path | None, out_option("the result's own")] = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions."""
     target = folder if out is None else out
     write = convert_chain if is_chain(folder) else convert_folder
-    for name in write(folder, listed(to), out, overwrite):
+    for name in write(folder, options.listed(to), out, overwrite):
         print(target / name)

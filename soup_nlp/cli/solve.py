@@ -6,13 +6,14 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import INPUT, METHOD, OUTPUT, SolveLog, camera, changed, located
+from soup_nlp.cli.options import in_input, in_method, in_output, option
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
@@ -30,44 +31,36 @@ from soup_nlp.storage.progress import interruptible
 from soup_nlp.storage.system import scratch
 
 SOURCE = "Two images, or a problem file or name (`soup-nlp list`)."
-FLOW: Mapping[str, Any] = {"rich_help_panel": "Flow"}
-PRIOR: Mapping[str, Any] = {"rich_help_panel": "Depth prior"}
+in_flow, in_prior = partial(option, panel="Flow"), partial(option, panel="Depth prior")
 
 
 def solve(
     source: Annotated[
         list[Path] | None, typer.Argument(metavar="PROBLEM | REF NEXT", help=SOURCE)
     ] = None,
-    ref: Annotated[str | None, typer.Option(help="Reference image.", **INPUT)] = None,
-    next_: Annotated[str | None, typer.Option("--next", help="Next image.", **INPUT)] = None,
+    ref: Annotated[str | None, in_input("Reference image.")] = None,
+    next_: Annotated[str | None, in_input("Next image.", "--next")] = None,
     intrinsics: options.Intrinsics = None,
     fov: options.Fov = None,
     intrinsics_next: Annotated[
-        str | None, typer.Option(help="Camera of the next frame, if it differs.", **INPUT)
+        str | None, in_input("Camera of the next frame, if it differs.")
     ] = None,
-    depth: Annotated[
-        str | None, typer.Option(help="True depth of the reference frame, to score.", **INPUT)
-    ] = None,
+    depth: Annotated[str | None, in_input("True depth of the reference frame, to score.")] = None,
     undistort: options.Undistort = False,
     flow: Annotated[
-        str | None,
-        typer.Option(help="File (.flo, KITTI .png, .npy, .onnx) or name; default DIS.", **FLOW),
+        str | None, in_flow("File (.flo, KITTI .png, .npy, .onnx) or name; default DIS.")
     ] = None,
     flow_backward: Annotated[
-        str | None,
-        typer.Option(help="Flow from next to ref; the consistency is the confidence.", **FLOW),
+        str | None, in_flow("Flow from next to ref; the consistency is the confidence.")
     ] = None,
     flow_confidence: Annotated[
-        str | None,
-        typer.Option(help="Confidence of --flow: .npy in [0, 1], or a grey picture.", **FLOW),
+        str | None, in_flow("Confidence of --flow: .npy in [0, 1], or a grey picture.")
     ] = None,
     depth_prior: Annotated[
-        str | None,
-        typer.Option(help="Depth of ref from elsewhere: .npy, .pfm, .png, .onnx.", **PRIOR),
+        str | None, in_prior("Depth of ref from elsewhere: .npy, .pfm, .png, .onnx.")
     ] = None,
     depth_prior_kind: Annotated[
-        str | None,
-        typer.Option(help="metric, relative, inverse, ordinal; default: by the flow.", **PRIOR),
+        str | None, in_prior("metric, relative, inverse, ordinal; default: by the flow.")
     ] = None,
     superpixels: options.Wanted = None,
     neighbours: options.Neighbours = None,
@@ -75,27 +68,19 @@ def solve(
     overrides: options.Set = None,
     preset: options.PresetName = None,
     no_refine: Annotated[
-        bool,
-        typer.Option("--no-refine", help="The NLP alone, as refine.enabled=false.", **METHOD),
+        bool, in_method("The NLP alone, as refine.enabled=false.", "--no-refine")
     ] = False,
     no_nlp: Annotated[
-        bool,
-        typer.Option("--no-nlp", help="Refine the start, as refine.from_start=true.", **METHOD),
+        bool, in_method("Refine the start, as refine.from_start=true.", "--no-nlp")
     ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Output folder; default out/NAME.", **OUTPUT),
-    ] = None,
+    out: Annotated[Path | None, options.out_option("out/NAME")] = None,
     overwrite: options.Overwrite = False,
     json_: Annotated[
-        bool, typer.Option("--json", help="Print summary.json instead of the verdict.", **OUTPUT)
+        bool, in_output("Print summary.json instead of the verdict.", "--json")
     ] = False,
     quiet: options.Quiet = False,
     verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose", "-v", help="Print every stage and round, and more on the solver.", **OUTPUT
-        ),
+        bool, in_output("Print every stage and round, and more on the solver.", "--verbose", "-v")
     ] = False,
 ) -> None:
     """Solve a pair of frames and write a result folder."""
@@ -111,20 +96,20 @@ def solve(
         "max_size": max_size,
         "refine.enabled": "false" if no_refine else None,
         "refine.from_start": "true" if no_nlp else None,
-        "flow.source": located(flow, "flow")
+        "flow.source": options.located(flow, "flow")
         if flow and is_path(flow)
         else flow and json.dumps(flow),
-        "flow.backward": located(flow_backward, "flow"),
-        "flow.confidence": located(flow_confidence, "confidence of the flow"),
-        "depth_prior.source": located(depth_prior, "depth prior"),
+        "flow.backward": options.located(flow_backward, "flow"),
+        "flow.confidence": options.located(flow_confidence, "confidence of the flow"),
+        "depth_prior.source": options.located(depth_prior, "depth prior"),
         "depth_prior.kind": depth_prior_kind,
     }
-    changes = changed(preset, overrides, keys)
+    changes = options.changed(preset, overrides, keys)
     pair_options = {
         "ref": ref,
         "next": next_,
-        "intrinsics": camera(intrinsics, "--intrinsics"),
-        "intrinsics_next": camera(intrinsics_next, "--intrinsics-next"),
+        "intrinsics": options.camera(intrinsics, "--intrinsics"),
+        "intrinsics_next": options.camera(intrinsics_next, "--intrinsics-next"),
         "fov": fov,
         "depth": depth,
         "undistort": undistort or None,
@@ -138,7 +123,7 @@ def solve(
     # the expected MRE is that of the problem file without overrides
     limit = None if changes else chosen.expected.mre_at_most
     folder = out or default_folder(chosen.name, chosen.subject)
-    log = SolveLog(quiet, verbose, chosen)
+    log = options.SolveLog(quiet, verbose, chosen)
     raise typer.Exit(solve_problem(chosen, folder, log, limit, json_, overwrite))
 
 
@@ -189,7 +174,7 @@ def _from_images(words: Sequence[Path], pair: Mapping[str, Any], changes: Sequen
 def solve_problem(
     chosen: Problem,
     out: Path,
-    log: SolveLog,
+    log: options.SolveLog,
     mre_at_most: float | None,
     as_json: bool = False,
     overwrite: bool = False,
@@ -276,7 +261,7 @@ def demo(
     for name, text in PAIRS.items():
         print(f"\n{name}: {text}", flush=True)
         problem = load_problem(name)
-        log, limit = SolveLog(quiet, problem=problem), problem.expected.mre_at_most
+        log, limit = options.SolveLog(quiet, problem=problem), problem.expected.mre_at_most
         codes.append(solve_problem(problem, out / name, log, limit, overwrite=overwrite))
     pages = " and ".join(str(out / name / PAGE) for name in PAIRS)
     print(f"\nopen        {pages} in a browser")

@@ -7,7 +7,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from helpers_files import write_flo
+from helpers_files import sets, write_flo, write_pair
 from PIL import ExifTags, Image
 
 from soup_nlp.cli.main import main
@@ -57,8 +57,7 @@ def test_a_photo_is_turned_as_its_exif_says(orientation, suffix, tmp_path):
 def orbit(tmp_path_factory):
     """A rendered pair as files, its flow in both directions, half of it marked unusable."""
     folder, pair = tmp_path_factory.mktemp("orbit"), render_scene("orbit", 0, *SIZE)
-    for name, image in (("a", pair.image_ref), ("b", pair.image_next)):
-        cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
+    write_pair(folder, pair)
     flow = pair.truth.flow.astype(np.float32)
     write_flo(folder / "forward.flo", flow)
     # wrong on the left by more than the largest error that is tolerated
@@ -123,7 +122,7 @@ def test_two_pictures_are_enough(orbit, tmp_path, capsys):
     pair = ["--ref", str(orbit / "a.png"), "--next", str(orbit / "b.png")]
     flow = ["--flow", str(orbit / "forward.flo"), "--flow-confidence", str(orbit / "half.png")]
     small = ["--superpixels", "30", "--neighbours", "5", "--no-refine", "--json"]
-    small += ["--set", "solver.presolve_iterations=5", "--set", "solver.max_iter=2"]
+    small += sets("solver.presolve_iterations=5 solver.max_iter=2")
     assert main(["solve", *pair, *flow, *small, "-o", str(tmp_path / "out")]) in (0, 1)
     told = capsys.readouterr()
     summary = json.loads(told.out)

@@ -12,7 +12,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from helpers_files import read_ply, write_flo
+from helpers_files import read_ply, sets, write_flo, write_pair
 
 from soup_nlp.cli.main import main
 from soup_nlp.cli.solve import exit_code
@@ -21,34 +21,17 @@ from soup_nlp.report.check import check_folder
 
 pytestmark = pytest.mark.slow
 
-SMALL = [
-    "--set", "input.width=144", "--set", "input.height=96",
-    "--set", "segmentation.superpixels=25", "--set", "segmentation.neighbours=6",
-    "--set", "flow.source=truth", "--set", "solver.presolve_iterations=60",
-]  # fmt: skip
+SMALL = sets(
+    "input.width=144 input.height=96 segmentation.superpixels=25 segmentation.neighbours=6"
+    " flow.source=truth solver.presolve_iterations=60"
+)
 FILES = [
-    "config.yaml",
-    "result.h5",
-    "summary.json",
-    "log.txt",
-    "ipopt.log",
-    "depth_ref.png",
-    "depth_next.png",
-    "depth_ref_colour.png",
-    "depth_next_colour.png",
-    "superpixels.png",
-    "components.png",
-    "flow.png",
-    "flow_confidence.png",
-    "normals.png",
-    "error.png",
-    "overview.png",
-    "motions.json",
-    "trajectory.tum",
-    "report.html",
-    "points_ref.ply",
+    "config.yaml", "result.h5", "summary.json", "log.txt", "ipopt.log", "depth_ref.png",
+    "depth_next.png", "depth_ref_colour.png", "depth_next_colour.png", "superpixels.png",
+    "components.png", "flow.png", "flow_confidence.png", "normals.png", "error.png",
+    "overview.png", "motions.json", "trajectory.tum", "report.html", "points_ref.ply",
     "points_next.ply",
-]
+]  # fmt: skip
 PROBLEMS = Path(__file__).parents[2] / "problems"
 
 
@@ -130,7 +113,7 @@ def test_evaluate_scores_against_a_file(solved, tmp_path, capsys):
 
 
 def test_a_solve_that_stops_early_is_a_result(tmp_path):
-    limit = ["--set", "solver.max_iter=0", "--set", "solver.presolve=false"]
+    limit = sets("solver.max_iter=0 solver.presolve=false")
     path = str(PROBLEMS / "street.yaml")
     assert main(["solve", path, "--out", str(tmp_path), *SMALL, *limit, "-q"]) == 1
     for name in FILES:
@@ -145,8 +128,7 @@ def test_a_solve_that_stops_early_is_a_result(tmp_path):
 def images(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("images")
     pair = render_scene("orbit", 0, 160, 120)
-    cv2.imwrite(str(folder / "a.png"), pair.image_ref[..., ::-1])
-    cv2.imwrite(str(folder / "b.png"), pair.image_next[..., ::-1])
+    write_pair(folder, pair)
     cv2.imwrite(str(folder / "small.png"), pair.image_next[:50, :50, ::-1])
     cv2.imwrite(str(folder / "flat.png"), np.full((120, 160, 3), 128, np.uint8))
     flow = pair.truth.flow.astype(np.float32)
@@ -161,14 +143,12 @@ def images(tmp_path_factory) -> Path:
 
 def solve_files(images: Path, out: Path, **changes: str) -> int:
     options = {"ref": "a.png", "next": "b.png", "intrinsics": "144,144,79.5,59.5"} | changes
-    sets = options.pop("sets", "segmentation.superpixels=40 segmentation.neighbours=6").split()
+    small = options.pop("sets", "segmentation.superpixels=40 segmentation.neighbours=6")
     args = ["solve", "--out", str(out), "-q"]
     for key, value in options.items():
         path = key in ("ref", "next", "flow", "depth")
         args += [f"--{key.replace('_', '-')}", str(images / value) if path else value]
-    for item in sets:
-        args += ["--set", item]
-    return main(args)
+    return main([*args, *sets(small)])
 
 
 @pytest.mark.parametrize(
@@ -265,11 +245,9 @@ def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     for seed, clip in enumerate(("a/clip", "b/clip")):
         (tmp_path / clip).mkdir(parents=True)
-        pair = render_scene("orbit", seed, 64, 48)
-        for k, image in enumerate((pair.image_ref, pair.image_next)):
-            cv2.imwrite(f"{clip}/frame_{k}.png", image)
+        write_pair(tmp_path / clip, render_scene("orbit", seed, 64, 48), ("frame_0", "frame_1"))
     small = ["--superpixels=6", "--neighbours=3", "--no-refine", "-q", "--fov=50"]
-    small += ["--set", "output.page=false"]
+    small += sets("output.page=false")
 
     def solve(clip: str, *arguments: str) -> int:
         pair = ["--ref", f"{clip}/frame_0.png", "--next", f"{clip}/frame_1.png"]

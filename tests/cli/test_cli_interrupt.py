@@ -9,6 +9,7 @@ import signal
 from pathlib import Path
 
 import pytest
+from helpers_files import sets
 
 from soup_nlp.cli import main as cli
 from soup_nlp.cli import solve as solve_module
@@ -25,11 +26,10 @@ from soup_nlp.storage.progress import interruptible
 pytestmark = pytest.mark.slow
 
 ORBIT = str(Path(__file__).parents[2] / "problems" / "orbit.yaml")
-SMALL = [
-    "--set", "input.width=160", "--set", "input.height=120", "--set", "flow.source=truth",
-    "--set", "segmentation.superpixels=30", "--set", "segmentation.neighbours=5",
-    "--set", "refine.rounds=1",
-]  # fmt: skip
+SMALL = sets(
+    "input.width=160 input.height=120 flow.source=truth segmentation.superpixels=30"
+    " segmentation.neighbours=5 refine.rounds=1"
+)
 
 
 def solve(out: Path) -> int:
@@ -85,7 +85,7 @@ def test_a_second_interrupt_aborts_with_a_message(tmp_path, monkeypatch, capfd):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize("at", [solve_module.SolveLog.iteration, cases.propose])
+@pytest.mark.parametrize("at", [solve_module.options.SolveLog.iteration, cases.propose])
 def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeypatch, capfd):
     pressed = []
 
@@ -95,7 +95,7 @@ def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeyp
             ctrl_c()
         return at(*args, **kwargs)
 
-    owner = cases if at is cases.propose else solve_module.SolveLog
+    owner = cases if at is cases.propose else solve_module.options.SolveLog
     monkeypatch.setattr(owner, at.__name__, interrupted)
     assert solve(tmp_path) == 1
     assert "interrupt received" in capfd.readouterr().err
@@ -111,9 +111,9 @@ def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeyp
 def test_sigterm_ends_like_ctrl_c(times, earlier, monkeypatch, capfd):
     before = (earlier / "result.h5").read_bytes()
     sent = iter([lambda: ctrl_c(times, signal.SIGTERM)])
-    original = solve_module.SolveLog.iteration
+    original = solve_module.options.SolveLog.iteration
     monkeypatch.setattr(
-        solve_module.SolveLog,
+        solve_module.options.SolveLog,
         "iteration",
         lambda *args: (next(sent, lambda: None)(), original(*args)),
     )
@@ -132,7 +132,7 @@ def test_a_second_one_in_the_solver_aborts_too(tmp_path, monkeypatch, capfd):
             ctrl_c()
             ctrl_c()
 
-    monkeypatch.setattr(solve_module.SolveLog, "iteration", interrupted)
+    monkeypatch.setattr(solve_module.options.SolveLog, "iteration", interrupted)
     assert solve(tmp_path / "out") == 130
     assert "no result is written" in capfd.readouterr().err
     assert not (tmp_path / "out" / "summary.json").exists()

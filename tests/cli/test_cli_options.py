@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import write_flo
+from helpers_files import sets, write_flo, write_pair
 
 from soup_nlp.cli.main import main
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -21,12 +21,10 @@ from soup_nlp.storage.folders import MARK
 pytestmark = pytest.mark.slow
 
 ORBIT = str(Path(__file__).parents[2] / "problems" / "orbit.yaml")
-SMALL = [
-    "--set", "input.width=112", "--set", "input.height=84", "--set", "refine.enabled=false",
-    "--set", "segmentation.superpixels=16", "--set", "segmentation.neighbours=5",
-    "--set", "solver.presolve_iterations=2", "--set", "solver.max_iter=0",
-    "--set", "output.page=false",
-]  # fmt: skip
+SMALL = sets(
+    "input.width=112 input.height=84 refine.enabled=false segmentation.superpixels=16"
+    " segmentation.neighbours=5 solver.presolve_iterations=2 solver.max_iter=0 output.page=false"
+)
 
 
 @pytest.mark.parametrize(
@@ -52,8 +50,7 @@ def foreign(folder: Path) -> list[str]:
     """A folder with the inputs of a pair under names of result files."""
     pair = render_scene("orbit", 0, 112, 84)
     folder.mkdir()
-    for name, image in (("frame_0", pair.image_ref), ("frame_1", pair.image_next)):
-        cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
+    write_pair(folder, pair, ("frame_0", "frame_1"))
     np.savetxt(folder / "K.txt", pair.K_ref)
     (folder / "pair.yaml").write_text("input: {kind: folder, path: .}\n")
     return ["solve", str(folder / "pair.yaml"), "-q", *SMALL[4:]]

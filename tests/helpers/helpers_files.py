@@ -1,8 +1,9 @@
-"""Files that readers are tested with, written by hand; a reader of the PLY files of results."""
+"""Files that readers are tested with, written by hand; a reader of PLY files; overrides."""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.data.formats.map_files import MAGIC
+from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 
 
@@ -65,6 +67,17 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
 
     normals = columns("nx", "ny", "nz") if "nx" in table.dtype.names else None
     return columns("x", "y", "z"), columns("red", "green", "blue"), normals
+
+
+def sets(text: str) -> list[str]:
+    """Overrides, separated by spaces, as words of a command line."""
+    return [word for item in text.split() for word in ("--set", item)]
+
+
+def write_pair(folder: Path, pair: Pair, names: Sequence[str] = ("a", "b")) -> None:
+    """The images of a pair as PNG files of these names."""
+    for name, image in zip(names, (pair.image_ref, pair.image_next), strict=True):
+        cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
 
 
 def put(path: Path, content: bytes) -> Path:
