@@ -7,47 +7,20 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+from helpers_model import plain_nlp
 
 from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.model.kernel import Group, Kernel, Table
-from soup_nlp.model.nlp import NLP
 
 
-def write_sx_nl(
-    path: Path,
-    problem: dict[str, ca.SX],
-    *,
-    x0: np.ndarray | None = None,
-    lbx: np.ndarray | None = None,
-    ubx: np.ndarray | None = None,
-    lbg: np.ndarray | None = None,
-    ubg: np.ndarray | None = None,
-    x_names: list[str] | None = None,
-    g_names: list[str] | None = None,
-) -> NLFile:
-    """Write a problem in the form of nlpsol as one kernel with one row."""
+def write_sx_nl(path: Path, problem: dict[str, ca.SX], **given: object) -> NLFile:
+    """Write a problem in the form of nlpsol as one kernel with one row; see `plain_nlp`."""
     x, f, g = problem["x"], problem["f"], problem.get("g", ca.SX(0, 1))
     n, m, none = x.numel(), g.numel(), ca.SX(0, 1)
     kernel = Kernel("nlp", x, none, none, objective=f, constraints=g if m else None)
     table = Table(np.arange(n)[None], np.zeros((1, 0)), np.arange(m)[None])
-
-    def vector(values: np.ndarray | None, size: int, default: float) -> np.ndarray:
-        return np.full(size, default) if values is None else np.asarray(values, float)
-
-    nlp = NLP(
-        "plain",
-        (Group(kernel, table),),
-        x0=vector(x0, n, 0.0),
-        lbx=vector(lbx, n, -np.inf),
-        ubx=vector(ubx, n, np.inf),
-        lbg=vector(lbg, m, -np.inf),
-        ubg=vector(ubg, m, np.inf),
-        theta={},
-        hessian_kind="exact",
-        x_names=lambda: x_names or [f"x[{i}]" for i in range(n)],
-        g_names=lambda: g_names or [f"g[{i}]" for i in range(m)],
-    )
-    return write_nl(path, nlp)
+    groups = [Group(kernel, table)]
+    return write_nl(path, plain_nlp("plain", groups, **{"x0": np.zeros(n), **given}))
 
 
 class ReadBack:

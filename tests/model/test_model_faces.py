@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import itertools
-from functools import cache
 
 import numpy as np
 import pytest
 from helpers_model import (
     GAUGES,
     K_NEXT,
-    Tiny,
+    NORMS,
+    UNITS,
     directional,
     exact_terms,
     lagrangian_gradient,
     random_soup,
+    tiny,
     value,
     weights_for,
     wiggle,
@@ -29,8 +30,6 @@ from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
 pytestmark = pytest.mark.slow
 
-UNITS = ("paper", "pixels")
-NORMS = ("smooth", "epigraph")
 EXACT = {
     "arap": 1e-11,
     **dict.fromkeys(("proj", "cont", "orient", "prior", "depth", "order"), 1e-12),
@@ -43,11 +42,6 @@ EVERY = [
     for data in (DATA if coordinates == "tangent" else (DATA[k % 2], DATA[3 - k % 2]))
 ]
 """Every coordinates and norm, each with both units and both ways to compare motions."""
-
-
-@cache
-def tiny(units: str, at_anchors: bool = False) -> Tiny:
-    return Tiny(units, at_anchors)
 
 
 def form(units: str = "paper", **options) -> Formulation:

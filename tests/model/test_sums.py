@@ -8,6 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from helpers_model import plain_nlp
 
 from soup_nlp.errors import ModelError
 from soup_nlp.model import compile as compiling
@@ -56,21 +57,8 @@ def squares(elements: int, compiled: bool = True, of=lambda x: x) -> NLP:
     e = np.arange(elements)
     weight = np.linspace(1.0, 2.0, elements)[:, None]
     table = Table(np.column_stack([e + 1, 0 * e]), weight, e[:, None])
-    n = elements + 1
-    return NLP(
-        "squares",
-        (Group(kernel, table),),
-        x0=np.linspace(0.5, 1.5, n),
-        lbx=np.full(n, -np.inf),
-        ubx=np.full(n, np.inf),
-        lbg=np.zeros(elements),
-        ubg=np.full(elements, np.inf),
-        theta={"theta": 3.0},
-        hessian_kind="exact",
-        x_names=lambda: [f"x[{i}]" for i in range(n)],
-        g_names=lambda: [f"g[{i}]" for i in range(elements)],
-        compiled=compiled,
-    )
+    own = {"lbg": 0.0, "theta": {"theta": 3.0}, "compiled": compiled}
+    return plain_nlp("squares", [Group(kernel, table)], np.linspace(0.5, 1.5, elements + 1), **own)
 
 
 def assert_same(one: NLP, two: NLP, x: np.ndarray, theta: np.ndarray, rtol: float) -> None:

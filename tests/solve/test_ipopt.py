@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from functools import partial
 
 import casadi as ca
 import numpy as np
 import pytest
+from helpers_model import plain_nlp
 
 from soup_nlp.errors import SolverError
 from soup_nlp.model.kernel import Group, Kernel, Table
@@ -20,22 +22,7 @@ from soup_nlp.storage.progress import Progress, Watch, interruptible
 # --- textbook problems as kernels and tables -----------------------------------------------------
 
 
-def make_nlp(groups: list[Group], x0: list[float], lbx, ubx, lbg, ubg) -> NLP:
-    n, m = len(x0), len(lbg)
-    return NLP(
-        "textbook",
-        tuple(groups),
-        x0=np.array(x0, float),
-        lbx=np.broadcast_to(np.asarray(lbx, float), n),
-        ubx=np.broadcast_to(np.asarray(ubx, float), n),
-        lbg=np.array(lbg, float),
-        ubg=np.array(ubg, float),
-        theta={"one": 1.0},
-        hessian_kind="exact",
-        x_names=lambda: [f"x[{i}]" for i in range(n)],
-        g_names=lambda: [f"g[{i}]" for i in range(m)],
-        compiled=False,
-    )
+textbook = partial(plain_nlp, "textbook", theta={"one": 1.0})
 
 
 def symbols(n: int, data: int = 0) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -59,13 +46,13 @@ def hs071() -> NLP:
         Group(main, Table(np.arange(4)[None], np.zeros((1, 0)), np.array([[0]]))),
         Group(square, Table(np.arange(4)[:, None], np.ones((4, 1)), np.ones((4, 1), int))),
     ]
-    return make_nlp(groups, [1, 5, 5, 1], 1, 5, [25, 40], [np.inf, 40])
+    return textbook(groups, [1, 5, 5, 1], lbx=1, ubx=5, lbg=[25, 40], ubg=[np.inf, 40])
 
 
 HS071 = np.array([1.0, 4.742999643, 3.821149978, 1.379408294]), 17.0140172892
 
 
-def rosenbrock(n: int, lbx: float = -np.inf, ubx: float = np.inf) -> NLP:
+def rosenbrock(n: int, ubx: float = np.inf) -> NLP:
     """Chained Rosenbrock: one kernel over n - 1 overlapping pairs.
 
     The later variable comes first in the kernel: tables need not be sorted.
@@ -76,7 +63,7 @@ def rosenbrock(n: int, lbx: float = -np.inf, ubx: float = np.inf) -> NLP:
     )
     index = np.stack([np.arange(1, n), np.arange(n - 1)], axis=1)
     table = Table(index, np.full((n - 1, 1), 100.0), np.zeros((n - 1, 0), int))
-    return make_nlp([Group(kernel, table)], [0.8] * n, lbx, ubx, [], [])
+    return textbook([Group(kernel, table)], [0.8] * n, ubx=ubx)
 
 
 def solve(nlp: NLP, **options) -> Stage:
@@ -117,14 +104,8 @@ def test_a_multiplier_of_the_wrong_sign_is_no_optimum():
     """max x, x >= 0: at 0 the gradient is balanced only by a force from an upper bound."""
     x, row, one = symbols(1)
     kernel = Kernel("line", x, row, one, objective=-x)
-    nlp = make_nlp(
-        [Group(kernel, Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 0), int)))],
-        [0.0],
-        0,
-        np.inf,
-        [],
-        [],
-    )
+    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 0), int))
+    nlp = textbook([Group(kernel, table)], [0.0], lbx=0)
     residual = optimality(nlp, np.zeros(1), np.array([1.0]), np.zeros(0))
     assert max(residual.values()) >= 1
 
@@ -168,7 +149,7 @@ def infeasible() -> NLP:
     x, row, one = symbols(1)
     kernel = Kernel("square", x, row, one, objective=x, constraints=x**2)
     table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 1), int))
-    return make_nlp([Group(kernel, table)], [1.0], -np.inf, np.inf, [-np.inf], [-1.0])
+    return textbook([Group(kernel, table)], [1.0], ubg=-1.0)
 
 
 def test_an_infeasible_problem_is_a_result_with_its_status():
@@ -297,7 +278,7 @@ def test_a_nan_in_the_objective_is_a_result_too():
     x, row, one = symbols(1)
     kernel = Kernel("root", x, row, one, objective=ca.sqrt(x - 2))
     table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 0), int))
-    nlp = make_nlp([Group(kernel, table)], [1.0], -np.inf, np.inf, [], [])
+    nlp = textbook([Group(kernel, table)], [1.0])
     stage = solve(nlp)
     assert not stage.converged
     assert np.isfinite(stage.x).all()
