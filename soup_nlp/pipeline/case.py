@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_depth, follow_flow
-from soup_nlp.data.flow.layers import corrected, still, without_still_layer
-from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.working_size import resized_flow, working_size
+from soup_nlp.data.working_size import working_size
 from soup_nlp.errors import DataError
-from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
@@ -40,14 +36,15 @@ from soup_nlp.model.reweighting import (
     within_bending,
     without_flow,
 )
+from soup_nlp.pipeline.flow import with_flow
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.components import TIES
-from soup_nlp.start.epipolar import focal_length, repeated
+from soup_nlp.start.epipolar import focal_length
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import in_order
-from soup_nlp.start.prior_evidence import PIECES, judged
+from soup_nlp.start.prior_evidence import PIECES, Evidence, judged
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
@@ -96,40 +93,24 @@ def prepare(
         (h, w), (rows, columns) = full.size, pair.size
         log(f"{w}x{h} is solved at {columns}x{rows} (max_size {problem.max_size:g} megapixels)")
     done("load")
-    pair, seen = _with_flow(problem, full, pair, log)
+    pair, seen = with_flow(problem, full, pair, log)
     done("flow", pair)
-    s, flow = problem.segmentation, pair.flow
-    assert flow is not None
     labels = superpixels(problem, pair)
-    samples = None if s.boundary_samples == "all" else s.boundary_samples
-    segmented = partial(
-        build_segmentation, image=pair.image_ref, neighbours=s.neighbours, boundary_samples=samples
-    )
-    seg = segmented(labels)
+    seg = _segmented(problem, pair, labels)
     done("segmentation", seg)
-    options = SeededStart(**dict(problem.start), seed=problem.seed)
-    fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
     if pair.focal_sigma >= GUESS_SIGMA:
-        better = focal_length(*fitted.views.matches(), pair.focal_sigma, problem.seed)
+        matches = _flow_fit(problem, pair, seg).views.matches()
+        better = focal_length(*matches, pair.focal_sigma, problem.seed)
         full, pair = full.with_focal(*better), pair.with_focal(*better)
         seen = None if seen is None else seen.with_focal(*better)
-        fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
         if log:
             log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
-    given_depth, start = None, _begin(problem, pair, seg, fitted, options)
+    begun, evidence, given_depth = _begun(problem, pair, seg), None, None
     if pair.depth_prior is not None and problem.energy.weights.depth > 0:
-        pieces = start, seg, pair, fitted
-        if s.superpixels > PIECES:
-            few = segmented(superpixels(problem, pair, PIECES))
-            fit = FlowFit.of(few, flow, pair.K_ref, pair.K_next, options)
-            pieces = _begin(problem, pair, few, fit, options), few, pair, fit
-        evidence = judged(*pieces, problem.depth_prior.kind)
-        if evidence.used and not evidence.confirmed and s.follow_flow_px is not None:
-            # the flow does not show where surfaces end
-            seg = segmented(follow_depth(labels, evidence.log_depth(pair.depth_prior)))
-            fitted = FlowFit.of(seg, flow, pair.K_ref, pair.K_next, options)
-            start = _begin(problem, pair, seg, fitted, options)
-        start, given_depth = by_prior(start, seg, pair, fitted, evidence)
+        begun, evidence = _judged(problem, labels, begun)
+    start, seg, *_ = begun
+    if evidence is not None:
+        start, given_depth = by_prior(*begun, evidence)
         if log:
             log(str(evidence))
     done("start", start)
@@ -147,40 +128,49 @@ def prepare(
     return replace(case, soup=answer.soup)
 
 
-def _begin(
-    problem: Problem, pair: Pair, seg: Segmentation, fitted: FlowFit, options: SeededStart
-) -> Start:
+Begun = tuple[Start, Segmentation, Pair, FlowFit]
+"""A start, its superpixels, its pair, and the flow as affine maps."""
+
+
+def _segmented(problem: Problem, pair: Pair, labels: Labels) -> Segmentation:
+    """Superpixels with their graphs."""
+    s = problem.segmentation
+    samples = None if s.boundary_samples == "all" else s.boundary_samples
+    return build_segmentation(labels, pair.image_ref, s.neighbours, boundary_samples=samples)
+
+
+def _flow_fit(problem: Problem, pair: Pair, seg: Segmentation) -> FlowFit:
+    """The flow of a pair as affine maps."""
+    assert pair.flow is not None
+    options = SeededStart(**dict(problem.start), seed=problem.seed)
+    return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, options)
+
+
+def _begun(problem: Problem, pair: Pair, seg: Segmentation) -> Begun:
     """The start on given superpixels, without a depth prior."""
+    fitted = _flow_fit(problem, pair, seg)
     start = propose(fitted)
     if problem.energy.weights.order > 0:
-        start = in_order(start, seg, pair, fitted, options)
-    return start
+        start = in_order(start, seg, pair, fitted, fitted.options)
+    return start, seg, pair, fitted
 
 
-def _with_flow(
-    problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] | None
-) -> tuple[Pair, Pair | None]:
-    """A pair with its flow, and that pair without a still layer before the scene, if it has one.
+def _judged(problem: Problem, labels: Labels, begun: Begun) -> tuple[Begun, Evidence]:
+    """Judge the depth prior of a pair, and return the start for it with the evidence.
 
-    Args:
-        problem: The merged problem.
-        full: The pair at its own size.
-        pair: The pair at the size that is solved.
-        log: Called with a line if there is such a layer.
+    Superpixels follow a prior that is used although the flow does not confirm it.
     """
-    flow = pair.flow
-    if flow is None and pair is not full and problem.flow.is_file():
-        # a flow file has the size of the original images
-        flow = resized_flow(problem.flow.load(full, problem.path), full, pair)
-    flow = flow or problem.flow.load(pair, problem.path)
-    pair = pair.with_flow(flow)
-    computed = is_named(flow.source) and not flow.source.startswith("truth")
-    seen = see_through(pair, problem.seed) if problem.flow.see_through and computed else None
-    if seen is None or seen.flow is None:
-        return pair, None
-    if log:
-        log("a layer stands still before the scene: flow searched for behind it")
-    return pair.with_flow(seen.flow), seen
+    s, pair, few = problem.segmentation, begun[2], begun
+    if s.superpixels > PIECES:
+        pieces = superpixels(problem, pair, PIECES)
+        few = _begun(problem, pair, _segmented(problem, pair, pieces))
+    evidence = judged(*few, problem.depth_prior.kind)
+    if evidence.used and not evidence.confirmed and s.follow_flow_px is not None:
+        assert pair.depth_prior is not None
+        # the flow does not show where surfaces end
+        followed = follow_depth(labels, evidence.log_depth(pair.depth_prior))
+        begun = _begun(problem, pair, _segmented(problem, pair, followed))
+    return begun, evidence
 
 
 def superpixels(problem: Problem, pair: Pair, count: int | None = None) -> Labels:
@@ -301,54 +291,3 @@ def check_fits(problem: Problem, pair: Pair) -> None:
     total, (_, hint) = sum(size for size, _ in parts.values()), max(parts.values())
     shares = ", ".join(f"{name} {size / 1e9:.3g} GB" for name, (size, _) in parts.items())
     require_memory(total, "this problem", shares, hint)
-
-
-# --- a layer that stands still before the scene --------------------------------------------------
-
-LEAST_SHARE = 0.003
-"""Least share of pixels that stand still for the search for a layer."""
-LEAST_FLOW = 2.0
-"""Median displacement, pixels, below which the camera may be at rest."""
-PIXELS = 6000
-"""Largest number of moving pixels to which their motion is fitted."""
-
-
-def see_through(pair: Pair, seed: int = 0) -> Pair | None:
-    """The pair without a still layer, and with the flow of the moving scene behind it.
-
-    Args:
-        pair: A pair whose flow was computed from its images.
-        seed: Seed of the sample to which the motion is fitted.
-
-    Returns:
-        Grey images (as RGB) without the layer, and the corrected flow; None if no pixel stands
-        still, if all may, or if the images do not contradict the flow of those that do.
-    """
-    flow = pair.flow
-    assert flow is not None
-    at_rest, sure = still(flow), flow.confidence > 0.5
-    if pair.size != pair.image_next.shape[:2] or at_rest.mean() < LEAST_SHARE:
-        return None
-    if np.median(np.linalg.norm(flow.uv[sure], axis=1)) < LEAST_FLOW:
-        return None
-    v, u = np.nonzero(sure & ~at_rest)
-    pick = np.random.default_rng(seed).permutation(len(v))[:PIXELS]
-    pixel = np.stack([u, v], axis=-1)[pick].astype(float)
-    move = flow.uv[v, u][pick].astype(float)
-    motions = repeated(
-        rays(pair.K_ref, pixel),
-        rays(pair.K_next, pixel + move),
-        flow.confidence[v, u][pick].astype(float),
-        float(pair.K_next[0, 0]),
-        count=1,
-        seed=seed,
-    )
-    if not motions:
-        return None
-    ref, nxt = without_still_layer(pair.image_ref, pair.image_next)
-    R, t = motions[0].R, motions[0].t
-    new = corrected(ref, nxt, flow, R, t, pair.K_ref, pair.K_next)
-    if new is None:
-        return None
-    first, second = (np.repeat(image[..., None], 3, axis=2) for image in (ref, nxt))
-    return replace(pair, image_ref=first, image_next=second, flow=new)
