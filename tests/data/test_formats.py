@@ -39,7 +39,7 @@ def flows(low: float, high: float) -> st.SearchStrategy[np.ndarray]:
 def test_flo_golden_bytes(tmp_path: Path) -> None:
     golden = struct.pack("<fii4f", 202021.25, 2, 1, 1.5, -2.0, 1e10, 0.0)
     assert golden[:4] == b"PIEH"
-    flow = fmt.read_flo(put(tmp_path / "a.flo", golden))
+    flow = fmt.read_flow(put(tmp_path / "a.flo", golden))
     np.testing.assert_array_equal(flow, [[[1.5, -2.0], [np.nan, np.nan]]])
 
 
@@ -55,9 +55,9 @@ def test_real_files(shared_data: Path, tmp_path: Path) -> None:
         assert values.shape[:2] == (436, 1024)
         assert path.read_bytes() == header + values.astype("<f4").tobytes()
     folder = shared_data / "kitti2012" / "training"
-    flow = fmt.read_kitti_flow(folder / "flow_occ" / "000027_10.png")
+    flow = fmt.read_flow(folder / "flow_occ" / "000027_10.png")
     write_kitti_flow(tmp_path / "a.png", flow)
-    np.testing.assert_array_equal(fmt.read_kitti_flow(tmp_path / "a.png"), flow)
+    np.testing.assert_array_equal(fmt.read_flow(tmp_path / "a.png"), flow)
     (projection,) = read_kitti_projections(folder / "calib" / "000027.txt", ["P1"])
     assert projection[0, 3] == -386.1448
 
@@ -66,13 +66,13 @@ def test_real_files(shared_data: Path, tmp_path: Path) -> None:
 @given(flow=flows(-1e9, 1e9))
 def test_flo_round_trip(tmp_path: Path, flow: np.ndarray) -> None:
     write_flo(tmp_path / "a.flo", flow)
-    np.testing.assert_array_equal(fmt.read_flo(tmp_path / "a.flo"), flow)
+    np.testing.assert_array_equal(fmt.read_flow(tmp_path / "a.flo"), flow)
 
 
 @pytest.mark.parametrize("mark", [np.nan, np.inf, -np.inf, 1.1e9, -2e9])
 def test_flo_unknown(tmp_path: Path, mark: float) -> None:
     body = struct.pack("<fii4f", 202021.25, 2, 1, 1.0, mark, 1.0, 1.0)
-    flow = fmt.read_flo(put(tmp_path / "a.flo", body))
+    flow = fmt.read_flow(put(tmp_path / "a.flo", body))
     assert np.isnan(flow[0, 0]).all()
     assert np.isfinite(flow[0, 1]).all()
 
@@ -119,11 +119,12 @@ def test_a_malformed_file_is_refused(name: str, content: bytes, match: str, tmp_
 def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
     put(tmp_path / "flow_0.flo", b"x")
     with raises(r"flow file is missing[\s\S]*flow_0\.flo"):
-        fmt.read_flo(tmp_path / "flow_1.flo")
+        fmt.read_flow(tmp_path / "flow_1.flo")
     with raises(r"folder .* does not exist"):
-        fmt.read_flo(tmp_path / "nowhere" / "a.flo")
+        fmt.read_flow(tmp_path / "nowhere" / "a.flo")
+    (tmp_path / "flow_2.flo").mkdir()
     with raises("cannot be read"):
-        fmt.read_flo(tmp_path)
+        fmt.read_flow(tmp_path / "flow_2.flo")
 
 
 # --- flow in PNG --------------------------------------------------------------------------------
@@ -132,7 +133,7 @@ def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
 def test_kitti_flow_channel_order(tmp_path: Path) -> None:
     rgb = np.array([[[2**15 + 64, 2**15 - 128, 1], [1, 2, 0]]], np.uint16)
     cv2.imwrite(str(tmp_path / "a.png"), rgb[:, :, ::-1])
-    flow = fmt.read_kitti_flow(tmp_path / "a.png")
+    flow = fmt.read_flow(tmp_path / "a.png")
     np.testing.assert_array_equal(flow, [[[1.0, -2.0], [np.nan, np.nan]]])
 
 
@@ -147,10 +148,10 @@ def test_kitti_flow_round_trip(tmp_path: Path, flow: np.ndarray) -> None:
 def test_kitti_flow_rejects_8_bit(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4, 3), np.uint8))
     with raises(r"uint8 with 3 channel"):
-        fmt.read_kitti_flow(tmp_path / "a.png")
+        fmt.read_flow(tmp_path / "a.png")
     cv2.imwrite(str(tmp_path / "b.png"), np.zeros((4, 4), np.uint16))
     with raises(r"uint16 with 1 channel"):
-        fmt.read_kitti_flow(tmp_path / "b.png")
+        fmt.read_flow(tmp_path / "b.png")
 
 
 def test_vkitti_flow(tmp_path: Path) -> None:

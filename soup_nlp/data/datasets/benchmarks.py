@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from dataclasses import replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator
 
-from soup_nlp.arrays import Float, Mask
-from soup_nlp.data.datasets.layout import (
-    PairInput,
-    Resolve,
-    make_pair,
-    need,
-    need_folder,
-    read_if,
-    training_folder,
-)
+from soup_nlp.data.datasets.layout import Folder, PairInput, Resolve, make_pair
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import (
     read_cam,
@@ -28,10 +19,9 @@ from soup_nlp.data.formats.camera_files import (
 from soup_nlp.data.formats.images import assumed, decode, read_mask
 from soup_nlp.data.formats.map_files import (
     KITTI_DISPARITY,
+    read_depth,
     read_depth_png16,
-    read_dpt,
-    read_flo,
-    read_kitti_flow,
+    read_flow,
     read_vkitti_depth,
     read_vkitti_flow,
 )
@@ -39,31 +29,16 @@ from soup_nlp.data.pair import Pair, Truth, check_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Whole
-from soup_nlp.storage.files import is_file
-
-
-class _Kitti(NamedTuple):
-    """Folders and names of one KITTI benchmark."""
-
-    images: str
-    calibration: str
-    projections: tuple[str, str]
-    disparity: str
-
-    @property
-    def layout(self) -> str:
-        """Its files, for messages."""
-        return (
-            f"training/{self.images}/NNNNNN_10.png and _11.png, training/{self.calibration}/"
-            f"NNNNNN.txt ({', '.join(self.projections)}); optional {self.disparity}, flow_occ,"
-            " flow_noc, obj_map with NNNNNN_10.png"
-        )
-
 
 _KITTI = {
-    "kitti2012": _Kitti("image_0", "calib", ("P0", "P1"), "disp_occ"),
-    "kitti2015": _Kitti("image_2", "calib_cam_to_cam", ("P_rect_02", "P_rect_03"), "disp_occ_0"),
+    "kitti2012": ("image_0", "calib", ("P0", "P1"), "disp_occ"),
+    "kitti2015": ("image_2", "calib_cam_to_cam", ("P_rect_02", "P_rect_03"), "disp_occ_0"),
 }
+"""Folders of images and calibration, names of the projections, folder of disparities."""
+KITTI_LAYOUT = (
+    "training/{0}/NNNNNN_10.png and _11.png, training/{1}/NNNNNN.txt ({2[0]}, {2[1]}); optional"
+    " {3}, flow_occ, flow_noc, obj_map with NNNNNN_10.png"
+)
 
 _VKITTI = {
     "vkitti1": (
@@ -115,12 +90,12 @@ class KittiInput(PairInput):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        kitti = _KITTI[self.kind]
-        base = training_folder(path(self.root), kitti.layout)
+        names, calib, projections, disparities = _KITTI[self.kind]
+        folder = Folder(path(self.root), KITTI_LAYOUT.format(*_KITTI[self.kind]), "training")
         name = f"{int(self.index):06d}"
-        images = [need(base / kitti.images / f"{name}_{k}.png", kitti.layout) for k in (10, 11)]
-        calibration = need(base / kitti.calibration / f"{name}.txt", kitti.layout)
-        left, right = read_kitti_projections(calibration, kitti.projections)
+        images = [folder.need(f"{names}/{name}_{k}.png") for k in (10, 11)]
+        calibration = folder.need(f"{calib}/{name}.txt")
+        left, right = read_kitti_projections(calibration, projections)
         K = left[:, :3].copy()
         baseline = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
         if not baseline > 0:
@@ -130,15 +105,15 @@ class KittiInput(PairInput):
                 found=f"{baseline:g} m",
                 expected="a positive length (0.53 to 0.55 m in KITTI)",
             )
-        kinds = kitti.disparity, "flow_occ", "flow_noc", "obj_map"
-        files = [base / kind / f"{name}_10.png" for kind in kinds]
-        disparity = read_if(read_depth_png16, files[0], KITTI_DISPARITY)
-        flow, visible = (read_if(read_kitti_flow, file) for file in files[1:3])
+        file = f"{{}}/{name}_10.png".format
+        disparity = folder.read(read_depth_png16, file(disparities), scale=KITTI_DISPARITY)
+        flow, visible = (folder.read(read_flow, file(kind)) for kind in ("flow_occ", "flow_noc"))
         occluded = None
         if flow is not None and visible is not None:
-            check_size("flow_noc and flow_occ", visible.shape, flow.shape, files[2])
+            where = folder.path / file("flow_noc")
+            check_size("flow_noc and flow_occ", visible.shape, flow.shape, where)
             occluded = np.isfinite(flow[:, :, 0]) & ~np.isfinite(visible[:, :, 0])
-        objects = read_if(decode, files[3], "object map")
+        objects = folder.read(decode, file("obj_map"), what="object map")
         truth = Truth(
             depth_ref=None if disparity is None else K[0, 0] * baseline / disparity,
             flow=flow,
@@ -178,25 +153,25 @@ class VkittiInput(SceneFrames):
         image, depth, flow = _VKITTI[self.kind]
         layout = f"{image}; optional {depth}, {flow}"
         layout = layout.replace("{:05d}", "NNNNN").format(*["SCENE", "VARIATION"] * 3)
-        root = need_folder(path(self.root), layout)
+        folder, numbers = Folder(path(self.root), layout), (self.frame, self.frame + self.step)
 
-        def file(pattern: str, number: int) -> Path:
-            head, tail = pattern.format(self.scene, self.variation, number).split("/", 1)
-            return max(root.glob(head), default=root / head) / tail
+        def file(pattern: str, number: int) -> str:
+            name = pattern.format(self.scene, self.variation, number)
+            if "*" not in pattern:
+                return name
+            head, tail = name.split("/", 1)
+            return f"{max((p.name for p in folder.path.glob(head)), default=head)}/{tail}"
 
-        numbers = (self.frame, self.frame + self.step)
-        images = [need(file(image, number), layout) for number in numbers]
+        images = [folder.need(file(image, number)) for number in numbers]
         if self.kind == "vkitti1":
             cameras = [intrinsics(*VKITTI1_CAMERA)] * 2
-            assumed(root, "Virtual KITTI 1 has no file of its camera", VKITTI1_TEXT)
+            assumed(folder.path, "Virtual KITTI 1 has no file of its camera", VKITTI1_TEXT)
         else:
-            table = need(root / self.scene / self.variation / "intrinsic.txt", layout)
+            table = folder.need(f"{self.scene}/{self.variation}/intrinsic.txt")
             cameras = read_vkitti2_intrinsics(table, numbers)
-        truth = Truth(
-            depth_ref=read_if(read_vkitti_depth, file(depth, numbers[0])),
-            depth_next=read_if(read_vkitti_depth, file(depth, numbers[1])),
-            flow=read_if(read_vkitti_flow, file(flow, self.frame) if self.step == 1 else None),
-        )
+        depths = [folder.read(read_vkitti_depth, file(depth, number)) for number in numbers]
+        flows = [file(flow, self.frame)] if self.step == 1 else []
+        truth = Truth(depths[0], depths[1], folder.read(read_vkitti_flow, *flows))
         name = f"{self.kind}_{self.scene}_{self.variation}_{self.frame:05d}"
         return make_pair(images, cameras, truth, name)
 
@@ -216,37 +191,37 @@ class SintelInput(SceneFrames):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        base = training_folder(path(self.root), SINTEL_LAYOUT)
+        folder = Folder(path(self.root), SINTEL_LAYOUT, "training")
         names = [f"{self.scene}/frame_{k:04d}" for k in (self.frame, self.frame + self.step)]
-        images = [need(base / self.render / f"{name}.png", SINTEL_LAYOUT) for name in names]
-        depths = [read_if(read_dpt, base / "depth" / f"{name}.dpt") for name in names]
-        flow, occluded = _sintel_flow(base, names[0]) if self.step == 1 else (None, None)
-        files = [base / "camdata_left" / f"{name}.cam" for name in names]
-        absent = [file for file in files if not is_file(file)]
+        images = [folder.need(f"{self.render}/{name}.png") for name in names]
+        depths = [folder.read(read_depth, f"depth/{name}.dpt") for name in names]
+        cameras = [folder.read(read_cam, f"camdata_left/{name}.cam") for name in names]
+        absent = [name for name, K in zip(names, cameras, strict=True) if K is None]
         if absent:
             doubt = f", which may be wrong for {self.scene}" * (self.scene != DEFAULT_SCENE)
             assumed(
-                absent[0],
+                folder.path / "camdata_left" / f"{absent[0]}.cam",
                 "no such camera file (camdata_left comes with Sintel's depth training data)",
                 f"the focal length of {DEFAULT_SCENE}, {DEFAULT_CAMERA[0]:g} pixels{doubt}",
             )
-        cameras = [intrinsics(*DEFAULT_CAMERA) if f in absent else read_cam(f) for f in files]
-        truth = Truth(depths[0], depths[1], flow, occluded)
+        cameras = [intrinsics(*DEFAULT_CAMERA) if K is None else K for K in cameras]
+        truth = Truth(depths[0], depths[1])
+        if self.step == 1:
+            truth = replace(truth, **_sintel_flow(folder, names[0]))
         return make_pair(images, cameras, truth, f"sintel_{self.scene}_{self.frame:04d}")
 
 
-def _sintel_flow(base: Path, name: str) -> tuple[Float | None, Mask | None]:
+def _sintel_flow(folder: Folder, name: str) -> dict[str, Any]:
     """True flow and occlusion of a frame; None without their files."""
-    flow = read_if(read_flo, base / "flow" / f"{name}.flo")
-    files = [base / kind / f"{name}.png" for kind in ("occlusions", "invalid")]
-    occluded, invalid = (read_if(read_mask, file) for file in files)
-    if flow is None:
-        return None, occluded
-    for mask, file in zip((occluded, invalid), files, strict=True):
-        if mask is not None:
-            check_size("mask and flow", mask.shape, flow.shape, file)
-    if occluded is not None:
-        occluded |= np.isfinite(flow[:, :, 0]) & leaves(flow, flow.shape[:2])
-    if invalid is not None:
-        flow[invalid] = np.nan
-    return flow, occluded
+    flow = folder.read(read_flow, f"flow/{name}.flo")
+    files = [f"{kind}/{name}.png" for kind in ("occlusions", "invalid")]
+    occluded, invalid = (folder.read(read_mask, file) for file in files)
+    if flow is not None:
+        for mask, file in zip((occluded, invalid), files, strict=True):
+            if mask is not None:
+                check_size("mask and flow", mask.shape, flow.shape, folder.path / file)
+        if occluded is not None:
+            occluded |= np.isfinite(flow[:, :, 0]) & leaves(flow, flow.shape[:2])
+        if invalid is not None:
+            flow[invalid] = np.nan
+    return {"flow": flow, "occluded": occluded}

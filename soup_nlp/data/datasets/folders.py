@@ -14,15 +14,7 @@ import numpy as np
 from skimage.measure import label
 
 from soup_nlp.arrays import Float
-from soup_nlp.data.datasets.layout import (
-    FramesInput,
-    PairInput,
-    Resolve,
-    make_pair,
-    need,
-    need_folder,
-    read_if,
-)
+from soup_nlp.data.datasets.layout import Folder, FramesInput, PairInput, Resolve, make_pair
 from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_intrinsics
 from soup_nlp.data.formats.images import assumed, read_mask
@@ -31,7 +23,7 @@ from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Positive, Whole
-from soup_nlp.storage.files import is_file, read_json, read_text
+from soup_nlp.storage.files import read_json, read_text
 from soup_nlp.storage.folders import MARK
 
 LAYOUT = (
@@ -39,9 +31,8 @@ LAYOUT = (
     "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, moving.png, "
     "points.npz"
 )
-_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp")
-_DEPTHS = (".npy", ".dpt", ".pfm", ".png")
-_FLOWS = (".flo", ".npy", ".png")
+_IMAGES = ".png .jpg .jpeg .tif .tiff .ppm .pgm .bmp"
+_DEPTHS = ".npy .dpt .pfm .png"
 
 TUM_SCALE = 5000.0
 """Values per metre of a TUM RGB-D depth image."""
@@ -59,13 +50,9 @@ _TUM_CAMERAS = {
 _TUM_SLACK = 0.02  # seconds between a colour image and its depth image
 
 
-def _find(folder: Path, stems: tuple[str, ...], suffixes: tuple[str, ...]) -> Path | None:
-    """The first file of the folder with one of the names, in the order given."""
-    for stem in stems:
-        for suffix in suffixes:
-            if is_file(folder / f"{stem}{suffix}"):
-                return folder / f"{stem}{suffix}"
-    return None
+def _names(stems: str, suffixes: str) -> list[str]:
+    """Names of files with one of the stems and one of the suffixes, separated by blanks."""
+    return [f"{stem}{suffix}" for stem in stems.split() for suffix in suffixes.split()]
 
 
 class FolderInput(FramesInput):
@@ -89,45 +76,46 @@ class FolderInput(FramesInput):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        return _plain_folder(path(self.path), self)
+        return _plain_folder(Folder(path(self.path), LAYOUT), self)
 
 
-def _plain_folder(folder: Path, options: FolderInput, usual: float = MILLIMETRES) -> Pair:
+def _plain_folder(folder: Folder, options: FolderInput, usual: float = MILLIMETRES) -> Pair:
     """The pair of a plain folder; `usual` are the values per unit of a depth without a scale."""
-    folder = need_folder(folder, LAYOUT)
-    marked, summary = is_file(folder / MARK), None
+    marked, summary = folder.find(MARK) is not None, None
     with suppress(DataError):
-        summary = read_json(folder / "summary.json", "summary.json")
+        summary = read_json(folder.path / "summary.json", "summary.json")
     if marked or (isinstance(summary, dict) and "problem_hash" in summary):
         raise DataError(
             "input folder holds a result, whose depth and flow would pass for truth",
-            where=folder,
+            where=folder.path,
             found=f"the hidden file {MARK} of a solve" if marked else "summary.json of a solve",
             expected="a folder with inputs only",
             hint="move the frames, K.txt and the truth to a folder of their own"
             + (f"; delete {MARK} where no solve has left files" if marked else ""),
         )
     images = [
-        need(_find(folder, (f"frame_{k}", stem), _IMAGES) or folder / f"frame_{k}.png", LAYOUT)
-        for k, stem in enumerate(("image_ref", "image_next"))
+        folder.need(*_names(stems, _IMAGES))
+        for stems in ("frame_0 image_ref", "frame_1 image_next")
     ]
-    K = read_intrinsics(need(folder / "K.txt", LAYOUT))
-    K_next = read_if(read_intrinsics, folder / "K_next.txt")
-    depth = _find(folder, ("depth", "depth_0", "depth_ref"), _DEPTHS)
-    depth_next = _find(folder, ("depth_next", "depth_1"), _DEPTHS)
-    moving = read_if(read_mask, _find(folder, ("moving",), _IMAGES))
+    K = read_intrinsics(folder.need("K.txt"))
+    K_next = folder.read(read_intrinsics, "K_next.txt")
+    depth, depth_next = (
+        folder.read(read_depth, *_names(stems, _DEPTHS), scale=options.depth_scale, usual=usual)
+        for stems in ("depth depth_0 depth_ref", "depth_next depth_1")
+    )
+    moving = folder.read(read_mask, *_names("moving", _IMAGES))
     truth = Truth(
-        depth_ref=read_if(read_depth, depth, options.depth_scale, usual),
-        depth_next=read_if(read_depth, depth_next, options.depth_scale, usual),
-        flow=read_if(read_flow, _find(folder, ("flow",), _FLOWS)),
-        occluded=read_if(read_mask, _find(folder, ("occluded",), _IMAGES)),
+        depth_ref=depth,
+        depth_next=depth_next,
+        flow=folder.read(read_flow, *_names("flow", ".flo .npy .png")),
+        occluded=folder.read(read_mask, *_names("occluded", _IMAGES)),
         # connected regions of the pixels that move
         components=None if moving is None else label(moving, connectivity=2).astype(np.int32),
-        points=read_if(_read_points, folder / "points.npz", options.unit),
+        points=folder.read(_read_points, "points.npz", unit=options.unit),
         unit=options.unit,
     )
     cameras = [K, K if K_next is None else K_next]
-    name = folder.resolve().name
+    name = folder.path.resolve().name
     return make_pair(images, cameras, truth, name, options.white, cropped=options.cropped)
 
 
@@ -172,32 +160,30 @@ class TumInput(PairInput):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        folder = need_folder(path(self.path), TUM_LAYOUT)
-        if _find(folder, ("frame_0", "image_ref"), _IMAGES) and not is_file(folder / "rgb.txt"):
+        folder = Folder(path(self.path), TUM_LAYOUT)
+        if folder.find(*_names("frame_0 image_ref", _IMAGES)) and not folder.find("rgb.txt"):
             options = FolderInput(kind="folder", path=self.path, depth_scale=self.depth_scale)
-            return _plain_folder(folder, options, TUM_SCALE)
-        images = _tum_list(need(folder / "rgb.txt", TUM_LAYOUT))
-        depths = read_if(_tum_list, folder / "depth.txt") or []
+            return _plain_folder(Folder(folder.path, LAYOUT), options, TUM_SCALE)
+        images = _tum_list(folder.need("rgb.txt"))
+        depths = folder.read(_tum_list, "depth.txt") or []
         numbers = self.frame, self.frame + self.step
         for index in numbers:
             if not 0 <= index < len(images):
                 raise DataError(
                     "frame is not in the sequence",
-                    where=folder / "rgb.txt",
+                    where=folder.path / "rgb.txt",
                     found=index,
                     expected=f"0 to {len(images) - 1}",
                 )
-        beside = _find(folder, ("K", "camera"), (".txt",))
-        K = _tum_camera(folder) if beside is None else read_intrinsics(beside)
+        K = folder.read(read_intrinsics, "K.txt", "camera.txt")
+        K = _tum_camera(folder.path) if K is None else K
         maps = []
         for time, _ in (images[k] for k in numbers):
-            stamp, file = min(
-                depths, key=lambda entry: abs(entry[0] - time), default=(np.inf, None)
-            )
-            near = abs(stamp - time) <= _TUM_SLACK
-            maps.append(read_if(read_depth, file if near else None, self.depth_scale, TUM_SCALE))
-        name = f"{folder.resolve().name}_{self.frame}"
-        files = [need(images[k][1], TUM_LAYOUT) for k in numbers]
+            near = [entry for entry in depths if abs(entry[0] - time) <= _TUM_SLACK]
+            best = [name for _, name in sorted(near, key=lambda entry: abs(entry[0] - time))[:1]]
+            maps.append(folder.read(read_depth, *best, scale=self.depth_scale, usual=TUM_SCALE))
+        name = f"{folder.path.resolve().name}_{self.frame}"
+        files = [folder.need(images[k][1]) for k in numbers]
         return make_pair(files, [K, K], Truth(maps[0], maps[1]), name)
 
 
@@ -214,15 +200,15 @@ def _tum_camera(folder: Path) -> Float:
     return intrinsics(*_TUM_CAMERAS[name])
 
 
-def _tum_list(path: Path) -> list[tuple[float, Path]]:
-    """(time stamp in seconds, file) of each line of rgb.txt or depth.txt."""
+def _tum_list(path: Path) -> list[tuple[float, str]]:
+    """(time stamp in seconds, name of a file) of each line of rgb.txt or depth.txt."""
     out = []
     for number, line in enumerate(read_text(path, "file list").splitlines(), 1):
         if not line.strip() or line.startswith("#"):
             continue
         words = line.split()
         try:
-            out.append((float(words[0]), path.parent / words[1]))
+            out.append((float(words[0]), words[1]))
         except (ValueError, IndexError):
             raise DataError(
                 "line of a file list is not understood",

@@ -1,11 +1,11 @@
-"""Shared parts of the kinds of input: base class, required and optional files, pair of images."""
+"""Shared parts of the kinds of input: base class, folder of a dataset, pair of images."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import Field
 
@@ -54,57 +54,58 @@ class FramesInput(PairInput):
     """The images are parts of larger ones: the principal point may be anywhere."""
 
 
-def need(path: PathLike, layout: str) -> Path:
-    """The path, if it is a file; `layout` is the expected layout for the message.
+class Folder:
+    """The folder of a dataset.
+
+    Args:
+        path: Its path.
+        layout: The files that are expected in it, for messages.
+        below: Name of a folder in it that takes its place if there is one.
 
     Raises:
-        DataError: the file is missing; the message names the first missing folder.
+        DataError: the path is no folder.
     """
-    path = as_path(path)
-    if is_file(path):
-        return path
-    folder = path.parent
-    while not is_folder(folder) and folder != folder.parent:
-        folder = folder.parent
-    raise DataError(
-        "file of the dataset is missing",
-        where=path,
-        found=f"{folder} has no {path.relative_to(folder).parts[0]}",
-        expected=layout,
-        hint="check the root folder and the frame, or rearrange the files to this layout",
-    )
 
+    def __init__(self, path: PathLike, layout: str, below: str = "") -> None:
+        self.path, self.layout = as_path(path, "dataset folder"), layout
+        if not is_folder(self.path):
+            raise DataError(
+                "dataset folder is missing",
+                where=path,
+                found="a file" if is_file(path) else "nothing",
+                expected=f"a folder with {layout}",
+            )
+        self.path = self.path / below if is_folder(self.path / below) else self.path
 
-def need_folder(path: PathLike, layout: str) -> Path:
-    """The path, if it is a folder.
+    def find(self, *names: str) -> Path | None:
+        """The first of these files that exists; None if there is none."""
+        return next((self.path / name for name in names if is_file(self.path / name)), None)
 
-    Raises:
-        DataError: it is no folder.
-    """
-    path = as_path(path, "dataset folder")
-    if not is_folder(path):
+    def need(self, *names: str) -> Path:
+        """The first of these files that exists.
+
+        Raises:
+            DataError: there is none; the message names the first missing folder.
+        """
+        file = self.find(*names)
+        if file is not None:
+            return file
+        path = self.path / names[0]
+        folder = path.parent
+        while not is_folder(folder) and folder != folder.parent:
+            folder = folder.parent
         raise DataError(
-            "dataset folder is missing",
+            "file of the dataset is missing",
             where=path,
-            found="a file" if is_file(path) else "nothing",
-            expected=f"a folder with {layout}",
+            found=f"{folder} has no {path.relative_to(folder).parts[0]}",
+            expected=self.layout,
+            hint="check the root folder and the frame, or rearrange the files to this layout",
         )
-    return path
 
-
-def training_folder(root: PathLike, layout: str) -> Path:
-    """The folder `training` of a dataset, or the root if it has no such folder.
-
-    Raises:
-        DataError: the root is not a folder.
-    """
-    root = need_folder(root, layout)
-    return root / "training" if is_folder(root / "training") else root
-
-
-def read_if(reader: Callable[..., T], path: Path | None, *options: object) -> T | None:
-    """Contents of an optional file; None if there is no such file."""
-    return reader(path, *options) if path is not None and is_file(path) else None
+    def read(self, reader: Callable[..., T], *names: str, **options: Any) -> T | None:
+        """Contents of the first of these files that exists; None if there is none."""
+        file = self.find(*names)
+        return None if file is None else reader(file, **options)
 
 
 def make_pair(

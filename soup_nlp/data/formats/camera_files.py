@@ -15,16 +15,15 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.images import check_body
-from soup_nlp.data.formats.map_files import check_magic
+from soup_nlp.data.formats.map_files import after_magic
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.storage.files import PathLike, parse_yaml, read_bytes, read_text
+from soup_nlp.storage.files import PathLike, parse_yaml, read_text
 
 CAMERA = ("fx", "fy", "cx", "cy")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of distortion in OpenCV's order; up to six more have no common names."""
 
-_CAM_BYTES = 8 * (9 + 12)  # intrinsics (3, 3) and extrinsics (3, 4)
 _VKITTI2_COLUMNS = ("frame", "cameraID", "K[0,0]", "K[1,1]", "K[0,2]", "K[1,2]")
 
 
@@ -174,10 +173,9 @@ def undistorted(image: Image, K: Float, distortion: Float) -> tuple[Image, Float
 
 def read_cam(path: PathLike) -> Float:
     """Read the intrinsics of a Sintel .cam file; its extrinsics are not used."""
-    content = read_bytes(path, "camera file")
-    check_magic(content, path, "camera file")
-    check_body(len(content) - 4, _CAM_BYTES, path, "camera file")
-    return check_intrinsics(np.frombuffer(content, "<f8", 9, offset=4).reshape(3, 3), path)
+    content = after_magic(path, "camera file")
+    check_body(len(content), 8 * (9 + 12), path, "camera file")  # (3, 3) and (3, 4)
+    return check_intrinsics(np.frombuffer(content, "<f8", 9).reshape(3, 3), path)
 
 
 def read_kitti_projections(path: PathLike, names: Sequence[str]) -> list[Float]:

@@ -47,9 +47,14 @@ MILLIMETRES = 1000.0
 """Values per unit of length of a depth image that is assumed if none are given."""
 
 
-def check_magic(content: bytes, path: PathLike, what: str) -> None:
-    """Raise DataError unless a file of Sintel or Middlebury starts with `MAGIC`."""
-    if content[:4] != MAGIC:
+def after_magic(path: PathLike, what: str) -> bytes:
+    """Content of a file of Sintel or Middlebury behind `MAGIC`.
+
+    Raises:
+        DataError: the file does not start with it.
+    """
+    content = read_bytes(path, what)
+    if not content.startswith(MAGIC):
         raise DataError(
             f"{what} has the wrong magic number",
             where=path,
@@ -57,37 +62,30 @@ def check_magic(content: bytes, path: PathLike, what: str) -> None:
             expected=f"{MAGIC!r} (float 202021.25)",
             hint=f"is it really a {Path(path).suffix} file?",
         )
+    return content[4:]
 
 
-def _raster(
-    content: bytes, start: int, size: tuple[int, ...], order: str, path: PathLike, what: str
-) -> FloatMap:
-    """The float32 numbers of byte order `order` after a header of `start` bytes, as an array.
+def _floats(body: bytes, size: tuple[int, ...], order: str, path: PathLike, what: str) -> FloatMap:
+    """The float32 numbers of byte order `order` behind the header of a file, as an array.
 
     Raises:
-        DataError: the size (H, W, ...) is impossible, or the file is shorter or longer.
+        DataError: the size (H, W, ...) is impossible, or the body is shorter or longer.
     """
     check_image_size(size[1], size[0], what, path)
-    check_body(len(content) - start, 4 * int(np.prod(size)), path, what)
-    values = np.frombuffer(content, f"{order}f4", offset=start).reshape(size)
-    return values.astype(np.float32)
+    check_body(len(body), 4 * int(np.prod(size)), path, what)
+    return np.frombuffer(body, f"{order}f4").reshape(size).astype(np.float32)
 
 
-def _read_pieh(path: PathLike, channels: tuple[int, ...], what: str) -> FloatMap:
-    """The numbers of a .flo or .dpt file: magic, int32 width and height, float32 by rows."""
-    content = read_bytes(path, what)
-    check_magic(content, path, what)
-    check_body(min(len(content) - 4, 8), 8, path, f"{what} header")
-    width, height = struct.unpack("<ii", content[4:12])
-    return _raster(content, 12, (height, width, *channels), "<", path, what)
-
-
-def read_npy(path: PathLike, what: str) -> NDArray[Any]:
-    """One array of real numbers from a .npy file, without pickles."""
-    return _array(read_bytes(path, what), path, what)
+def _read_pieh(path: PathLike, what: str, *channels: int) -> FloatMap:
+    """(H, W, *channels) of a .flo or .dpt file: magic, int32 width and height, float32 by rows."""
+    content = after_magic(path, what)
+    check_body(min(len(content), 8), 8, path, f"{what} header")
+    width, height = struct.unpack("<ii", content[:8])
+    return _floats(content[8:], (height, width, *channels), "<", path, what)
 
 
 def _array(content: bytes, path: PathLike, what: str) -> NDArray[Any]:
+    """One array of real numbers of the content of a .npy file, without pickles."""
     stream = io.BytesIO(content)
     try:
         array = npy.read_array(stream, allow_pickle=False)
@@ -108,7 +106,7 @@ def _array(content: bytes, path: PathLike, what: str) -> NDArray[Any]:
 
 
 def read_npz(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
-    """The arrays of a .npz file by name, see `read_npy`."""
+    """The arrays of real numbers of a .npz file by name."""
     content, most = io.BytesIO(read_bytes(path, what)), 32 * MAX_PIXELS
     try:
         with zipfile.ZipFile(content) as archive:
@@ -171,11 +169,6 @@ def _known_flow(flow: NDArray[Any], path: PathLike) -> Float:
     return out.astype(np.float64)
 
 
-def read_flo(path: PathLike) -> Float:
-    """Read a Middlebury .flo file (also used by Sintel); NaN and values above 1e9 are unknown."""
-    return _known_flow(_read_pieh(path, (2,), "flow file"), path)
-
-
 def _read_flow_png(path: PathLike, what: str) -> Float:
     """(H, W, 2) values of a 16-bit flow PNG, R and G; NaN where B is 0."""
     bgr = decode_png16(path, 3, what)
@@ -193,11 +186,6 @@ def _read_flow_png(path: PathLike, what: str) -> Float:
     return code
 
 
-def read_kitti_flow(path: PathLike) -> Float:
-    """Read a KITTI flow PNG: 16-bit RGB, u = (R - 2^15) / 64, v = (G - 2^15) / 64, B > 0 valid."""
-    return (_read_flow_png(path, "KITTI flow") - 2.0**15) / 64.0
-
-
 def read_vkitti_flow(path: PathLike) -> Float:
     """Read a Virtual KITTI 1 or 2 flow PNG.
 
@@ -212,13 +200,15 @@ def read_vkitti_flow(path: PathLike) -> Float:
 def read_flow(path: PathLike) -> Float:
     """Read a flow by the suffix of its file.
 
-    `.flo` is Middlebury, `.png` is KITTI (Virtual KITTI needs `read_vkitti_flow`), `.npy` is an
-    array (H, W, 2) or (2, H, W) in pixels with NaN or values above 1e9 where unknown.
+    - `.flo` is Middlebury's, also used by Sintel; NaN and values above 1e9 are unknown.
+    - `.png` is KITTI's (Virtual KITTI needs `read_vkitti_flow`): 16-bit RGB, u = (R - 2^15) / 64,
+      v = (G - 2^15) / 64, B > 0 valid.
+    - `.npy` is an array (H, W, 2) or (2, H, W) in pixels, unknown as in `.flo`.
     """
     readers: dict[str, Reader] = {
-        ".flo": read_flo,
-        ".png": read_kitti_flow,
-        ".npy": lambda p: _known_flow(read_npy(p, "flow file"), p),
+        ".flo": lambda p: _known_flow(_read_pieh(p, "flow file", 2), p),
+        ".png": lambda p: (_read_flow_png(p, "KITTI flow") - 2.0**15) / 64.0,
+        ".npy": lambda p: _known_flow(_array(read_bytes(p, "flow file"), p, "flow file"), p),
     }
     return _by_suffix(path, readers, "flow")
 
@@ -226,7 +216,7 @@ def read_flow(path: PathLike) -> Float:
 def read_confidence(path: PathLike) -> NDArray[Any]:
     """The confidence of a .npy file, or of a grey image of 8 or 16 bits (black is 0, white 1)."""
     if Path(path).suffix == ".npy":
-        return read_npy(path, "confidence file")
+        return _array(read_bytes(path, "confidence file"), path, "confidence file")
     image = decode(path, "confidence map")
     whole = image.dtype.kind == "u"
     return image / np.iinfo(image.dtype).max if whole else image
@@ -245,11 +235,6 @@ def known_depth(depth: NDArray[Any], path: PathLike) -> Float:
     out = np.array(depth, dtype=np.float64)
     out[~(np.isfinite(out) & (out > 0))] = np.nan
     return out
-
-
-def read_dpt(path: PathLike) -> Float:
-    """Read a Sintel .dpt depth file, in scene units (metres in Sintel)."""
-    return known_depth(_read_pieh(path, (), "depth file"), path)
 
 
 def read_pfm(path: PathLike) -> Float:
@@ -276,7 +261,7 @@ def read_pfm(path: PathLike) -> Float:
         )
     size = int(header.group(2)), int(header.group(1))
     order = "<" if scale < 0 else ">"
-    return known_depth(_raster(content, header.end(), size, order, path, "PFM file")[::-1], path)
+    return known_depth(_floats(content[header.end() :], size, order, path, "PFM file")[::-1], path)
 
 
 def read_depth_png16(path: PathLike, scale: float) -> Float:
@@ -305,7 +290,7 @@ def read_vkitti_depth(path: PathLike) -> Float:
 
 
 def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIMETRES) -> Float:
-    """Read a depth by the suffix of its file: .dpt, .npy, .pfm or 16-bit .png.
+    """Read a depth by the suffix of its file: .dpt (Sintel), .npy, .pfm or 16-bit .png.
 
     Args:
         path: The file.
@@ -323,8 +308,8 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
         return read_depth_png16(path, usual if scale is None else scale)
 
     readers: dict[str, Reader] = {
-        ".dpt": read_dpt,
-        ".npy": lambda p: known_depth(read_npy(p, "depth file"), p),
+        ".dpt": lambda p: known_depth(_read_pieh(p, "depth file"), p),
+        ".npy": lambda p: known_depth(_array(read_bytes(p, "depth file"), p, "depth file"), p),
         ".pfm": read_pfm,
         ".png": by_scale,
     }
