@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -76,34 +76,32 @@ def make_plan(
         and its key.
     """
     datasets = {name: _dataset(name, data, limit) for name in DATASETS}
-    studied = _families(STUDIED, datasets, data)
+    studied = [("", item) for item in _families(STUDIED, datasets, data)]
+    rendered = [("", item) for _, item in studied if item.suite == "rendered"]
     compared = [(name, item) for name, items in datasets.items() for item in items]
     compared_keys = {item.key for _, item in compared}
-    compared += [("", item) for item in studied if item.key not in compared_keys]
-    lines: list[dict[str, Any]] = []
-
-    def add(section: str, items: Iterable[tuple[str, Item]], n: int = analysis) -> None:
-        for dataset, item in items:
-            for method, base in METHODS.items():
-                for change, changes in _variants(section, method).items():
-                    count = int(change) if section == "superpixels" else n
-                    size = f"segmentation.superpixels={count}"
-                    printed = _scaled(PRINTED if base else (), count)
-                    all_overrides = (*base, size, *printed, *overrides, *_scaled(changes, count))
-                    maps = None
-                    if section == "comparison":
-                        name = f"{item.key}-{method}".replace(": ", "_")
-                        maps = folder / "maps" / f"{name.replace('/', '-').replace(' ', '_')}.npz"
-                    cell = Cell(item, all_overrides, ", ".join(all_overrides), maps)
-                    key = cell.identity()["key"]
-                    line = section, method, change, dataset, item.name, cell, key
-                    lines.append(dict(zip(COLUMNS, line, strict=True)))
-
-    add("comparison", compared, superpixels)
-    for section in STUDIES:
-        rendered = [i for i in studied if i.suite == "rendered"]
-        add(section, [("", i) for i in (rendered if section == "flow" else studied)])
-    add("departures", [("", i) for i in _families(DEPARTING, datasets, data)])
+    compared += [("", item) for _, item in studied if item.key not in compared_keys]
+    sections = {
+        "comparison": compared,
+        **{name: rendered if name == "flow" else studied for name in STUDIES},
+        "departures": [("", item) for item in _families(DEPARTING, datasets, data)],
+    }
+    lines = []
+    for section, items in sections.items():
+        for (dataset, item), (method, base) in product(items, METHODS.items()):
+            for change, changes in _variants(section, method).items():
+                n, maps = analysis, None
+                if section == "superpixels":
+                    n = int(change)
+                if section == "comparison":
+                    n, name = superpixels, f"{item.key}-{method}".replace(": ", "_")
+                    maps = folder / "maps" / f"{name.replace('/', '-').replace(' ', '_')}.npz"
+                printed = _scaled(PRINTED if base else (), n)
+                size = f"segmentation.superpixels={n}"
+                all_overrides = (*base, size, *printed, *overrides, *_scaled(changes, n))
+                cell = Cell(item, all_overrides, ", ".join(all_overrides), maps)
+                key = cell.identity()["key"]
+                lines.append((section, method, change, dataset, item.name, cell, key))
     return pd.DataFrame(lines, columns=COLUMNS)
 
 
