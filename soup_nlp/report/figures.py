@@ -6,7 +6,7 @@ Every writer raises `DataError` if the file cannot be written.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from importlib.resources import files
 from io import BytesIO
 
@@ -108,12 +108,8 @@ def _draw_swatches(sheet: Pil.Image, key: Swatches, left: int, bottom: int, widt
 @lru_cache(maxsize=100)
 def _font(points: float) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which has more letters than the font that comes with Pillow."""
-    return ImageFont.truetype(BytesIO(_font_file()), points * _DPI / 72)
-
-
-@cache
-def _font_file() -> bytes:
-    return (files("soup_nlp.report") / "font" / "DejaVuSans.ttf").read_bytes()
+    file = files("soup_nlp.report") / "font" / "DejaVuSans.ttf"
+    return ImageFont.truetype(BytesIO(file.read_bytes()), points * _DPI / 72)
 
 
 def _write(

@@ -201,9 +201,15 @@ _ROUND = (
 
 def summary(run: Run) -> dict[str, Any]:
     """Contents of summary.json; the keys are stable."""
-    s = run.solution
+    s, r, full, truth = run.solution, run.refined, run.full, run.pair.truth
     constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
     facing = run.problem.formulation.min_facing
+    components: dict[str, Any] = {"count": len(run.components)}
+    if truth is not None and truth.components is not None:
+        overlaps = component_overlaps(run.components.of_pixel, truth.components)
+        components["truth"] = {
+            str(k): {"component": c, "iou": iou} for k, (c, iou) in overlaps.items()
+        }
     return {
         "name": run.problem.name,
         "problem_hash": run.problem.digest(),
@@ -211,18 +217,28 @@ def summary(run: Run) -> dict[str, Any]:
         "converged": s.converged,
         "delivered": run.delivered,
         "energy_by_stage": dict(s.ends)
-        | ({"refinement": run.energy["total"]} if run.refined is not None else {}),
+        | ({} if r is None else {"refinement": run.energy["total"]}),
         "energy": {"start": s.energy_start, "nlp": s.energy, "solution": run.energy},
         "residuals": run.residuals,
         "nlp_residuals": constraint_residuals(s.soup, run.data.rim_ray, facing),
         "answer_residuals": constraint_residuals(run.answer, run.data.rim_ray, facing),
-        "refinement": refinement_summary(run),
+        "refinement": None
+        if r is None
+        else {
+            "status": r.status,
+            "seconds": r.seconds,
+            "contradicted": r.contradicted,
+            "start": r.energy_start,
+            "begin": r.energy_begin,
+            "end": r.energy,
+            "rounds": [{key: getattr(one, key) for key in _ROUND} for one in r.rounds],
+        },
         "metrics": {
             # the constant depth is scored on the reference frame only
             k: m.as_dict() | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
             for k, m in run.metrics.items()
         },
-        "components": _components(run),
+        "components": components,
         "expected": run.problem.expected.model_dump(),
         "seconds": run.seconds,
         "iterations": {stage.name: stage.iterations for stage in s.stages},
@@ -234,7 +250,13 @@ def summary(run: Run) -> dict[str, Any]:
             "height": run.pair.size[0],
             **s.nlp,
         },
-        "full_size": _full_size(run),
+        "full_size": None
+        if full is None
+        else {
+            "width": full.depth_ref.shape[1],
+            "height": full.depth_ref.shape[0],
+            "metrics": full.metrics and full.metrics.as_dict(),
+        },
         "start": {
             "motions": len(run.start.motions),
             "borrowed": int(run.start.borrowed.sum()),
@@ -247,41 +269,6 @@ def summary(run: Run) -> dict[str, Any]:
         "versions": versions(),
         "seed": run.problem.seed,
         "focal_sigma": run.pair.focal_sigma,
-    }
-
-
-def _full_size(run: Run) -> dict[str, Any] | None:
-    """Size and score of the depth at the size of the images; None if it was solved at that size."""
-    if run.full is None:
-        return None
-    height, width = run.full.depth_ref.shape
-    scores = run.full.metrics
-    return {"width": width, "height": height, "metrics": scores and scores.as_dict()}
-
-
-def _components(run: Run) -> dict[str, Any]:
-    """Number of components, and their overlap with the true ones."""
-    truth = run.pair.truth
-    out: dict[str, Any] = {"count": len(run.components)}
-    if truth is not None and truth.components is not None:
-        overlaps = component_overlaps(run.components.of_pixel, truth.components)
-        out["truth"] = {str(k): {"component": c, "iou": iou} for k, (c, iou) in overlaps.items()}
-    return out
-
-
-def refinement_summary(run: Run) -> dict[str, Any] | None:
-    """Results of the refinement by round; None if it was disabled."""
-    r = run.refined
-    if r is None:
-        return None
-    return {
-        "status": r.status,
-        "seconds": r.seconds,
-        "contradicted": r.contradicted,
-        "start": r.energy_start,
-        "begin": r.energy_begin,
-        "end": r.energy,
-        "rounds": [{key: getattr(one, key) for key in _ROUND} for one in r.rounds],
     }
 
 

@@ -126,7 +126,25 @@ def write_folder(
     with staged(folder, whole=True, subject=run.problem.subject) as new:
         if ipopt_log is not None and ipopt_log.is_file():
             shutil.copy(ipopt_log, new / "ipopt.log")
-        _write_files(new, run, config, verdict, formats)
+        write_text(new / "config.yaml", config)
+        contents = summary(run)
+        result = result_of(run, contents, facts(run) if verdict is None else verdict)
+        drawn, rec = pictures(result), run.reconstruction
+        depths: dict[str, AnyFloat] = {"ref": rec.depth_ref, "next": rec.depth_next}
+        if run.full is not None:
+            depths |= {"ref_full": run.full.depth_ref, "next_full": run.full.depth_next}
+        scales = {
+            name: write_clipped_depth_png16(new / f"depth_{name}.png", z)
+            for name, z in depths.items()
+        }
+        for name, file in PICTURES.items():
+            if name in drawn:
+                write_picture(new / file, drawn[name])
+        write_png(new / "overview.png", overview(drawn, run.problem.name))
+        write_formats(new, result, ("motions", "ply", *formats))
+        if run.problem.output.page:
+            write_text(new / PAGE, page(result, drawn))
+        write_json(new / "summary.json", {**contents, "depth_png_scale": scales})
         names = {path.name for path in new.iterdir()} | {"log.txt", "result.h5"}
         files = [name for name in FILES if name in names] + sorted(names.difference(FILES))
         write_text(new / "log.txt", log if isinstance(log, str) else log(files))
@@ -160,32 +178,6 @@ def write_failure(folder: Path, log: str, ipopt_log: Path) -> None:
         log += ipopt_log.read_text(encoding="utf-8", errors="replace")
     with staged(folder) as new:
         write_text(new / FAILED, log)
-
-
-def _write_files(
-    folder: Path, run: Run, config: str, verdict: str | None, formats: Sequence[str]
-) -> None:
-    """Every file of a run but its logs and result.h5."""
-    write_text(folder / "config.yaml", config)
-    contents = summary(run)
-    result = result_of(run, contents, facts(run) if verdict is None else verdict)
-    drawn = pictures(result)
-    rec = run.reconstruction
-    depths: dict[str, AnyFloat] = {"ref": rec.depth_ref, "next": rec.depth_next}
-    if run.full is not None:
-        depths |= {"ref_full": run.full.depth_ref, "next_full": run.full.depth_next}
-    scales = {
-        name: write_clipped_depth_png16(folder / f"depth_{name}.png", z)
-        for name, z in depths.items()
-    }
-    for name, file in PICTURES.items():
-        if name in drawn:
-            write_picture(folder / file, drawn[name])
-    write_png(folder / "overview.png", overview(drawn, run.problem.name))
-    write_formats(folder, result, ("motions", "ply", *formats))
-    if run.problem.output.page:
-        write_text(folder / PAGE, page(result, drawn))
-    write_json(folder / "summary.json", {**contents, "depth_png_scale": scales})
 
 
 def renew_page(folder: Path) -> Path:

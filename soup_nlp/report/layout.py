@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from soup_nlp.errors import DataError
 from soup_nlp.pipeline.record import Run
+from soup_nlp.refine.records import Round
 from soup_nlp.storage.h5_files import RECORD, ReadTree
 from soup_nlp.storage.store import Array, Tree
 
@@ -215,12 +216,12 @@ def _row(place: str) -> Row | None:
     return None
 
 
-def result_arrays(run: Run) -> dict[str, Any]:
-    """Every array of a run by group and name; records hold more than `TABLE` names."""
+def result_tree(run: Run) -> Tree:
+    """Every array of a run with its description; records hold more than `TABLE` names."""
     pair, rec, nlp, sure = run.pair, run.reconstruction, run.nlp_reconstruction, run.confidence
     form, parts = run.problem.formulation, run.components
     assert pair.flow is not None
-    return {
+    arrays = {
         "input": {**vars(pair), "flow": pair.flow.uv, "confidence": pair.flow.confidence},
         "segmentation": vars(run.segmentation),
         "energy": run.data.arrays(),
@@ -232,7 +233,7 @@ def result_arrays(run: Run) -> dict[str, Any]:
         "start": {**vars(run.start.soup), **vars(run.start), "bending": run.start.bending},
         "solution": vars(run.soup),
         "nlp": vars(run.solution.soup),
-        "refine": _rounds(run),
+        "refine": {} if run.refined is None else _by_round(run.refined.rounds),
         "answer": vars(run.answer),
         "multipliers": dict(run.solution.multipliers),
         "iterations": {
@@ -257,31 +258,21 @@ def result_arrays(run: Run) -> dict[str, Any]:
         },
         "truth": {} if pair.truth is None else vars(pair.truth),
     }
+    return described(arrays, "" if pair.truth is None else pair.truth.unit)
 
 
-def _rounds(run: Run) -> dict[str, Any]:
+def _by_round(rounds: Sequence[Round]) -> dict[str, Any]:
     """The refinement by round, and by kind of particle; empty without rounds."""
-    refined = run.refined
-    if refined is None or not refined.rounds:
+    if not rounds:
         return {}
-
-    def by_round(key: str) -> list[Any]:
-        return [getattr(one, key) for one in refined.rounds]
-
-    scalars = ["mrf_energy", "bound", "gap", "moved", "ties", "iterations", "taken", "seconds"]
-    kinds = {k: [list(row.values()) for row in by_round(k)] for k in ("proposed", "accepted")}
-    energy = {f"energy_{k}": [one[k] for one in by_round("energy")] for k in refined.energy}
-    columns = {**energy, **{key: by_round(key) for key in scalars}, **kinds}
-    return {
-        **{key: np.array(column) for key, column in columns.items()},
-        "kinds": np.array(list(refined.rounds[0].proposed)),
+    kinds = {k: [[*getattr(r, k).values()] for r in rounds] for k in ("proposed", "accepted")}
+    rows = [
+        {f"energy_{k}": e for k, e in r.energy.items()} | vars(r) | {"gap": r.gap} for r in rounds
+    ]
+    columns = {key: [row[key] for row in rows] for key in rows[0]} | kinds
+    return {key: np.array(column) for key, column in columns.items()} | {
+        "kinds": np.array(list(rounds[0].proposed))
     }
-
-
-def result_tree(run: Run) -> Tree:
-    """Every array of a run with its description, as `store.write_h5` takes it."""
-    truth = run.pair.truth
-    return described(result_arrays(run), "" if truth is None else truth.unit)
 
 
 def require_layout(tree: ReadTree) -> None:
@@ -290,39 +281,37 @@ def require_layout(tree: ReadTree) -> None:
     Raises:
         DataError: an array has a wrong shape or type, or indices out of range.
     """
+    # of the shared axes, as the first array has them
     sizes: dict[str, int] = {}
     for place, row in LAYOUT.items():
         group, _, name = place.partition("/")
         values = tree.get(group, {})
         if not isinstance(values, Mapping):
             raise _wrong(group, "an array", "a group")
-        if name in values and row.unit != "text":
-            _require_row(place, row, values[name], sizes)
+        if name not in values or row.unit == "text":
+            continue
+        value, axes = values[name], row.axes.split(",") if row.axes else []
+        if isinstance(value, Mapping) or value.dtype.kind not in "biuf":
+            raise _wrong(place, "a group or text", "numbers")
+        if "/image_" in place and value.dtype != np.uint8:
+            raise _wrong(place, value.dtype, "uint8")
+        if len(axes) != value.ndim:
+            raise _wrong(place, value.shape, f"axes ({row.axes})")
+        for axis, size in zip(axes, value.shape, strict=True):
+            expected = int(axis) if axis.isdigit() else size
+            if axis in SHARED and place not in FREE:
+                expected = sizes.setdefault(axis, size)
+            if size != expected or (axis in ("H", "W") and not size):
+                raise _wrong(place, value.shape, f"({row.axes}) with {axis} = {expected}")
+    last = sizes.get("N", 0) - 1
     for place in INDICES:
         group, name = place.split("/")
-        found, count = tree.get(group, {}).get(name), sizes.get("N", 0)
-        if found is not None and (
-            found.dtype.kind not in "iu"
-            or (found.size and not 0 <= found.min() <= found.max() < count)
+        if (index := tree.get(group, {}).get(name)) is None:
+            continue
+        if index.dtype.kind not in "iu" or (
+            index.size and not 0 <= index.min() <= index.max() <= last
         ):
-            raise _wrong(place, "other values", f"whole numbers from 0 to {count - 1}")
-
-
-def _require_row(place: str, row: Row, value: Any, sizes: dict[str, int]) -> None:
-    """Check type and shape of an array; `sizes` collects the sizes of the shared axes."""
-    if isinstance(value, Mapping) or value.dtype.kind not in "biuf":
-        raise _wrong(place, "a group or text", "numbers")
-    if "/image_" in place and value.dtype != np.uint8:
-        raise _wrong(place, value.dtype, "uint8")
-    axes = row.axes.split(",") if row.axes else []
-    if len(axes) != value.ndim:
-        raise _wrong(place, value.shape, f"axes ({row.axes})")
-    for axis, size in zip(axes, value.shape, strict=True):
-        expected = int(axis) if axis.isdigit() else size
-        if axis in SHARED and place not in FREE:
-            expected = sizes.setdefault(axis, size)
-        if size != expected or (axis in ("H", "W") and not size):
-            raise _wrong(place, value.shape, f"({row.axes}) with {axis} = {expected}")
+            raise _wrong(place, "other values", f"whole numbers from 0 to {last}")
 
 
 def _wrong(place: str, found: object, expected: str) -> DataError:

@@ -58,12 +58,11 @@ def page(result: Result, drawn: Mapping[str, Picture]) -> str:
             for name, word in MODES.items() if name in drawn
         ],
     }  # fmt: skip
-    images = {name: _data_uri(picture) for name, picture in drawn.items()}
     parts = {
         "title": escape(result.name),
         "style": web_file("page.css"),
         "summary": _summary(result),
-        "gallery": "\n".join(_figure(picture, images[name]) for name, picture in drawn.items()),
+        "gallery": "\n".join(_figure(picture) for picture in drawn.values()),
         "limits": "\n".join(f"<li>{escape(line)}</li>" for line in limits(result)),
         "components": _components(result),
         "verdict": escape(result.verdict) or "not recorded",
@@ -85,15 +84,6 @@ def packed(array: NDArray[Any]) -> str:
     """An array's numbers, deflated, as base64."""
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     return base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
-
-
-def _data_uri(picture: Picture) -> str:
-    """A picture as a data URI: photographs as JPEG, pictures with a legend as lossless WebP."""
-    photo = picture.legend is None
-    # a quality above 100 is lossless
-    kind, options = ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, 90]) if photo else (
-        "webp", [cv2.IMWRITE_WEBP_QUALITY, 101])  # fmt: skip
-    return encoded(picture.image, kind, options)
 
 
 def encoded(image: Image, kind: str, options: Sequence[int] = (), most: int = SIDE) -> str:
@@ -145,9 +135,13 @@ def _css(colour: Any) -> str:
     return "#" + "".join(f"{int(c):02x}" for c in colour)
 
 
-def _figure(picture: Picture, source: str) -> str:
-    """A picture with its title and legend in HTML."""
-    title = escape(picture.title)
+def _figure(picture: Picture) -> str:
+    """A picture with its title and legend in HTML; those with a legend are stored without loss."""
+    # a quality of WebP above 100 is lossless
+    kind, options = "webp", [cv2.IMWRITE_WEBP_QUALITY, 101]
+    if picture.legend is None:
+        kind, options = "jpeg", [cv2.IMWRITE_JPEG_QUALITY, 90]
+    source, title = encoded(picture.image, kind, options), escape(picture.title)
     return (
         f'<figure><figcaption>{title}</figcaption><img data-name="{picture.name}" alt="{title}"'
         f' src="{source}">{_legend(picture)}</figure>'

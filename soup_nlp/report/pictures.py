@@ -92,8 +92,10 @@ def pictures(result: Result) -> dict[str, Picture]:
     "depth_ref", "depth_next", "depth_start", "depth_true", "error", "confidence" and "normals".
     Pictures of unknown quantities are left out.
     """
+    before, after = result.images
     drawn = [
-        *_images(result),
+        Picture("image_ref", "reference frame", before),
+        Picture("image_next", "next frame", after),
         *_parts(result),
         *_flow(result),
         *_depths(result),
@@ -107,11 +109,6 @@ def pictures(result: Result) -> dict[str, Picture]:
         drawn.append(_shares("confidence", title, sigma, "viridis", SIGMA_TICKS))
     drawn.append(_normals(result))
     return {picture.name: picture for picture in drawn}
-
-
-def _images(result: Result) -> list[Picture]:
-    named = (("ref", "reference frame", result.images[0]), ("next", "next frame", result.images[1]))
-    return [Picture(f"image_{k}", title, image) for k, title, image in named]
 
 
 def _parts(result: Result) -> list[Picture]:
