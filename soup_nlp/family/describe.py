@@ -33,14 +33,11 @@ RANK = 1e-8
 
 def degree(value: ca.SX, x: ca.SX) -> int:
     """0 constant, 1 linear, 2 quadratic, 3 anything else, as an expression of x."""
-    if not any(ca.which_depends(value, x, 1, True)):
-        return 0
-    gradient = ca.jacobian(value, x)
-    entries = ca.vertcat(*gradient.nonzeros())
-    if not any(ca.which_depends(entries, x, 1, True)):
-        return 1
-    second = ca.vertcat(*ca.jacobian(entries, x).nonzeros())
-    return 2 if not any(ca.which_depends(second, x, 1, True)) else 3
+    for order in range(3):
+        if not any(ca.which_depends(value, x, 1, True)):
+            return order
+        value = ca.vertcat(*ca.jacobian(value, x).nonzeros())
+    return 3
 
 
 def classes(nlp: NLP) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A chain of solved pairs with a common scale and frame of reference, and tracks of what moves."""
+"""A chain of solved pairs with a common scale and frame of reference; tracks of components."""
 
 from __future__ import annotations
 
@@ -28,6 +28,10 @@ LEAST_SPREAD = 0.005
 """Smallest spread of a log ratio in the weight of a link."""
 MAX_GUESSED = 0.5
 """A pair has no parallax if the depth of a larger share of its background is a guess."""
+MADE_BY = "soup_nlp.sequence.solve.solve_pairs(...)"
+"""Where pairs of a chain come from, for messages."""
+SAME = 0.3
+"""Smallest intersection over union of two components of one track."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,12 +194,6 @@ def solve_scales(total: int, links: Sequence[Link]) -> Float:
     if len(links) > total - 1:
         answer = least_squares(lambda x: A @ x - b, answer, jac=lambda x: A, loss="cauchy").x
     return np.exp(np.concatenate([[0.0], answer]))
-
-
-MADE_BY = "soup_nlp.sequence.solve.solve_pairs(...)"
-"""Where pairs of a chain come from, for messages."""
-SAME = 0.3
-"""Smallest intersection over union of two components of one track."""
 
 
 @dataclass(frozen=True, eq=False)

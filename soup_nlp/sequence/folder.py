@@ -34,7 +34,7 @@ SAME = 1e-6
 COLMAP_POINTS = 60_000
 """Largest number of points of a COLMAP model."""
 VISIBLE = 0.03
-"""A point is seen in a frame whose depth there is its own to this ratio."""
+"""A point is visible in a frame if log depths of point and frame differ by less than this."""
 
 
 def is_chain(folder: Path) -> bool:

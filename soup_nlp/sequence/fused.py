@@ -1,4 +1,4 @@
-"""One cloud of the static scene of a sequence, and clouds of what moves, frame by frame."""
+"""One cloud of the static scene of a sequence, and clouds of its moving components by frame."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ VOXEL = 0.004
 MOST = 300_000
 """Largest number of points that enter the fusion, all frames together."""
 OF_MOVER = 4_000
-"""Largest number of points of what moves in a frame."""
+"""Largest number of points of a moving component in a frame."""
 IN_FRONT = 0.8
-"""A point contradicts a view if it stands before what the view shows, by more than this ratio."""
+"""A point contradicts a frame if its depth is below this share of the depth of the frame there."""
 SHOWN = 3
-"""Least number of frames of a track that is shown; shorter ones are mostly no real bodies."""
+"""Smallest number of frames of a track that is shown; shorter tracks are mostly no objects."""
 
 Cloud: TypeAlias = "np.recarray[Any, Any]"
 """(M,) points with the fields of POINT."""
@@ -32,9 +32,9 @@ the frame of a point of the static scene or the track of a moving one."""
 def fuse(chain: Chain, most: int = MOST) -> Cloud:
     """The static scene of all frames: guesses left out, conflicts resolved, one point per voxel.
 
-    A point that stands before the static surface which a neighbouring frame sees gives way where
-    that frame is surer. In a voxel the surest point is kept. Of more than `most` points each k-th
-    one is returned.
+    A point in front of the static surface of a neighbouring frame is removed if that frame is more
+    certain there. A voxel keeps its most certain point. Of more than `most` points each k-th one is
+    returned.
     """
     masks = [pair.static for pair in chain.pairs]
     share = MOST / max(sum(int(mask.sum()) for mask in masks), 1)
@@ -73,7 +73,10 @@ def shown_tracks(chain: Chain) -> list[int]:
 
 
 def movers(chain: Chain, frame: int) -> Cloud:
-    """Points of what moves, where they are in a frame; in the last one moved there."""
+    """Points of moving components at their positions in a frame.
+
+    Those of the last frame come from the frame before, moved by their components.
+    """
     pair = min(frame, len(chain.pairs) - 1)
     result, shown = chain.pairs[pair].result, set(shown_tracks(chain))
     clouds = []
@@ -122,9 +125,9 @@ def projected(chain: Chain, points: Float, frame: int) -> tuple[Mask, Int, Int, 
 
 
 def _contradicts(chain: Chain, cloud: Cloud, frame: int) -> Mask:
-    """(M,) points before the static surface that a frame sees and is surer of."""
+    """(M,) points in front of the static surface of a frame that is more certain there."""
     inside, v, u, z = projected(chain, cloud.points, frame)
     with np.errstate(invalid="ignore"):
-        before = z < IN_FRONT * chain.depth(frame)[v, u]
-    surer = _sigma(chain, frame)[v, u] <= cloud.sigma
-    return np.asarray(chain.pairs[frame].static[v, u] & inside & before & surer)
+        in_front = z < IN_FRONT * chain.depth(frame)[v, u]
+    more_certain = _sigma(chain, frame)[v, u] <= cloud.sigma
+    return np.asarray(chain.pairs[frame].static[v, u] & inside & in_front & more_certain)

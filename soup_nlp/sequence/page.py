@@ -1,7 +1,7 @@
 """A chain for viewers: its page, and an animated GLB.
 
 The page has a 3D view, images and depths with a slider, tables of tracks and links. The GLB (glTF
-2.0, binary) has the static scene, what moves, and the camera.
+2.0, binary) has the static scene, the moving components and the camera.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WIDTH = 720
 MANY = 24
 """Frames above which the images have half the width."""
 STILL, MOVING = 120_000, 60_000
-"""Largest numbers of points of the static scene, and of what moves in all frames."""
+"""Largest numbers of points of the static scene, and of moving components in all frames."""
 QUALITY = 80
 """JPEG quality of the images."""
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf")
@@ -134,8 +134,8 @@ NUMBERS = {np.dtype(np.float32): 5126, np.dtype(np.uint8): 5121}
 def write_animation(path: PathLike, chain: Chain, contents: Mapping[str, Any]) -> None:
     """Write the sequence; axes of glTF, world = the first frame's camera, five frames a second.
 
-    Nodes are "static scene", "track N" for what moves, and "camera". A track has the points of its
-    first frame, which move rigidly from frame to frame as its component does.
+    Nodes are "static scene", "track N" for a moving component, and "camera". A track has the points
+    of its first frame, which move rigidly from frame to frame as its component does.
     """
     arrays: list[NDArray[Any]] = []
     meshes, nodes, channels, samplers = [], [], [], []

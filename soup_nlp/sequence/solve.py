@@ -91,7 +91,7 @@ def solve_chain(
         say: Called with (done, total, row) after every pair.
 
     Raises:
-        ConfigError: two cameras are given, the stride is none, or a scene cannot be stepped.
+        ConfigError: two cameras are given, the stride is wrong, or a scene has another stride.
         DataError: the frames are no sequence, one is damaged, or the folder holds the result of
             another one.
         SolverError: a pair cannot be solved; the others are kept.
@@ -216,7 +216,7 @@ def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:
     prior = first.focal_sigma**-2
     total = prior + float(np.sum(sigmas**-2 - prior))
     focal = first.K_ref[0, 0] * float(np.exp(sigmas**-2 @ np.log(factor) / total))
-    # distortion is an error of all pairs: together they are no surer than the surest one
+    # distortion is an error of all pairs: together they are no more certain than the best one
     sigma = float(sigmas.min())
     fov = float(np.degrees(2 * np.arctan(first.size[1] / (2 * focal))))
     warnings.warn(
