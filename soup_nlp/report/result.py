@@ -226,19 +226,35 @@ def load(folder: str | Path) -> Result:
             hint="solve the pair again",
         )
     require_layout(tree)
+    picture, metre = place / "overview.png", attrs.get("scale_to_truth")
     try:
-        metrics = {name: _metrics(row) for name, row in summary["metrics"].items()}
-        loaded = _result(tree, attrs)
+        before, after = (require(tree, f"input/image_{frame}") for frame in FRAMES)
+        K_ref, K_next = (require(tree, f"input/K_{frame}") for frame in FRAMES)
+        soup = Soup(*(require(tree, f"solution/{key}") for key in ("lam", "n", "d", "R", "t")))
+        planes = np.isfinite(soup.lam * soup.d).all()
+        if not planes or not (np.abs(np.linalg.det(soup.R) - 1) < 1e-3).all():
+            raise ValueError("planes or rotations of the solution are none")
+        given = {f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)}
+        seg, (height, width) = Segmentation(**given), tree["depth"]["next"].shape
+        rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
+        part, borrowed = tree["start"]["part"], tree["start"]["borrowed"].astype(bool)
+        return Result(
+            name=str(attrs["name"]),
+            images=(before, after),
+            K=(K_ref, K_next),
+            reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
+            components=find_components(soup, seg, part, K_ref, K_next, borrowed),
+            flow_confidence=tree["input"]["confidence"],
+            metre=None if metre is None else float(metre),
+            metre_unit=str(attrs.get("truth_unit", "m")),
+            metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
+            tree=tree,
+            summary=summary,
+            verdict=_ending(place / "log.txt"),
+            overview=picture.read_bytes() if picture.is_file() else b"",
+        )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise DataError("result does not hold together", where=place, found=error) from error
-    picture = place / "overview.png"
-    return replace(
-        loaded,
-        metrics=metrics,
-        summary=summary,
-        verdict=_ending(place / "log.txt"),
-        overview=picture.read_bytes() if picture.is_file() else b"",
-    )
 
 
 def _ending(log: Path) -> str:
@@ -256,29 +272,3 @@ def _metrics(row: Mapping[str, Any]) -> DepthMetrics:
     scores: dict[str, Any] = {f.name: row[f.name] for f in fields(DepthMetrics)}
     scores |= {k: np.nan for k, v in scores.items() if v is None and k != "cap"}
     return DepthMetrics(**scores)
-
-
-def _result(tree: ReadTree, attrs: Mapping[str, Any]) -> Result:
-    """The result of the arrays and attributes of result.h5."""
-    images = [require(tree, f"input/image_{frame}") for frame in FRAMES]
-    K_ref, K_next = (require(tree, f"input/K_{frame}") for frame in FRAMES)
-    soup = Soup(*(require(tree, f"solution/{key}") for key in ("lam", "n", "d", "R", "t")))
-    distance = soup.lam * soup.d
-    if not np.isfinite(distance).all() or not (np.abs(np.linalg.det(soup.R) - 1) < 1e-3).all():
-        raise ValueError("planes or rotations of the solution are none")
-    seg = Segmentation(**{f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)})
-    height, width = tree["depth"]["next"].shape
-    rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
-    part, borrowed = tree["start"]["part"], tree["start"]["borrowed"].astype(bool)
-    metre = attrs.get("scale_to_truth")
-    return Result(
-        name=str(attrs["name"]),
-        images=(images[0], images[1]),
-        K=(K_ref, K_next),
-        reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
-        components=find_components(soup, seg, part, K_ref, K_next, borrowed),
-        flow_confidence=tree["input"]["confidence"],
-        metre=None if metre is None else float(metre),
-        metre_unit=str(attrs.get("truth_unit", "m")),
-        tree=tree,
-    )
