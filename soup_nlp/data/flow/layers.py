@@ -19,7 +19,7 @@ from scipy.fft import dctn, idctn
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.census import census, census_at
 from soup_nlp.data.pair import Flow
-from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.camera import pixel_grid, rays
 
 LEVELS = 64
 """Number of depths that are tried for each kind of plane."""
@@ -111,7 +111,6 @@ def corrected(
     height, width = nxt.shape
     census_ref = np.ascontiguousarray(census(ref)[:, ::STRIDE, ::STRIDE])
     census_next, side = census(nxt), max(1, WINDOW // STRIDE)
-    v, u = np.mgrid[0 : ref.shape[0] : STRIDE, 0 : ref.shape[1] : STRIDE].astype(np.float32)
 
     def cost_at(x: FloatMap, y: FloatMap) -> FloatMap:
         """Mean census difference over a window to pixels (x, y) of the next image, or `TAU`."""
@@ -120,7 +119,11 @@ def corrected(
         c = np.where(inside, np.minimum(c, TAU), TAU).astype(np.float32)
         return np.asarray(cv2.blur(c, (side, side)), np.float32)
 
-    swept, cost = _swept(cost_at, u, v, R, t, K_ref, K_next, REACH * width / K_next[0, 0])
+    pixels = pixel_grid(*ref.shape)
+    u, v = np.moveaxis(pixels[::STRIDE, ::STRIDE].astype(np.float32), 2, 0)
+    swept, cost = _swept(
+        cost_at, u, v, rays(K_ref, pixels[::STRIDE, ::STRIDE]), R, t, K_next, width
+    )
     now = flow.uv[::STRIDE, ::STRIDE]
     gain = cost_at(u + now[..., 0], v + now[..., 1]) - cost
     moved = np.linalg.norm(swept - now, axis=2)
@@ -129,15 +132,21 @@ def corrected(
         return None
 
     def full(coarse: FloatMap) -> FloatMap:
-        height, width = ref.shape
         size = coarse.shape[1] * STRIDE, coarse.shape[0] * STRIDE
-        return np.asarray(cv2.resize(coarse, size)[:height, :width], np.float32)
+        return np.asarray(cv2.resize(coarse, size)[: ref.shape[0], : ref.shape[1]], np.float32)
 
     gain = cv2.blur(gain, (9, 9))
     wrong = (full(gain) > MIN_GAIN) & (full(moved) > MOVED_PX)
     guess = np.where(wrong[..., None], full(swept), flow.uv).astype(np.float32)
-    uv = _nearby(ref, nxt, guess)
-    off = _distance_from_line(uv, R, t, K_ref, K_next)
+    # DIS on the two finest scales
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(0)
+    dis.setCoarsestScale(1)
+    dis.setVariationalRefinementIterations(10)
+    uv = dis.calc(ref, nxt, guess.copy())
+    line = np.cross(t, rays(K_ref, pixels) @ R.T)
+    across = np.maximum(np.linalg.norm(line[..., :2], axis=2), 1e-12)
+    off = K_next[0, 0] * np.abs(np.sum(line * rays(K_next, pixels + uv), axis=2)) / across
     sure = (np.linalg.norm(uv - guess, axis=2) < 3) & (full(cost) < MAX_COST)
     # pixels without confidence mostly leave the image, so that the search finds a wrong match
     sure &= flow.confidence > 0.3
@@ -150,49 +159,28 @@ def _swept(
     cost_at: Callable[[FloatMap, FloatMap], FloatMap],
     u: FloatMap,
     v: FloatMap,
+    ray: Float,
     R: Float,
     t: Float,
-    K_ref: Float,
-    K_next: Float,
-    most: float,
+    K: Float,
+    width: int,
 ) -> tuple[FloatMap, FloatMap]:
     """Flow of least cost of pixels (u, v) along their epipolar lines, and its cost.
 
-    Planes are swept over depth, up to a ratio `most` of translation to depth. They are parallel to
+    Planes are swept over depth; K and width are those of the next image. The planes are parallel to
     the image, or horizontal like the ground in an upright image.
     """
-    ray = rays(K_ref, np.stack([u, v], axis=-1).astype(float))
     turned = (ray @ R.T).astype(np.float32)
     cost, flow = np.full(u.shape, np.inf, np.float32), np.zeros((*u.shape, 2), np.float32)
     level = np.maximum(ray[..., 1], 0.0) / max(float(ray[..., 1].max()), 1e-6)
+    most = REACH * width / K[0, 0]
     for plane, share in product((np.ones_like(level), level), (np.arange(LEVELS) + 0.5) / LEVELS):
         point = turned + (most * share * plane[..., None] * t).astype(np.float32)
         ahead = np.maximum(point[..., 2], 0.05)
-        x = (point[..., 0] / ahead * K_next[0, 0] + K_next[0, 2]).astype(np.float32)
-        y = (point[..., 1] / ahead * K_next[1, 1] + K_next[1, 2]).astype(np.float32)
+        x = (point[..., 0] / ahead * K[0, 0] + K[0, 2]).astype(np.float32)
+        y = (point[..., 1] / ahead * K[1, 1] + K[1, 2]).astype(np.float32)
         c = cost_at(x, y)
         better = c < cost
         cost[better] = c[better]
         flow[better] = np.stack([x - u, y - v], axis=-1)[better]
     return flow, cost
-
-
-def _nearby(ref: Image, nxt: Image, guess: FloatMap) -> FloatMap:
-    """Flow (H, W, 2) by DIS on the two finest scales, starting at a guess."""
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    dis.setFinestScale(0)
-    dis.setCoarsestScale(1)
-    dis.setVariationalRefinementIterations(10)
-    return np.asarray(dis.calc(ref, nxt, guess.copy()), np.float32)
-
-
-def _distance_from_line(
-    uv: FloatMap, R: Float, t: Float, K_ref: Float, K_next: Float
-) -> NDArray[np.float64]:
-    """(H, W) distance of the end of a flow vector from the epipolar line of its pixel, pixels."""
-    height, width = uv.shape[:2]
-    v, u = np.mgrid[0:height, 0:width].astype(float)
-    line = np.cross(t, rays(K_ref, np.stack([u, v], axis=-1)) @ R.T)
-    end = rays(K_next, np.stack([u + uv[..., 0], v + uv[..., 1]], axis=-1))
-    across = np.maximum(np.linalg.norm(line[..., :2], axis=2), 1e-12)
-    return np.asarray(K_next[0, 0] * np.abs(np.sum(line * end, axis=2)) / across)

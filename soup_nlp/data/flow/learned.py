@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,13 @@ from soup_nlp.storage.files import require_file
 
 RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 """Input values of black and white by the metadata `input_range` of an ONNX file; default "255"."""
+
+
+TAKES = {
+    1: ("one image", "one input (1, 3, H, W)"),
+    2: ("two images", "two inputs (1, 3, H, W), or one (1, 6, H, W)"),
+}
+"""What a network takes, and its inputs, by the number of its images."""
 
 
 class Network:
@@ -33,15 +41,13 @@ class Network:
     """
 
     def __init__(self, source: str, count: int) -> None:
+        self.source = source
         require_file(source, "file of a network")
         try:
             import onnxruntime
         except ImportError as error:
-            raise DataError(
-                "an .onnx network needs onnxruntime",
-                where=source,
-                hint="pip install soup-nlp[onnx]",
-            ) from error
+            what, hint = "an .onnx network needs onnxruntime", "pip install soup-nlp[onnx]"
+            raise DataError(what, where=source, hint=hint) from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         try:
@@ -49,41 +55,33 @@ class Network:
                 source, options, providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # onnxruntime raises many types
-            raise DataError(
-                "file is no network that onnxruntime can run",
-                where=source,
-                found=_first_line(error),
-            ) from error
+            what = "file is no network that onnxruntime can run"
+            raise DataError(what, where=source, found=_first_line(error)) from error
         inputs = self.session.get_inputs()
-        channels = [i.shape[1] if len(i.shape) == 4 else None for i in inputs]
+        shapes = [i.shape for i in inputs]
+        channels = [shape[1] if len(shape) == 4 else None for shape in shapes]
         if channels not in ([3] * count, [3 * count]):
-            images, expected = (
-                ("one image", "one input (1, 3, H, W)")
-                if count == 1
-                else ("two images", "two inputs (1, 3, H, W), or one (1, 6, H, W)")
-            )
-            raise DataError(
-                f"network does not take {images}",
-                where=source,
-                found=[i.shape for i in inputs],
-                expected=expected,
-            )
+            images, expected = TAKES[count]
+            what = f"network does not take {images}"
+            raise DataError(what, where=source, found=shapes, expected=expected)
         word = self.session.get_modelmeta().custom_metadata_map.get("input_range", "255")
         if word not in RANGES:
-            raise DataError(
-                "unknown input range of a network",
-                where=source,
-                found=word,
-                expected=", ".join(RANGES),
-            )
-        self.source, self.levels = source, RANGES[word]
+            what = "unknown input range of a network"
+            raise DataError(what, where=source, found=word, expected=", ".join(RANGES))
+        self.levels = RANGES[word]
         self.names = [i.name for i in inputs]
         self.kind = np.float16 if "float16" in inputs[0].type else np.float32
-        height, width = inputs[0].shape[2:]
+        height, width = shapes[0][2:]
         self.size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
 
-    def outputs(self, *images: Image) -> tuple[list[Any], tuple[int, int]]:
-        """Outputs for images (H, W, 3) of equal size, and the (rows, columns) of the inputs."""
+    def outputs(
+        self, fits: Callable[[Any], bool], kind: str, *images: Image
+    ) -> tuple[list[Any], tuple[int, int]]:
+        """Outputs that fit for images (H, W, 3) of equal size, and (rows, columns) of the inputs.
+
+        Raises:
+            DataError: the network fails, or has no output of the kind, such as "flow (1, 2, h, w)".
+        """
         height, width = images[0].shape[:2]
         rows, cols = self.size or (-(-n // 8) * 8 for n in (height, width))
         black, white = self.levels
@@ -98,25 +96,23 @@ class Network:
         feed = planes if len(self.names) == len(planes) else [np.concatenate(planes, axis=1)]
         named = {name: x.astype(self.kind) for name, x in zip(self.names, feed, strict=True)}
         try:
-            return list(self.session.run(None, named)), (rows, cols)
+            outputs = self.session.run(None, named)
         except Exception as error:  # onnxruntime raises many types
-            raise DataError(
-                "network failed", where=self.source, found=_first_line(error)
-            ) from error
-
-    def no_output(self, kind: str, outputs: list[Any], expected: str) -> DataError:
-        """The error of a network without an output of the expected shape."""
-        shapes = [np.shape(o) for o in outputs]
-        what = f"network gives no {kind}"
-        return DataError(what, where=self.source, found=shapes, expected=f"an output {expected}")
+            found = _first_line(error)
+            raise DataError("network failed", where=self.source, found=found) from error
+        fitting = [o for o in outputs if fits(o)]
+        if not fitting:
+            name, _, shape = kind.partition(" ")
+            what, shapes = f"network gives no {name}", [np.shape(o) for o in outputs]
+            raise DataError(what, where=self.source, found=shapes, expected=f"an output {shape}")
+        return fitting, (rows, cols)
 
     def flow(self, first: Image, second: Image) -> FloatMap:
         """(H, W, 2) flow, in pixels of the images (H, W, 3)."""
         height, width = first.shape[:2]
-        outputs, (rows, cols) = self.outputs(first, second)
-        flows = [o for o in outputs if np.ndim(o) == 4 and o.shape[:2] == (1, 2)]
-        if not flows:
-            raise self.no_output("flow", outputs, "(1, 2, h, w)")
+        flows, (rows, cols) = self.outputs(
+            lambda o: np.ndim(o) == 4 and o.shape[:2] == (1, 2), "flow (1, 2, h, w)", first, second
+        )
         best = max(reversed(flows), key=lambda o: o.shape[2] * o.shape[3])
         flow = np.moveaxis(best[0].astype(np.float32), 0, 2)
         # displacements are in pixels of the images that the network saw
@@ -162,12 +158,11 @@ def learned_map(source: str, image: Image) -> FloatMap:
         DataError: the library or the file is missing, or the network gives no map.
     """
     network = Network(source, 1)
-    outputs, (rows, cols) = network.outputs(image)
-    maps = [np.squeeze(o) for o in outputs if np.ndim(o) in (3, 4)]
-    maps = [m for m in maps if m.ndim == 2]
-    if not maps:
-        raise network.no_output("map", outputs, "(1, 1, h, w)")
-    resized = cv2.resize(maps[-1].astype(np.float32), (cols, rows), interpolation=cv2.INTER_LINEAR)
+    maps, (rows, cols) = network.outputs(
+        lambda o: np.ndim(o) in (3, 4) and np.squeeze(o).ndim == 2, "map (1, 1, h, w)", image
+    )
+    last = np.squeeze(maps[-1]).astype(np.float32)
+    resized = cv2.resize(last, (cols, rows), interpolation=cv2.INTER_LINEAR)
     # cut off the padding to a multiple of 8
     whole = resized if network.size else resized[: image.shape[0], : image.shape[1]]
     return np.where(np.isfinite(whole) & (whole > 0), whole, np.nan).astype(np.float32)
