@@ -29,16 +29,6 @@ def exp(w: ArrayLike) -> Float:
     return np.eye(3) + a * W + b * (W @ W)
 
 
-def right_jacobian(w: ArrayLike) -> Float:
-    """(3, 3) J of a rotation vector w (3,): `exp(w + dw) = exp(w) exp(J dw)` to first order."""
-    W = hat(w)
-    angle = float(np.linalg.norm(w))
-    if angle < 1e-4:
-        return np.eye(3) - W / 2 + W @ W / 6
-    a, b = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-    return np.eye(3) - a * W + b * (W @ W)
-
-
 def log(R: ArrayLike) -> Float:
     """Rotation vectors (..., 3) of rotations (..., 3, 3); angles in [0, pi]."""
     from scipy.spatial.transform import Rotation

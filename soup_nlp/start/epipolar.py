@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,9 +13,9 @@ from scipy.optimize import least_squares
 from soup_nlp.arrays import Float
 from soup_nlp.geometry import rotation
 
-REFINEMENTS = 5
-"""Largest number of robust fits of a motion, each with the noise estimated by the last."""
-
+REFINEMENTS, STEPS = 5, 30
+"""Largest number of robust fits of a motion, each with the noise estimated by the last, and of
+evaluations of a fit."""
 LEAST_NOISE = 0.01
 """Smallest scale of the robust loss, pixels."""
 NEAR = np.array([0.02] * 3 + [0.3] * 2)
@@ -41,26 +42,9 @@ class Motion:
 
 def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
     """Sampson distance (...) of rays r, q (..., 3) under E (3, 3), times focal: pixels."""
-    top, root, _, _ = _sampson_parts(E, np.swapaxes(r, -1, -2), np.swapaxes(q, -1, -2))
-    return focal * top / root
-
-
-def _sampson_parts(E: Float, r: Float, q: Float) -> tuple[Float, Float, Float, Float]:
-    """q'E r of columns r, q (..., 3, M), the norm of its gradient, and the gradients by q and r."""
-    by_q, by_r = E[:2] @ r, E[:, :2].T @ q
-    squared = np.sum(by_q**2, axis=-2) + np.sum(by_r**2, axis=-2)
-    return np.sum(q * (E @ r), axis=-2), np.sqrt(np.maximum(squared, 1e-24)), by_q, by_r
-
-
-def sampson_slopes(E: Float, directions: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
-    """(M, k) derivatives of the distances of r, q (M, 3) along `directions` (k, 3, 3) of E."""
-    r, q = r.T, q.T
-    top, root, by_q, by_r = _sampson_parts(E, r, q)
-    share = top / root**2
-    left, right = q / root, share * by_r / root
-    left[:2] -= share * by_q / root
-    slopes = [np.sum(left * (D @ r), axis=0) - np.sum(right * (D.T[:2] @ q), 0) for D in directions]
-    return focal * np.stack(slopes, axis=1)
+    by_q, by_r = r @ E.T, q @ E
+    squared = np.sum(by_q[..., :2] ** 2 + by_r[..., :2] ** 2, axis=-1)
+    return focal * np.sum(q * by_q, axis=-1) / np.sqrt(np.maximum(squared, 1e-24))
 
 
 def estimate(
@@ -142,48 +126,25 @@ def triangulate(motion: Motion, r: Float, q: Float) -> tuple[Float, Float]:
 def refine(
     motion: Motion, r: Float, q: Float, weight: Float, focal: float, threshold: float = 1.0
 ) -> Motion:
-    """Motion that minimises the robust (Cauchy), weighted Sampson distance."""
-    root, basis, unpack = np.sqrt(weight), tangent(motion.t), around(motion)
+    """Motion that minimises the robust (Cauchy), weighted Sampson distance.
 
-    def residual(x: Float) -> Float:
-        return root * sampson(unpack(x).essential(), r, q, focal)
+    The scale of the loss falls from the inlier distance to the noise, so that components that move
+    otherwise drop out.
+    """
+    root, scale = np.sqrt(weight), max(0.1, 0.5 * threshold)
 
-    def jacobian(x: Float) -> Float:
-        now = unpack(x)
-        turns = rotation.hat(rotation.right_jacobian(x[:3]).T)
-        shifts = basis - np.outer(basis @ now.t, now.t)
-        shifts /= np.linalg.norm(motion.t + x[3:] @ basis)
-        directions = np.concatenate([now.essential() @ turns, rotation.hat(shifts) @ now.R])
-        return root[:, None] * sampson_slopes(now.essential(), directions, r, q, focal)
+    def residual(now: Motion) -> Float:
+        return root * sampson(now.essential(), r, q, focal)
 
-    # from the inlier distance down to the noise, so that components that move otherwise drop out
-    scale = max(0.1, 0.5 * threshold)
-    x = np.zeros(5)
     for _ in range(REFINEMENTS):
-        x = least_squares(residual, x, jacobian, loss="cauchy", f_scale=scale, max_nfev=30).x
-        error = np.abs(residual(x))
+        _, motion = minimum(motion, residual, np.ones(5), loss="cauchy", f_scale=scale)
+        error = np.abs(residual(motion))
         near = error[error < max(3 * scale, LEAST_NOISE)]
         noise = 1.5 * float(np.median(near)) if len(near) else scale
         if noise > 0.8 * scale:
             break
         scale = max(noise, LEAST_NOISE)
-    return unpack(x)
-
-
-def tangent(t: Float) -> Float:
-    """(2, 3) unit vectors perpendicular to a translation (3,) and to each other."""
-    return np.asarray(np.linalg.svd(t[None])[2][1:])
-
-
-def around(motion: Motion) -> Callable[[Float], Motion]:
-    """Motions near a given one by (5,) parameters: rotation vector, and shifts along `tangent`."""
-    basis = tangent(motion.t)
-
-    def moved(x: Float) -> Motion:
-        t = motion.t + x[3:] @ basis
-        return Motion(motion.R @ rotation.exp(x[:3]), t / np.linalg.norm(t))
-
-    return moved
+    return motion
 
 
 def refine_near(
@@ -233,6 +194,36 @@ def refine_near(
         R, t = rotation.exp(turn) @ motion.R, t + step[3:] @ basis
         t = t / np.linalg.norm(t)
     return _facing(Motion(R, t), r, q, weight)
+
+
+def tangent(t: Float) -> Float:
+    """(2, 3) unit vectors perpendicular to a translation (3,) and to each other."""
+    return np.asarray(np.linalg.svd(t[None])[2][1:])
+
+
+def minimum(
+    motion: Motion, residual: Callable[[Motion], Float], scale: Float, **loss: Any
+) -> tuple[float, Motion]:
+    """Least sum of squares of a function of motions near a given one, and the motion there.
+
+    The change (5,) has a rotation vector and two shifts along `tangent`.
+
+    Args:
+        motion: Where to begin.
+        residual: (K,) residuals of a motion.
+        scale: (5,) usual sizes of the change.
+        loss: Loss and scale of it, see `scipy.optimize.least_squares`; squares without it.
+    """
+    basis = tangent(motion.t)
+
+    def moved(x: Float) -> Motion:
+        t = motion.t + x[3:] @ basis
+        return Motion(motion.R @ rotation.exp(x[:3]), t / np.linalg.norm(t))
+
+    end = least_squares(
+        lambda x: residual(moved(x)), np.zeros(5), x_scale=scale, max_nfev=STEPS, **loss
+    )
+    return float(end.cost), moved(end.x)
 
 
 def fit_translation(

@@ -11,11 +11,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float
 from soup_nlp.start.choice import PIECE_SIZE, Choice, limited_noise
-from soup_nlp.start.epipolar import Motion, around, sampson, triangulate
+from soup_nlp.start.epipolar import Motion, minimum, sampson, triangulate
 from soup_nlp.start.views import FlowFit
 
 SYSTEMATIC, MOST_SYSTEMATIC_PX = 1.5, 0.15
@@ -27,6 +26,8 @@ MOST_RELIEF = 3.0
 """Limit of a log depth relative to the median: points at infinity or behind the camera."""
 EXACT_PX = 0.005
 """Median error of rigid motions below which the flow is exact and leaves no motion open, pixels."""
+CHANGE = np.array([0.01] * 3 + [0.1] * 2)
+"""Usual change of rotation (radians) and direction of the translation."""
 CLIP_PX = 0.3
 """Scale of the Cauchy loss of epipolar distances, pixels."""
 
@@ -70,21 +71,14 @@ def most_probable(
         expected: (M,) log depth by a depth prior, from which relief is counted.
         spread: Standard deviation of the relief.
     """
-    root, results = np.sqrt(weight / weight.sum()), []
+    root = np.sqrt(weight / weight.sum())
 
     def residual(motion: Motion) -> Float:
         distance = cauchy(sampson(motion.essential(), r, q, focal), CLIP_PX)
         depth = cauchy(relief(motion, r, q, expected), spread)
         return np.concatenate([root * distance / error, root * depth / spread])
 
-    for unpack in map(around, motions):
-        end = least_squares(
-            lambda x, unpack=unpack: residual(unpack(x)),
-            np.zeros(5),
-            x_scale=[0.01] * 3 + [0.1] * 2,
-            max_nfev=30,
-        )
-        results.append((float(end.cost), unpack(end.x)))
+    results = [minimum(motion, residual, CHANGE) for motion in motions]
     return min(results, key=lambda result: result[0])[1]
 
 

@@ -73,14 +73,6 @@ def test_exp_and_log_are_inverse_of_each_other(w, angle):
     np.testing.assert_allclose(rotation.exp(rotation.log(R)), R, atol=1e-9)
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-5, 0.5, 3.0])
-def test_the_right_jacobian_is_that_of_exp(size):
-    w, h = size * np.array([2.0, -1.0, 2.0]) / 3, 1e-6
-    turns = [rotation.exp(w).T @ (rotation.exp(w + e) - rotation.exp(w - e)) for e in h * np.eye(3)]
-    J = rotation.right_jacobian(w)
-    np.testing.assert_allclose(np.array(turns) / (2 * h), rotation.hat(J.T), atol=1e-9)
-
-
 @given(vectors)
 def test_cayley_rotates_by_twice_the_arc_tangent(w):
     R = rotation.cayley(2 * w)

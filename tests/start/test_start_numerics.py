@@ -17,7 +17,6 @@ from soup_nlp.start.epipolar import (
     fit_translation,
     refine_near,
     sampson,
-    sampson_slopes,
 )
 from soup_nlp.start.views import Views, affine_flow
 
@@ -129,17 +128,6 @@ def test_the_essential_matrix_that_explains_most_is_taken(monkeypatch, position)
     assert motion is not None
     assert np.abs(sampson(motion.essential(), r, q, FOCAL)).max() < 1e-6
     assert max(off(m, motion)) < 1e-6
-
-
-def test_slopes_of_the_sampson_distance_are_its_differences():
-    m, r, q = rigid(50)
-    q = q + np.random.default_rng(0).normal(0, 0.01, q.shape) * [1, 1, 0]
-    E, directions, h = m.essential(), np.random.default_rng(1).normal(size=(5, 3, 3)), 1e-5
-    ends = [[sampson(E + s * h * D, r, q, FOCAL) for s in (1, -1)] for D in directions]
-    differences = np.stack([(a - b) / (2 * h) for a, b in ends], axis=1)
-    slopes = sampson_slopes(E, directions, r, q, FOCAL)
-    # the next term of Taylor's series is h^2 = 1e-10 of the distance's third derivative
-    np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-6 * np.abs(slopes).max())
 
 
 # --- planes --------------------------------------------------------------------------------------
