@@ -25,7 +25,7 @@ class Program:
     Attributes:
         stamped: (template, (E, nx) variables, (E, m) rows or OBJECTIVE of every output).
         jacobian: (ng, nx) linear coefficients of the rows.
-        gradient: (1, nx) those of the objective; both store 0 for nonlinear entries.
+        gradient: (1, nx) linear coefficients of the objective; both store 0 for nonlinear entries.
         in_rows: (nx,) variable is nonlinear in some row.
         in_objective: (nx,) variable is nonlinear in the objective.
         curved_rows: (ng,) row has an expression or a constant.

@@ -135,7 +135,7 @@ def load_frozen(scene: str, size: int) -> Frozen:
 
 
 def read_frozen(path: Path) -> Frozen:
-    """A record of a file.
+    """Read the record of a scene from a file.
 
     Raises:
         DataError: the file is missing or cannot be read.

@@ -157,8 +157,8 @@ class Summed:
     Attributes:
         call: The loop, of a library of `compile_lanes`.
         lanes: The table.
-        place: (B, entries, LANES) where each is added; what fills the last block belongs in an
-            entry that is dropped.
+        place: (B, entries, LANES) index of the sum that each value is added to; the sum of the
+            values that pad the last block is dropped.
     """
 
     call: Callable[..., None]

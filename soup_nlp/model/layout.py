@@ -53,7 +53,7 @@ class MatrixLayout:
 
     @property
     def size(self) -> int:
-        """Superpixel variables, tau included."""
+        """Number of superpixel variables, tau included."""
         return self.count * self.stride + (self.gauge == "unit-translation")
 
     @property

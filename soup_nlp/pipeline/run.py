@@ -266,7 +266,7 @@ def solve_pair(
     """Solve a pair that is in memory.
 
     The problem of the run holds a hash of the pair only, so that its config.yaml cannot be solved.
-    `soup-nlp show street` lists the keys of a problem.
+    `soup-nlp show street --all` lists the keys of a problem.
 
     Args:
         pair: Images, cameras, and a flow if there is one (else OpenCV DIS).

@@ -76,7 +76,7 @@ def page(result: Result, drawn: Mapping[str, Picture]) -> str:
 
 @cache
 def web_file(name: str) -> str:
-    """A file of the pages."""
+    """Text of a script, style or template of the pages."""
     return (files("soup_nlp.report") / "web" / name).read_text(encoding="utf-8")
 
 

@@ -141,7 +141,7 @@ def _minimum(run: Run) -> list[str]:
 
 
 def _refinement(run: Run) -> list[str]:
-    """Fall of what the refinement minimises, and the gap of its last choice."""
+    """How far the refinement lowers its objective, and the gap of its last choice of labels."""
     r = run.refined
     if r is None:
         return []

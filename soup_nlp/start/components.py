@@ -33,7 +33,7 @@ def numbered(label: Int) -> Int:
 
 
 def largest(label: Int) -> int:
-    """The most frequent of indices (N,): of components the largest one, the background."""
+    """The most frequent index of (N,) labels; of components the background."""
     return int(np.argmax(np.bincount(label)))
 
 

@@ -153,9 +153,9 @@ class Seen(NamedTuple):
 
 
 def without_gaps(pair: Pair, seg: Segmentation) -> tuple[Float, Mask, Float]:
-    """Values of a pair's depth prior: (N,) medians, (N,) True if most pixels have one, and (H, W).
+    """Depth prior of a pair: (N,) medians, (N,) True where most pixels have a value, (H, W) values.
 
-    Other superpixels have the median of the nearest one with values; 1 if there is none.
+    A superpixel without values has the median of the nearest one with values; 1 if there is none.
     """
     prior = pair.depth_prior
     assert prior is not None
