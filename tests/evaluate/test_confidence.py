@@ -141,7 +141,7 @@ def test_the_variance_of_a_pixel_is_of_log_depth(small_room, info, dense):
     assert sigma[v, u] == pytest.approx(expected, rel=1e-4)
 
 
-def test_pixels_beside_a_step_may_lie_on_either_side_of_it():
+def test_pixels_beside_a_step_may_lie_on_either_side():
     log_depth = np.where(np.arange(400) < 200, 0.0, 0.4) * np.ones((60, 1))
     sigma = at_outlines(np.exp(log_depth))
     np.testing.assert_allclose(sigma[:, 198:202], 0.4 * OUTLINE, atol=1e-6)
@@ -362,7 +362,7 @@ def test_other_components_are_less_sure_than_the_reference(small_room):
     np.testing.assert_allclose(sure.component_sigma, expected)
 
 
-def test_a_scale_is_open_where_contact_makes_a_component_too_fast(small_room):
+def test_a_scale_is_open_where_contact_implies_too_fast_motion(small_room):
     sure, start = sure_of(small_room), small_room.start
     tied = start.tie != TIES.index("reference")
     fast = int(start.component[tied][0])
@@ -379,7 +379,7 @@ def test_a_scale_is_open_where_contact_makes_a_component_too_fast(small_room):
     np.testing.assert_array_equal(scale(5.0)[~moving], usual[~moving])
 
 
-def test_a_camera_at_rest_leaves_everything_a_guess_that_keeps_its_order(small_room):
+def test_a_camera_at_rest_leaves_a_guess_that_keeps_its_order(small_room):
     rests = replace(small_room, start=replace(small_room.start, at_rest=True))
     moving, resting = sure_of(small_room).sigma, sure_of(rests).sigma
     least = GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)

@@ -199,7 +199,7 @@ def test_slack_variables_on_their_epigraph_are_the_smooth_norms(gauge):
 
 @pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
-def test_the_coordinates_of_the_presolve_leave_scale_and_visibility_to_constrain(chart, units):
+def test_the_presolve_constrains_scale_and_visibility_only(chart, units):
     problem = tiny(units)
     f = form(depth_ratio=4.0, min_facing=0.02)
     nlp, layout = build_tangent_nlp(problem.soup, problem.data, PAPER, f, chart)

@@ -197,7 +197,7 @@ def test_the_presolve_has_the_same_objective_as_the_constrained_nlp(units):
     assert value(two, two.x0)[0] == pytest.approx(value(one, one.x0)[0], rel=1e-11)
 
 
-def test_the_length_unit_of_a_variable_offset_weighs_distances_by_share():
+def test_the_length_unit_weighs_distances_by_share():
     problem = tiny()
     share = np.linspace(1.0, 4.0, len(problem.soup))
     share /= share.sum()

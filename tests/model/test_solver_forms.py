@@ -121,7 +121,7 @@ def optimal_slacks(nlp: NLP) -> np.ndarray:
 
 @pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_the_epigraph_at_its_optimum_is_the_exact_energy_without_truncations(gauge, units):
+def test_the_epigraph_at_its_optimum_is_the_untruncated_energy(gauge, units):
     problem, w = tiny(units), weights_for(units, truncated=False)
     weights = w.replace(sigma_cont=np.inf, sigma_orient=np.inf)
     sharp = form(gauge=gauge, norm="epigraph", eps=0.0, eps_pixel=0.0)

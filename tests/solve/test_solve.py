@@ -416,7 +416,7 @@ def test_the_constrained_nlp_starts_at_the_presolves_kkt_point(room, depth_ratio
         assert np.abs(done.multipliers["lam_g_visible"]).max() > 1e-2
 
 
-def test_a_start_of_less_exact_energy_keeps_the_nlp_at_the_presolves_kkt_point(room, solved):
+def test_a_better_start_is_delivered_beside_the_presolves_kkt_point(room, solved):
     # wide smoothing raises the exact energy above that of a start that was solved with less
     first = solved["unit-offset"].soup
     options = OPTIONS.replace(presolve_eps=(0.3,), eps=0.3, tol=1e-6)
