@@ -78,8 +78,9 @@ def _run(
     claim(out, [name for study in studies for name in (study.page, *study.files)], overwrite)
     for study in studies:
         page, say = out / study.page, options.RowProgress(quiet, study.line)
-        measure_rows = partial(measure_all, say=say, **running)
-        frame = study.measured(page.with_suffix(".jsonl"), measure_rows)
+        measure_rows, rows = partial(measure_all, say=say, **running), page.with_suffix(".jsonl")
+        with options.resumable("the rows that were measured are kept", rows):
+            frame = study.measured(rows, measure_rows)
         with staged(out) as new:
             study.write(new / page.name, frame)
             written = [name for name in (page.name, *study.files) if (new / name).is_file()]

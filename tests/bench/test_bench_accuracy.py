@@ -137,6 +137,10 @@ def broken(cell: Cell) -> Row:
     raise DataError("image is missing", where="a/0.png", found="nothing", expected="a file")
 
 
+def interrupted(cell: Cell) -> Row:
+    raise KeyboardInterrupt
+
+
 def test_command_line(tmp_path, capsys, monkeypatch):
     words = ["bench", "accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
     words += ["--width", "128", "--out", str(tmp_path)]
@@ -156,6 +160,11 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     assert main(["bench", "accuracy", "--suite", "imagenet"]) == 2
     assert main([*words, "--suite", "everyday", "--name", "both"]) == 2
     assert main(["bench", "accuracy", "--suite", "rendered", "--seeds", "a"]) == 2
+    # Ctrl-C keeps the rows
+    monkeypatch.setattr(bench, "measure_pair", interrupted)
+    assert main([*words, "--width", "96", "-q"]) == 130
+    assert "the rows that were measured are kept" in capsys.readouterr().err
+    assert (tmp_path / "rendered.jsonl").read_text() == before
     monkeypatch.setattr(bench, "measure_pair", broken)
     assert main([*words, "--width", "64", "-q"]) == 1
     assert "image is missing, where: a/0.png, found: nothing" in capsys.readouterr().out
