@@ -116,15 +116,12 @@ class FilesInput(FramesInput):
         def depth(name: str | None) -> Float | None:
             return None if name is None else read_depth(path(name), self.depth_scale)
 
-        if self.undistort and (
-            self.depth or self.depth_next or not isinstance(self.intrinsics, str)
-        ):
+        no_file = not isinstance(self.intrinsics, str)
+        if self.undistort and (no_file or self.depth or self.depth_next):
             raise ConfigError(
                 "images cannot be undistorted",
                 where="input.undistort",
-                found="no file of the camera"
-                if not isinstance(self.intrinsics, str)
-                else "true depth",
+                found="no file of the camera" if no_file else "true depth",
                 expected="intrinsics in a file with distortion, and no true depth, which would"
                 " belong to the images before",
             )

@@ -128,18 +128,17 @@ class Flow:
     __repr__ = __str__
 
 
-_SHAPES = {
-    "depth_ref": "(H, W)",
-    "depth_next": "(H, W)",
-    "flow": "(H, W, 2)",
-    "occluded": "(H, W)",
-    "components": "(H, W)",
-    "motions": "(B, 4, 4)",
-    "points": "(M, 3)",
-    "scene_flow": "(H, W, 3)",
+_PARTS = {
+    "depth_ref": ("(H, W)", "fiu"),
+    "depth_next": ("(H, W)", "fiu"),
+    "flow": ("(H, W, 2)", "fiu"),
+    "occluded": ("(H, W)", "b"),
+    "components": ("(H, W)", "iu"),
+    "motions": ("(B, 4, 4)", "fiu"),
+    "points": ("(M, 3)", "fiu"),
+    "scene_flow": ("(H, W, 3)", "fiu"),
 }
-_KINDS = dict.fromkeys(_SHAPES, "fiu") | {"occluded": "b", "components": "iu"}
-"""Shape and kind of number of every part of a truth."""
+"""Shape and kinds of number of every part of a truth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +168,10 @@ class Truth:
     unit: str = "m"
 
     def __post_init__(self) -> None:
-        for name, kinds in _KINDS.items():
+        for name, (axes, kinds) in _PARTS.items():
             value = getattr(self, name)
             if value is None:
                 continue
-            axes = _SHAPES[name]
             expected = f"{axes} array of {'True and False' if kinds == 'b' else 'numbers'}"
             where, what = f"truth.{name}", "part of the truth"
             hint = "soup_nlp.Truth(depth_ref=array); files are read by a problem's input"
