@@ -48,17 +48,15 @@ def depth_range(depth: AnyFloat) -> tuple[float, float]:
     return near, far
 
 
-def colourise_depth(depth: AnyFloat, near: float | None = None, far: float | None = None) -> Image:
+def colourise_depth(depth: AnyFloat, near: float, far: float) -> Image:
     """Depth in colour by even steps of 1/z: near is red, far is blue.
 
     Args:
         depth: (H, W) z; grey where not finite or not positive.
-        near: Depth of the near end; None takes `depth_range`.
-        far: Depth of the far end; None takes `depth_range`.
+        near: Depth of the near end.
+        far: Depth of the far end.
     """
     z = np.asarray(depth, np.float64)
-    nearest, farthest = depth_range(z)
-    near, far = nearest if near is None else near, farthest if far is None else far
     known = np.isfinite(z) & (z > 0)
     safe = np.clip(np.where(known, z, near), near, far)
     return _paint((1 / safe - 1 / far) / (1 / near - 1 / far), known, "turbo")
@@ -118,17 +116,16 @@ def flow_limit(uv: AnyFloat) -> float:
     return max(float(min(length.max(), 1.5 * np.percentile(length, 99))), 1e-6)
 
 
-def colourise_flow(uv: AnyFloat, limit: float | None = None) -> Image:
+def colourise_flow(uv: AnyFloat, limit: float) -> Image:
     """Flow in the colours of the Middlebury wheel: hue is direction, white is no motion.
 
     Args:
         uv: (H, W, 2) displacement, pixels; black where not finite.
-        limit: Length, pixels, of full saturation; longer is darker. None takes `flow_limit`.
+        limit: Length, pixels, of full saturation, such as `flow_limit`; longer is darker.
     """
     known: Mask = np.asarray(np.isfinite(uv).all(axis=2))
     flow = np.where(known[:, :, None], uv, 0.0).astype(np.float64)
     length = np.hypot(flow[:, :, 0], flow[:, :, 1])
-    limit = flow_limit(np.asarray(uv)) if limit is None else limit
     radius = (length / limit)[:, :, None]
     wheel = colour_wheel() / 255
     turn = np.arctan2(-flow[:, :, 1], -flow[:, :, 0]) / np.pi

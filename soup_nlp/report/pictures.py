@@ -172,11 +172,7 @@ def _depths(result: Result) -> list[Picture]:
     truth, delivered = result.array("truth/depth_ref"), result.array("depth/ref")
     assert delivered is not None
     near, far = depth_range(truth if truth is not None else delivered * result.scale)
-    steps = 1 / np.linspace(1 / far, 1 / near, 5)
-    unit = {0: f" {result.length}", 4: f" {result.length}"}
-    texts = tuple(f"{z:.3g}{unit.get(k, '')}" for k, z in enumerate(steps))
-    bar = Bar(colourise_depth(1 / np.linspace(1 / far, 1 / near, 128)[None], near, far), texts)
-    out = []
+    bar, out = depth_bar(near, far, f" {result.length}"), []
     for array, name, title, scored, more in DEPTHS:
         z, score = result.array(f"depth/{array}"), result.summary["metrics"].get(scored, {})
         if z is None:
@@ -191,6 +187,13 @@ def _depths(result: Result) -> list[Picture]:
         true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)
         out.append(Picture("depth_true", "true depth; grey = no truth", true, bar))
     return out
+
+
+def depth_bar(near: float, far: float, unit: str = "") -> Bar:
+    """Legend of depths with five values; both ends name the unit."""
+    first, *middle, last = (f"{z:.3g}" for z in 1 / np.linspace(1 / far, 1 / near, 5))
+    colours = colourise_depth(1 / np.linspace(1 / far, 1 / near, 128)[None], near, far)
+    return Bar(colours, (first + unit, *middle, last + unit))
 
 
 def _enlarged(values: AnyFloat) -> AnyFloat:

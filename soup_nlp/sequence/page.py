@@ -23,7 +23,7 @@ from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.models import GLTF
 from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
-from soup_nlp.report.pictures import Bar
+from soup_nlp.report.pictures import depth_bar
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.fused import Cloud, every_kth, fuse, kept, movers, shown_tracks
 from soup_nlp.sequence.score import LINK_HEADS, link_rows, score_text
@@ -63,8 +63,6 @@ def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
         "names": [Path(x).name for x in contents["sources"]],
         "scene": scene,
     }
-    z = 1 / np.linspace(1 / far, 1 / near, 25)
-    ticks = tuple(f"{x:.3g}" for x in z[::6])
     links = table(LINK_HEADS, link_rows(contents))
     if contents["score"]:
         links += f"<p>{score_text(contents['score'])}.</p>"
@@ -75,7 +73,7 @@ def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
         data=json.dumps(plain(data)).replace("<", "\\u003c"),
         three=web_file("three.js"),
         script=web_file("chain.js"),
-        bar=colour_bar(Bar(colourise_depth(z[None], near, far), ticks)),
+        bar=colour_bar(depth_bar(near, far)),
         tracks=_tracks(chain, scene["tracks"]),
         links=links,
         unit=html.escape(str(contents["unit"])),

@@ -84,8 +84,9 @@ def test_depth_range_is_robust():
     near, far = depth_range(np.linspace(4.999, 5.001, 100)[None])
     np.testing.assert_allclose([near, far], [5.0 / 1.01, 5.0 * 1.01], rtol=1e-3)
     assert depth_range(np.full((2, 2), np.nan)) == (1.0, 2.0)
-    assert (colourise_depth(np.full((2, 2), np.nan)) == UNKNOWN).all()
-    assert (colourise_depth(np.full((2, 2), 5.0)) != UNKNOWN).any()
+    assert (colourise_depth(np.full((2, 2), np.nan), 1.0, 2.0) == UNKNOWN).all()
+    constant = np.full((2, 2), 5.0)
+    assert (colourise_depth(constant, *depth_range(constant)) != UNKNOWN).any()
 
 
 def test_flow_wheel():
@@ -143,8 +144,9 @@ def test_the_limit_of_a_flow_ignores_outliers():
     assert flow_limit(uv) == pytest.approx(15, rel=0.02)
     assert flow_limit(np.full((2, 2, 2), np.nan)) == 1.0
     # their colours, in that limit
-    assert (colourise_flow(np.zeros((2, 2, 2))) == 255).all()
-    assert not colourise_flow(np.full((2, 2, 2), np.nan)).any()
+    still, unknown = np.zeros((2, 2, 2)), np.full((2, 2, 2), np.nan)
+    assert (colourise_flow(still, flow_limit(still)) == 255).all()
+    assert not colourise_flow(unknown, flow_limit(unknown)).any()
 
 
 def test_superpixel_boundaries():
