@@ -74,7 +74,7 @@ def _best_motion(
     """The motion of rays r, q (M, 3) with the smallest Cauchy cost, or None where there is none."""
     best, lowest = None, np.inf
     for distance in (INLIER, TIGHT * INLIER):
-        motion = epipolar.estimate(r, q, weight, focal, distance, seed)
+        motion = epipolar.estimate(epipolar.Matches(r, q, weight, focal), distance, seed)
         if motion is None or not (np.isfinite(motion.R).all() and np.isfinite(motion.t).all()):
             continue
         off = epipolar.sampson(motion.essential(), r, q, focal) / (TIGHT * INLIER)

@@ -100,7 +100,7 @@ def prepare(
     done("segmentation", seg)
     if pair.focal_sigma >= GUESS_SIGMA:
         matches = _flow_fit(problem, pair, seg).views.matches()
-        better = focal_length(*matches, pair.focal_sigma, problem.seed)
+        better = focal_length(matches, pair.focal_sigma, problem.seed)
         full, pair = full.with_focal(*better), pair.with_focal(*better)
         seen = None if seen is None else seen.with_focal(*better)
         if log:

@@ -13,7 +13,7 @@ from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.working_size import resized_flow
 from soup_nlp.geometry.camera import rays
-from soup_nlp.start.epipolar import repeated
+from soup_nlp.start.epipolar import Matches, repeated
 
 LEAST_SHARE = 0.003
 """Least share of pixels that stand still for the search for a layer."""
@@ -71,14 +71,13 @@ def see_through(pair: Pair, seed: int = 0) -> Pair | None:
     pick = np.random.default_rng(seed).permutation(len(v))[:PIXELS]
     pixel = np.stack([u, v], axis=-1)[pick].astype(float)
     move = flow.uv[v, u][pick].astype(float)
-    motions = repeated(
+    matches = Matches(
         rays(pair.K_ref, pixel),
         rays(pair.K_next, pixel + move),
         flow.confidence[v, u][pick].astype(float),
         float(pair.K_next[0, 0]),
-        count=1,
-        seed=seed,
     )
+    motions = repeated(matches, 1, seed=seed)
     if not motions:
         return None
     ref, nxt = without_still_layer(pair.image_ref, pair.image_next)

@@ -214,9 +214,8 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
         # RANSAC has an inlier distance, within which a compromise with the bending part has more
         # inliers than the motion of the least median error
         matches, median = views.matches(at, FIT_PIXELS), []
-        r, q, _, focal = matches
-        if (motion := essential_motion(r, q, focal, None, flow.options.seed)) is not None:
-            median = [refine_near(motion, *matches, max(noise, LEAST_SCALE))]
+        if (motion := essential_motion(matches, None, flow.options.seed)) is not None:
+            median = [refine_near(motion, matches, max(noise, LEAST_SCALE))]
         excess = views.subset(at).fit(tried + median).cost - flow.residual[at, None]
         middle = np.median(excess, axis=0)
         # where many motions explain half of a surface badly, the one of least median is chance

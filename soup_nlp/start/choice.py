@@ -34,13 +34,11 @@ def least_gain(noise: float) -> float:
 def dominant(flow: FlowFit) -> list[Motion]:
     """Motions that many pixels share, the most frequent first; at least one."""
     seed = flow.options.seed
-    r, q, w, focal = flow.views.matches()
-    good = np.flatnonzero(w > 0.3 * w.max())
+    matches = flow.views.matches()
+    good = np.flatnonzero(matches.weight > 0.3 * matches.weight.max())
     rng = np.random.default_rng(seed)
     pick = good if len(good) <= 6000 else rng.choice(good, 6000, replace=False)
-    threshold = flow.options.threshold_px
-    matches = r[pick], q[pick], w[pick], focal
-    motions = repeated(*matches, count=DOMINANT, threshold=threshold, seed=seed)
+    motions = repeated(matches.at(pick), DOMINANT, flow.options.threshold_px, seed)
     # nothing determines a motion (no flow at all): a sideways camera keeps depth defined
     return motions or [Motion(np.eye(3), np.array([1.0, 0.0, 0.0]))]
 
@@ -75,9 +73,9 @@ def of_pieces(flow: FlowFit, motions: list[Motion], cost: Float, noise: float) -
         if sizes[c] < PIECE_SIZE:
             break
         matches = flow.views.matches(np.flatnonzero(piece == c))
-        motion = estimate(*matches, max(3 * noise, 0.3), flow.options.seed)
+        motion = estimate(matches, max(3 * noise, 0.3), flow.options.seed)
         out += [] if motion is None else [motion]
-        out.append(fit_translation(motions[0].R, *matches, max(noise, 0.1)))
+        out.append(fit_translation(motions[0].R, matches, max(noise, 0.1)))
     return out
 
 

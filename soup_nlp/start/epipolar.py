@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 
 REFINEMENTS, STEPS = 5, 30
@@ -18,6 +18,8 @@ REFINEMENTS, STEPS = 5, 30
 evaluations of a fit."""
 LEAST_NOISE = 0.01
 """Smallest scale of the robust loss, pixels."""
+LEAST_SHARE = 0.03
+"""Least share of all correspondences that a dominant motion explains."""
 NEAR = np.array([0.02] * 3 + [0.3] * 2)
 """Standard deviations of the change of a motion by `refine_near`: rotation in radians, direction of
 the translation."""
@@ -40,6 +42,30 @@ class Motion:
         return rotation.hat(self.t) @ self.R
 
 
+class Matches(NamedTuple):
+    """Correspondences of two frames.
+
+    Attributes:
+        ray: (M, 3) reference rays, third component 1.
+        target: (M, 3) rays of the next frame.
+        weight: (M,) confidence.
+        focal: Pixels per ray unit, so that errors are in pixels.
+    """
+
+    ray: Float
+    target: Float
+    weight: Float
+    focal: float
+
+    def at(self, which: Int | Mask | slice) -> Matches:
+        """Some of the correspondences."""
+        return Matches(self.ray[which], self.target[which], self.weight[which], self.focal)
+
+    def distance(self, motion: Motion) -> Float:
+        """(M,) Sampson distance to a motion, pixels."""
+        return sampson(motion.essential(), self.ray, self.target, self.focal)
+
+
 def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
     """Sampson distance (...) of rays r, q (..., 3) under E (3, 3), times focal: pixels."""
     by_q, by_r = r @ E.T, q @ E
@@ -47,39 +73,30 @@ def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
     return focal * np.sum(q * by_q, axis=-1) / np.sqrt(np.maximum(squared, 1e-24))
 
 
-def estimate(
-    r: Float, q: Float, weight: Float, focal: float, threshold: float = 1.0, seed: int = 0
-) -> Motion | None:
+def estimate(matches: Matches, threshold: float = 1.0, seed: int = 0) -> Motion | None:
     """Motion with the most inliers, or None if the correspondences do not determine one.
 
     Args:
-        r: (M, 3) reference rays, third component 1.
-        q: (M, 3) next rays.
-        weight: (M,) confidence.
-        focal: Pixels per ray unit, so that the threshold is in pixels.
+        matches: Correspondences.
         threshold: Inlier distance, pixels.
         seed: Seed of RANSAC.
     """
-    motion = essential_motion(r, q, focal, threshold, seed)
-    return None if motion is None else refine(motion, r, q, weight, focal, threshold)
+    motion = essential_motion(matches, threshold, seed)
+    return None if motion is None else refine(motion, matches, threshold)
 
 
-def essential_motion(
-    r: Float, q: Float, focal: float, threshold: float | None, seed: int = 0
-) -> Motion | None:
+def essential_motion(matches: Matches, threshold: float | None, seed: int = 0) -> Motion | None:
     """Motion by RANSAC on the essential matrix and cheirality, or None; see `estimate`.
 
     Without a threshold it is the motion with the least median error.
     """
+    r, q, _, focal = matches
     if len(r) < 8:
         return None
     cv2.setRNGSeed(seed)
-    a = np.ascontiguousarray(r[:, :2])
-    b = np.ascontiguousarray(q[:, :2])
     try:
         E, _ = cv2.findEssentialMat(
-            a,
-            b,
+            *(np.ascontiguousarray(v[:, :2]) for v in (r, q)),
             np.eye(3),
             method=cv2.LMEDS if threshold is None else cv2.RANSAC,
             prob=0.999,
@@ -92,8 +109,7 @@ def essential_motion(
     # several solutions come stacked: keep the one with the smallest robust distance
     stack = np.ascontiguousarray(E[: 3 * (len(E) // 3)]).reshape(-1, 3, 3)
     cost = [np.mean(np.minimum(np.abs(sampson(e, r, q, focal)), 3.0)) for e in stack]
-    best = np.ascontiguousarray(stack[int(np.argmin(cost))])
-    return _decompose(best, r, q)
+    return _decompose(np.ascontiguousarray(stack[int(np.argmin(cost))]), r, q)
 
 
 def _decompose(E: Float, r: Float, q: Float) -> Motion | None:
@@ -123,18 +139,16 @@ def triangulate(motion: Motion, r: Float, q: Float) -> tuple[Float, Float]:
     return z, z * y[:, 2] + motion.t[2]
 
 
-def refine(
-    motion: Motion, r: Float, q: Float, weight: Float, focal: float, threshold: float = 1.0
-) -> Motion:
+def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
     """Motion that minimises the robust (Cauchy), weighted Sampson distance.
 
     The scale of the loss falls from the inlier distance to the noise, so that components that move
     otherwise drop out.
     """
-    root, scale = np.sqrt(weight), max(0.1, 0.5 * threshold)
+    root, scale = np.sqrt(matches.weight), max(0.1, 0.5 * threshold)
 
     def residual(now: Motion) -> Float:
-        return root * sampson(now.essential(), r, q, focal)
+        return root * matches.distance(now)
 
     for _ in range(REFINEMENTS):
         _, motion = minimum(motion, residual, np.ones(5), loss="cauchy", f_scale=scale)
@@ -148,14 +162,7 @@ def refine(
 
 
 def refine_near(
-    motion: Motion,
-    r: Float,
-    q: Float,
-    weight: Float,
-    focal: float,
-    noise: float,
-    prior: Float = NEAR,
-    rounds: int = 8,
+    motion: Motion, matches: Matches, noise: float, prior: Float = NEAR, rounds: int = 8
 ) -> Motion:
     """Motion near a given one that lowers the robust Sampson distance.
 
@@ -164,14 +171,12 @@ def refine_near(
 
     Args:
         motion: Where to begin.
-        r: (M, 3) reference rays.
-        q: (M, 3) next rays.
-        weight: (M,) confidence.
-        focal: Pixels per ray unit.
+        matches: Correspondences.
         noise: Flow noise, pixels.
         prior: (5,) standard deviations of the change, see `NEAR`.
         rounds: Gauss-Newton steps.
     """
+    r, q, weight, focal = matches
     R, t, turn, stiff = motion.R, motion.t, np.zeros(3), prior**-2.0
     for _ in range(rounds):
         y, basis = r @ R.T, tangent(t)
@@ -193,7 +198,7 @@ def refine_near(
         turn = turn + step[:3]
         R, t = rotation.exp(turn) @ motion.R, t + step[3:] @ basis
         t = t / np.linalg.norm(t)
-    return _facing(Motion(R, t), r, q, weight)
+    return _facing(Motion(R, t), matches)
 
 
 def tangent(t: Float) -> Float:
@@ -226,9 +231,7 @@ def minimum(
     return float(end.cost), moved(end.x)
 
 
-def fit_translation(
-    R: Float, r: Float, q: Float, weight: Float, focal: float, noise: float, rounds: int = 6
-) -> Motion:
+def fit_translation(R: Float, matches: Matches, noise: float, rounds: int = 6) -> Motion:
     """Motion with a given rotation whose translation explains correspondences best.
 
     The epipolar constraint `t . (R r x q) = 0` is linear in t, which is the eigenvector of the
@@ -236,61 +239,46 @@ def fit_translation(
 
     Args:
         R: (3, 3) rotation.
-        r: (M, 3) reference rays.
-        q: (M, 3) next rays.
-        weight: (M,) confidence.
-        focal: Pixels per ray unit.
+        matches: Correspondences.
         noise: Flow noise, pixels: errors beyond it are down-weighted.
         rounds: Reweighting rounds.
     """
+    r, q, weight, focal = matches
     normal, w, t = np.cross(r @ R.T, q), weight, np.zeros(3)
     for _ in range(rounds):
         t = np.linalg.eigh((normal * w[:, None]).T @ normal)[1][:, 0]
         spread = np.maximum(np.linalg.norm(np.cross(t, q)[:, :2], axis=1), 1e-6)
         # Sampson's weight: error in pixels, not the algebraic one
         w = weight / (1 + (focal * (normal @ t) / spread / noise) ** 2) / spread**2
-    return _facing(Motion(R, t), r, q, weight)
+    return _facing(Motion(R, t), matches)
 
 
-def _facing(motion: Motion, r: Float, q: Float, weight: Float) -> Motion:
+def _facing(motion: Motion, matches: Matches) -> Motion:
     """The motion with the sign of its translation that puts most points in front of the camera."""
-    vote = weight @ np.sign(triangulate(motion, r, q)[0])
+    vote = matches.weight @ np.sign(triangulate(motion, matches.ray, matches.target)[0])
     return motion if vote >= 0 else Motion(motion.R, -motion.t)
 
 
-def repeated(
-    r: Float,
-    q: Float,
-    weight: Float,
-    focal: float,
-    *,
-    count: int = 5,
-    threshold: float = 1.0,
-    min_share: float = 0.03,
-    seed: int = 0,
-) -> list[Motion]:
+def repeated(matches: Matches, count: int, threshold: float = 1.0, seed: int = 0) -> list[Motion]:
     """Dominant motions by repeated robust fits, each to the outliers of the earlier ones.
 
     Args:
-        r: (M, 3) reference rays.
-        q: (M, 3) next rays.
-        weight: (M,) confidence.
-        focal: Pixels per ray unit.
+        matches: Correspondences.
         count: Largest number of motions.
         threshold: Inlier distance, pixels.
-        min_share: Least share of all correspondences that a motion explains.
         seed: Of RANSAC.
     """
-    left = np.ones(len(r), bool)
+    least = LEAST_SHARE * len(matches.ray)
+    left = np.ones(len(matches.ray), bool)
     out: list[Motion] = []
     for k in range(count):
-        if left.sum() < max(8, min_share * len(r)):
+        if left.sum() < max(8, least):
             break
-        motion = estimate(r[left], q[left], weight[left], focal, threshold, seed + k)
+        motion = estimate(matches.at(left), threshold, seed + k)
         if motion is None:
             break
-        inlier = np.abs(sampson(motion.essential(), r, q, focal)) < threshold
-        if np.sum(inlier & left) < min_share * len(r):
+        inlier = np.abs(matches.distance(motion)) < threshold
+        if np.sum(inlier & left) < least:
             break
         out.append(motion)
         left &= ~inlier
@@ -308,9 +296,7 @@ FOCAL_PIXELS, FOCAL_NOISE_PX = 3000, 0.05
 """Largest number of correspondences of these fits, and the scale of their robust loss, pixels."""
 
 
-def focal_length(
-    r: Float, q: Float, weight: Float, focal: float, sigma: float, seed: int = 0
-) -> tuple[float, float]:
+def focal_length(matches: Matches, sigma: float, seed: int = 0) -> tuple[float, float]:
     """Factor of a guessed focal length, and the standard deviation of its logarithm.
 
     If the camera turns and shifts, no rigid motion explains the flow with a wrong focal length.
@@ -320,22 +306,20 @@ def focal_length(
     lengths, they are about 1 and `sigma`.
 
     Args:
-        r: (M, 3) reference rays with the guess.
-        q: (M, 3) next rays.
-        weight: (M,) confidence.
-        focal: The guess, pixels.
+        matches: Correspondences with the guess.
         sigma: Standard deviation of its logarithm.
         seed: Of the fits.
     """
-    use = np.flatnonzero(weight > 0)
-    use = use[:: max(1, len(use) // FOCAL_PIXELS)]
+    use = np.flatnonzero(matches.weight > 0)
+    r, q, weight, focal = matches.at(use[:: max(1, len(use) // FOCAL_PIXELS)])
     error = np.full(len(FOCAL_FACTORS), np.inf)
     for k, factor in enumerate(FOCAL_FACTORS):
-        a, b = (v[use] / [factor, factor, 1.0] for v in (r, q))
-        motion = essential_motion(a, b, factor * focal, None, seed)
+        longer = [factor, factor, 1.0]
+        tried = Matches(r / longer, q / longer, weight, factor * focal)
+        motion = essential_motion(tried, None, seed)
         if motion is not None:
-            motion = refine_near(motion, a, b, weight[use], factor * focal, FOCAL_NOISE_PX)
-            error[k] = np.median(np.abs(sampson(motion.essential(), a, b, factor * focal)))
+            motion = refine_near(motion, tried, FOCAL_NOISE_PX)
+            error[k] = np.median(np.abs(tried.distance(motion)))
     least = error.min()
     if not np.isfinite(least):
         return 1.0, sigma

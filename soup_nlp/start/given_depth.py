@@ -180,9 +180,8 @@ def _settled(
     if not determined:
         return soup.taking(views.soup(np.exp(-prior), flat, R, T_prior), mask), ~all_members
     error = min(SYSTEMATIC * start.noise, MOST_SYSTEMATIC_PX)
-    flow_data = views.anchor[use], seen.fitted.centre[use], np.ones(len(use)), views.focal[0], error
     tried = Motion(soup.R[at[0]], T / length), Motion(R, T_prior / np.linalg.norm(T_prior))
-    best = most_probable(tried, *flow_data, prior[use], sigma)
+    best = most_probable(tried, seen.fitted.anchor_matches(use), error, prior[use], sigma)
     planes = views.fit([best])
     mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
     strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP)

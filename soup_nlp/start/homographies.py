@@ -21,7 +21,7 @@ import numpy as np
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.plane import about_anchor, at_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.epipolar import Motion, essential_motion, sampson
+from soup_nlp.start.epipolar import Matches, Motion, essential_motion
 from soup_nlp.start.views import LEAST_PIXELS, FlowFit, Views
 
 MOST_PIXELS = 400
@@ -32,14 +32,6 @@ LEAST_MOTION = 1e-6
 """Smallest |t| / d at which a decomposition determines a direction and a depth."""
 CLIP = 5.0
 """Sampson distances are clipped at this many pixels."""
-
-
-class Matches(NamedTuple):
-    """Correspondences (M, 3) rays, (M, 3) rays of their flow targets, (M,) weights above 0."""
-
-    ray: Float
-    target: Float
-    weight: Float
 
 
 class Patch(NamedTuple):
@@ -71,33 +63,30 @@ def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
 def _patch(flow: FlowFit, i: int) -> Patch | None:
     """Motion and plane of a superpixel; None if its flow does not determine them."""
     views, knn, o = flow.views, flow.seg.knn[i], flow.options
-    inside = matches(views, np.array([i]))
+    inside = confident(views, np.array([i]))
     if len(inside.ray) < LEAST_PIXELS:
         return None
-    focal, seen = views.focal[0], np.vstack([inside.ray, views.anchor[i]])
+    seen = np.vstack([inside.ray, views.anchor[i]])
     if not o.motion_neighbours:
         H = fit_homography(inside)
         choices = [] if H is None else in_front(H, seen)
         if len(choices) < 2:
             return choices[0] if choices else None
-        around = matches(views, knn[:JUDGES])
-        return choices[int(np.argmin([epipolar_error(c.motion, around, focal) for c in choices]))]
-    around = matches(views, np.append(i, knn[: o.motion_neighbours]))
-    motion = essential_motion(around.ray, around.target, focal, o.threshold_px, o.seed)
+        around = confident(views, knn[:JUDGES])
+        return choices[int(np.argmin([epipolar_error(c.motion, around) for c in choices]))]
+    around = confident(views, np.append(i, knn[: o.motion_neighbours]))
+    motion = essential_motion(around, o.threshold_px, o.seed)
     if motion is None:
         return None
     m = plane_of(motion, inside)
     return Patch(motion, m) if (seen @ m > 0).all() else None
 
 
-def matches(views: Views, members: Int) -> Matches:
-    """Correspondences of superpixels (M,), evenly subsampled if there are many."""
-    ray, target, weight = (
-        v[members].reshape(-1, *v.shape[2:]) for v in (views.ray, views.target, views.weight)
-    )
-    use = np.flatnonzero(weight > 0)
-    use = use[:: max(1, len(use) // MOST_PIXELS)]
-    return Matches(*(np.ascontiguousarray(v[use]) for v in (ray, target, weight)))
+def confident(views: Views, members: Int) -> Matches:
+    """Correspondences of superpixels (M,) with weight, evenly subsampled if there are many."""
+    matches = views.matches(members)
+    use = np.flatnonzero(matches.weight > 0)
+    return matches.at(use[:: max(1, len(use) // MOST_PIXELS)])
 
 
 def plane_of(motion: Motion, matched: Matches) -> Float:
@@ -146,9 +135,9 @@ def in_front(H: Float, ray: Float) -> list[Patch]:
     return patches
 
 
-def epipolar_error(motion: Motion, around: Matches, focal: float) -> float:
+def epipolar_error(motion: Motion, around: Matches) -> float:
     """Mean clipped Sampson distance of correspondences to a motion, pixels."""
     if not len(around.ray):
         return 0.0
-    error = sampson(motion.essential(), around.ray, around.target, focal)
-    return float(np.average(np.minimum(np.abs(error), CLIP), weights=around.weight))
+    error = np.minimum(np.abs(around.distance(motion)), CLIP)
+    return float(np.average(error, weights=around.weight))

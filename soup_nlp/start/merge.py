@@ -75,9 +75,9 @@ def candidates(
     motions of the superpixels, refined, and the motion of their own essential matrix.
     """
     matches = flow.views.matches(at, PIXELS)
-    start = [fit_translation(main.R, *matches, max(noise, 0.1)), *present]
-    motion = estimate(*matches, max(3 * noise, 0.3), flow.options.seed)
-    refined = [refine_near(m, *matches, max(noise, 0.1)) for m in start]
+    start = [fit_translation(main.R, matches, max(noise, 0.1)), *present]
+    motion = estimate(matches, max(3 * noise, 0.3), flow.options.seed)
+    refined = [refine_near(m, matches, max(noise, 0.1)) for m in start]
     return [*refined, start[0], *([] if motion is None else [motion])]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float
 from soup_nlp.start.choice import PIECE_SIZE, Choice, limited_noise
-from soup_nlp.start.epipolar import Motion, minimum, sampson, triangulate
+from soup_nlp.start.epipolar import Matches, Motion, minimum, triangulate
 from soup_nlp.start.views import FlowFit
 
 SYSTEMATIC, MOST_SYSTEMATIC_PX = 1.5, 0.15
@@ -41,17 +41,13 @@ def settle(flow: FlowFit, choice: Choice) -> Choice:
     for c, motion in enumerate(motions):
         at = np.flatnonzero((choice.label == c) & usable)
         if len(at) >= PIECE_SIZE:
-            data = views.anchor[at], flow.centre[at], np.ones(len(at)), views.focal[0], error
-            motions[c] = most_probable([motion], *data)
+            motions[c] = most_probable([motion], flow.anchor_matches(at), error)
     return Choice.of(views, motions, choice.label, choice.noise)
 
 
 def most_probable(
     motions: Sequence[Motion],
-    r: Float,
-    q: Float,
-    weight: Float,
-    focal: float,
+    matches: Matches,
     error: float,
     expected: Float | float = 0.0,
     spread: float = RELIEF,
@@ -63,19 +59,16 @@ def most_probable(
 
     Args:
         motions: Initial motions; the best result is returned.
-        r: (M, 3) reference rays.
-        q: (M, 3) next rays.
-        weight: (M,) confidence.
-        focal: Pixels per ray unit.
+        matches: Correspondences.
         error: Systematic error of the flow, pixels.
         expected: (M,) log depth by a depth prior, from which relief is counted.
         spread: Standard deviation of the relief.
     """
-    root = np.sqrt(weight / weight.sum())
+    root = np.sqrt(matches.weight / matches.weight.sum())
 
     def residual(motion: Motion) -> Float:
-        distance = cauchy(sampson(motion.essential(), r, q, focal), CLIP_PX)
-        depth = cauchy(relief(motion, r, q, expected), spread)
+        distance = cauchy(matches.distance(motion), CLIP_PX)
+        depth = cauchy(relief(motion, matches.ray, matches.target, expected), spread)
         return np.concatenate([root * distance / error, root * depth / spread])
 
     results = [minimum(motion, residual, CHANGE) for motion in motions]

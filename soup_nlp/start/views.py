@@ -16,7 +16,7 @@ from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.plane_fit import PlaneFit, fit_planes
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
-from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.epipolar import Matches, Motion
 from soup_nlp.start.start_options import SeededStart
 
 USABLE = 0.5
@@ -88,19 +88,14 @@ class Views:
         """(N,) distance in pixels between the moved and the merely rotated anchor."""
         return np.linalg.norm(soup.parallax(self.anchor) * np.asarray(self.focal), axis=1)
 
-    def matches(
-        self, at: Int | None = None, most: int | None = None
-    ) -> tuple[Float, Float, Float, float]:
-        """Rays (M, 3) of both frames, confidence (M,) and focal length of superpixels `at`, or all.
-
-        Of more than `most` pixels about as many are taken, evenly.
-        """
+    def matches(self, at: Int | None = None, most: int | None = None) -> Matches:
+        """Pixels of superpixels `at`, or of all; evenly about `most` of them if there are more."""
         ray, target, weight = (
             v if at is None else v[at] for v in (self.ray, self.target, self.weight)
         )
         step = max(1, weight.size // most) if most else 1
         r, q = (v.reshape(-1, 3)[::step] for v in (ray, target))
-        return r, q, weight.ravel()[::step], self.focal[0]
+        return Matches(r, q, weight.ravel()[::step], self.focal[0])
 
     def subset(self, at: Int) -> Views:
         """The views of superpixels `at`."""
@@ -194,6 +189,12 @@ class FlowFit(NamedTuple):
         """(N, 3) rays of the next frame to which the anchors move."""
         moved = self.fit[:, 0] / self.views.focal
         return np.concatenate([moved, np.ones((len(moved), 1))], axis=1)
+
+    def anchor_matches(self, at: Int) -> Matches:
+        """Correspondences of the anchors of superpixels `at`, all with the same weight."""
+        return Matches(
+            self.views.anchor[at], self.centre[at], np.ones(len(at)), self.views.focal[0]
+        )
 
     @property
     def displacement(self) -> Float:

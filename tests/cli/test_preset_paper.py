@@ -23,7 +23,8 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.start.homographies import Matches, fit_homography, in_front, plane_of
+from soup_nlp.start.epipolar import Matches
+from soup_nlp.start.homographies import fit_homography, in_front, plane_of
 
 PAPER = {
     # Sec. 4.4.1: "1,000-2,000 superpixels" by SLIC
@@ -170,7 +171,7 @@ def test_a_homography_has_its_own_motion_among_its_decompositions():
     grid = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 5), np.linspace(0, 0.2, 5)), axis=-1)
     ray = np.column_stack([grid.reshape(-1, 2), np.ones(25)])
     target = ray @ R.T + (ray @ m)[:, None] * t
-    matched = Matches(ray, target / target[:, 2:], np.ones(25))
+    matched = Matches(ray, target / target[:, 2:], np.ones(25), 1.0)
     H = fit_homography(matched)
     patches = in_front(H, ray)
     assert 1 <= len(patches) <= 2
@@ -180,7 +181,7 @@ def test_a_homography_has_its_own_motion_among_its_decompositions():
     assert min(off) < 1e-3
     assert np.allclose(best.m, m, atol=1e-3)
     assert np.allclose(plane_of(best.motion, matched), m, atol=1e-3)
-    assert fit_homography(Matches(ray[:5], target[:5], np.ones(5))) is None
+    assert fit_homography(Matches(ray[:5], target[:5], np.ones(5), 1.0)) is None
 
 
 @pytest.mark.parametrize("length", ["depth", "translation", "scales"])

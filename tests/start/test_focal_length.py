@@ -11,7 +11,7 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.geometry import rotation
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.start.epipolar import focal_length
+from soup_nlp.start.epipolar import Matches, focal_length
 
 FOCAL = 500.0
 
@@ -23,20 +23,21 @@ def correspondences(turn, shift, wrong, noise=0.05):
     X = rng.uniform(2, 6, 800)[:, None] * r @ rotation.exp(np.array(turn)).T + np.array(shift)
     q = X / X[:, 2:]
     q[:, :2] += noise / FOCAL * rng.standard_normal((800, 2))
-    return *(v / [wrong, wrong, 1.0] for v in (r, q)), np.ones(800), FOCAL * wrong
+    r, q = (v / [wrong, wrong, 1.0] for v in (r, q))
+    return Matches(r, q, np.ones(800), FOCAL * wrong)
 
 
 @pytest.mark.parametrize("wrong", [0.7, 1.25])
 def test_a_turn_with_parallax_determines_the_focal_length(wrong):
     matched = correspondences((0.05, 0.1, 0.02), (0.4, 0.1, 0.2), wrong)
-    factor, sigma = focal_length(*matched, GUESS_SIGMA)
+    factor, sigma = focal_length(matched, GUESS_SIGMA)
     assert abs(np.log(factor * wrong)) < 0.08
     assert sigma < 0.15
 
 
 def test_a_shift_without_a_turn_leaves_the_focal_length_as_it_is():
     """A longer lens and as much deeper a scene have the same flow."""
-    factor, sigma = focal_length(*correspondences((0, 0, 0), (0.4, 0, 0), 1.25), GUESS_SIGMA)
+    factor, sigma = focal_length(correspondences((0, 0, 0), (0.4, 0, 0), 1.25), GUESS_SIGMA)
     assert factor == pytest.approx(1.0, abs=0.05)
     assert sigma > 0.85 * GUESS_SIGMA
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.geometry import rotation
-from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.epipolar import Matches, Motion
 from soup_nlp.start.settle import MOST_RELIEF, cauchy, most_probable, relief
 
 FOCAL = 500.0
@@ -35,7 +35,7 @@ def relief_error(motion: Motion, r: np.ndarray, q: np.ndarray, log_z: np.ndarray
 
 def test_a_motion_that_parallax_determines_is_kept():
     r, q, _ = flow(0.3)
-    found = most_probable([TRUE], r, q, np.ones(len(r)), FOCAL, 0.05)
+    found = most_probable([TRUE], Matches(r, q, np.ones(len(r)), FOCAL), 0.05)
     np.testing.assert_allclose(found.R, TRUE.R, atol=2e-4)
     np.testing.assert_allclose(found.t, TRUE.t, atol=5e-3)
 
@@ -43,8 +43,8 @@ def test_a_motion_that_parallax_determines_is_kept():
 def test_depth_survives_little_parallax_and_biased_flow():
     """The motion of the least residual follows the bias, and distant points recede."""
     r, q, log_z = flow(0.006, bias=0.4)
-    least = most_probable([TRUE], r, q, np.ones(len(r)), FOCAL, 1e-4)
-    found = most_probable([least], r, q, np.ones(len(r)), FOCAL, 0.15)
+    least = most_probable([TRUE], Matches(r, q, np.ones(len(r)), FOCAL), 1e-4)
+    found = most_probable([least], Matches(r, q, np.ones(len(r)), FOCAL), 0.15)
     assert relief_error(found, r, q, log_z) < 0.7 * relief_error(least, r, q, log_z)
 
 

@@ -12,6 +12,7 @@ from soup_nlp.geometry.plane_fit import PlaneFit
 from soup_nlp.start import epipolar
 from soup_nlp.start.bending import constant_depth
 from soup_nlp.start.epipolar import (
+    Matches,
     Motion,
     estimate,
     fit_translation,
@@ -54,7 +55,7 @@ def perturbed(m: Motion, turn: float, tilt: float, seed: int = 1) -> Motion:
 def test_refinement_finds_the_motion_of_exact_rays(seed):
     m, r, q = rigid(200, seed)
     begin = perturbed(m, 0.009, 0.05, seed)
-    turn, tilt = off(m, refine_near(begin, r, q, np.ones(200), FOCAL, 0.1))
+    turn, tilt = off(m, refine_near(begin, Matches(r, q, np.ones(200), FOCAL), 0.1))
     assert turn < 2e-5
     assert tilt < 1e-4
 
@@ -69,7 +70,7 @@ def test_a_prior_holds_directions_that_pixels_hardly_determine(wrong, priors, we
     begin = perturbed(m, *wrong)
     prior, moved = np.repeat(priors, (3, 2)), []
     for rounds in (30, 600):
-        motion = refine_near(begin, r, q, np.full(200, weight), FOCAL, 5.0, prior, rounds)
+        motion = refine_near(begin, Matches(r, q, np.full(200, weight), FOCAL), 5.0, prior, rounds)
         moved.append(sum(off(begin, motion)) / sum(wrong))
     # the pull of the pixels is not zero, and does not add up over rounds
     assert 1e-4 < moved[1] < 0.2
@@ -88,7 +89,7 @@ def test_translations_are_weighed_in_pixels_not_in_algebraic_distances():
     many = 300
     noisy = np.tile(Y / Y[:, 2:], (many, 1, 1))
     noisy[..., :2] += rng.normal(0, 0.1 / FOCAL, (many, 60, 2))
-    t = [fit_translation(m.R, r, q, np.ones(60), FOCAL, 0.1).t for q in noisy]
+    t = [fit_translation(m.R, Matches(r, q, np.ones(60), FOCAL), 0.1).t for q in noisy]
     normal = np.cross(r @ m.R.T, noisy)
     plain = np.linalg.eigh(normal.transpose(0, 2, 1) @ normal)[1][:, :, 0]
     plain *= np.sign(plain @ m.t)[:, None]
@@ -99,7 +100,7 @@ def test_translations_are_weighed_in_pixels_not_in_algebraic_distances():
 def test_a_translation_puts_points_in_front():
     for sign in (1.0, -1.0):
         m, r, q = rigid(40, shift=sign * SHIFT)
-        assert off(m, fit_translation(m.R, r, q, np.ones(40), FOCAL, 0.1))[1] < 1e-6
+        assert off(m, fit_translation(m.R, Matches(r, q, np.ones(40), FOCAL), 0.1))[1] < 1e-6
 
 
 # --- motions of the whole image ------------------------------------------------------------------
@@ -111,7 +112,7 @@ def test_flow_without_confidence_does_not_change_a_motion():
     wrong = np.arange(200) % 2 == 0
     q = q + np.where(wrong[:, None], [0.0, 0.5 / FOCAL, 0.0], 0.0)
     weight = np.where(wrong, 1e-12, 1.0)
-    motion = epipolar.refine(perturbed(m, 0.002, 0.01), r, q, weight, FOCAL)
+    motion = epipolar.refine(perturbed(m, 0.002, 0.01), Matches(r, q, weight, FOCAL))
     turn, tilt = off(m, motion)
     assert turn < 1e-6
     assert tilt < 1e-5
@@ -124,7 +125,7 @@ def test_the_essential_matrix_that_explains_most_is_taken(monkeypatch, position)
     stack = np.concatenate(np.insert(np.stack(others), position, m.essential(), axis=0))
     monkeypatch.setattr(epipolar.cv2, "findEssentialMat", lambda *a, **k: (stack, None))
     monkeypatch.setattr(epipolar, "refine", lambda motion, *a: motion)
-    motion = estimate(r, q, np.ones(100), FOCAL)
+    motion = estimate(Matches(r, q, np.ones(100), FOCAL))
     assert motion is not None
     assert np.abs(sampson(motion.essential(), r, q, FOCAL)).max() < 1e-6
     assert max(off(m, motion)) < 1e-6
