@@ -86,6 +86,13 @@ def evaluate(
             "unknown scale rule", where="--scale", found=scale, expected=", ".join(rules)
         )
     if is_chain(folder):
+        if scale != "median" or cap is not None:
+            raise ConfigError(
+                "a chain is scored with a median scale and no cap",
+                where=folder,
+                found=f"--scale {scale}" if cap is None else f"--cap {cap:g}",
+                hint="soup-nlp evaluate DIR/pairs/000_001 scores one pair with other rules",
+            )
         truths = [read_depth(path, depth_scale) for path in depth_files(depth)]
         print("\n".join(score_lines(score(read_chain(folder)[0], truths))))
         return

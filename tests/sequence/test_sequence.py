@@ -290,6 +290,9 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
         np.save(tmp_path / "true" / f"{k}.npy", truth)
     assert main(["evaluate", str(out), "--depth", str(tmp_path / "true")]) == 0
     assert f"{told['score']['mre_one_scale']:.4f}" in capsys.readouterr().out
+    for rule in (["--scale", "lsq"], ["--cap", "70"]):
+        assert main(["evaluate", str(out), "--depth", str(tmp_path / "true"), *rule]) == 2
+        assert f"found: {' '.join(rule)}" in capsys.readouterr().err
     video = cv2.VideoCapture(str(tmp_path / "out" / "depth.mp4"))
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
     video.release()
