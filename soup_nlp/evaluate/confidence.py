@@ -289,11 +289,13 @@ def confidence(
     bends = start.bends[rec.labels]
     most = np.where(bends, BENDING_MISFIT, MOST_MISFIT)
     noise, misfit = start.noise, flow_misfit(rec, pair.flow, most)
-    flow_evidence = evidence(rec.soup, data, start.component, noise, pair.focal_sigma)
+    rigid = ~start.bends & (start.tie != FIXED) & (not start.at_rest)
+    by_pair = start.component, noise, pair.focal_sigma, rigid
+    flow_evidence = evidence(rec.soup, data, *by_pair)
     far = displacement(rec.soup, data.anchor_ray, start.component)
     scale = scale_by_contact(with_flow, start, sizes, far, given_depth)
-    rigid = np.hypot(scale, flow_evidence.sigma)
-    added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), rigid)
+    by_motion = np.hypot(scale, flow_evidence.sigma)
+    added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), by_motion)
     guess = flow_evidence.guess[start.component] | start.at_rest | (start.tie == FIXED)
     added = np.hypot(added, np.where(guess, GUESSED, 0.0))
     before = np.full(len(added), SIGMA_PRIOR)

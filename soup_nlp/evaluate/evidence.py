@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.evaluate.camera import KINDS, camera_errors, corrected
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.camera import project
+from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.start.bending import fit_robustly, turned
+from soup_nlp.start.bending import TURN_SIZE, fit_robustly, turned
 from soup_nlp.start.settle import RELIEF
 
 LEAST_GAP_PX, LEAST_GAP = 0.5, 3.0
@@ -30,6 +31,10 @@ CLIP_PX = 3.0
 """Limit of a superpixel's error where explanations are compared, pixels."""
 FEWEST = 3
 """Least number of superpixels with flow of a component whose depth can be known."""
+SMALL = 1e-4
+"""Error of the camera by which derivatives are computed."""
+PIXELS = 3000
+"""Largest number of pixels whose flow shows errors of the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +42,13 @@ class Evidence:
     """Evidence of the flow for the depth of C components; errors are in pixels.
 
     Attributes:
-        turn: (C,) mean error of the best rotation alone, the focal length free.
+        turn: (C,) mean error of the best rotation alone, with what `turned` leaves free.
         constant: (C,) mean error of the best rigid motion of a component at a constant depth.
         solution: (C,) mean error of the answer.
         noise: Noise of the flow, pixels.
-        sigma: (N,) standard deviation of log depth by the systematic error of the flow.
+        sigma: (N,) standard deviation of log depth by the systematic error of the flow and by
+            errors of the camera.
+        camera: Error of the given camera that the flow shows, one of `KINDS`, or None.
     """
 
     turn: Float
@@ -49,6 +56,7 @@ class Evidence:
     solution: Float
     noise: float
     sigma: Float
+    camera: str | None = None
 
     @property
     def gap(self) -> Float:
@@ -79,7 +87,12 @@ def _finite_or_none(value: float) -> float | None:
 
 
 def evidence(
-    soup: Soup, data: EnergyData, component: Int, noise: float, focal_sigma: float = 0.0
+    soup: Soup,
+    data: EnergyData,
+    component: Int,
+    noise: float,
+    focal_sigma: float = 0.0,
+    rigid: Mask | None = None,
 ) -> Evidence:
     """Evidence of the flow for the depth of every component.
 
@@ -89,6 +102,8 @@ def evidence(
         component: (N,) rigid component of every superpixel.
         noise: Noise of the flow, pixels.
         focal_sigma: Standard deviation of the log focal length, 0 where it is given.
+        rigid: (N,) True where the flow is that of a moving camera and may show its errors; None
+            where none is sought.
     """
     valid = data.pixel_weight.sum(axis=1) > 0.25
     moved = soup.moved(soup.points(data.pixel_ray))
@@ -96,16 +111,30 @@ def evidence(
     count = int(component.max()) + 1
     errors = np.full((3, count), np.nan)
     sigma = np.full(len(soup), np.inf)
+    camera, wrong = np.zeros(len(KINDS)), None
+    if rigid is not None and (rigid & valid).any():
+        main = np.argmax(np.bincount(component[rigid & valid]))
+        camera, wrong = _camera(data, rigid & valid & (component == main))
+    # where the focal length is a guess its deviation is known
+    camera[0] = focal_sigma or camera[0]
     for c in range(count):
         at = np.flatnonzero((component == c) & valid)
         if len(at) < FEWEST:
             continue
         errors[:, c] = *_without_depth(data, at), _mean(misfit[at])
         members = np.flatnonzero(component == c)
-        sigma[members] = _open_motion(
-            soup, data, members, valid[members], OPEN * noise, focal_sigma
-        )
-    return Evidence(errors[0], errors[1], errors[2], noise, sigma)
+        sigma[members] = _open_motion(soup, data, members, valid[members], OPEN * noise, camera)
+    return Evidence(errors[0], errors[1], errors[2], noise, sigma, wrong)
+
+
+def _camera(data: EnergyData, at: Mask) -> tuple[Float, str | None]:
+    """Errors of the camera by the flow of superpixels, see `camera_errors`."""
+    ray, pixel = data.pixel_ray[at].reshape(-1, 3), data.pixel_target[at].reshape(-1, 2)
+    weight = data.pixel_weight[at].ravel()
+    use = np.flatnonzero((weight > 0) & np.isfinite(pixel).all(axis=1))
+    use = use[:: max(1, len(use) // PIXELS)]
+    target = rays(data.K_next, pixel[use])
+    return camera_errors(ray[use], target, weight[use] / weight.max(), data.K_next[0, 0])
 
 
 def _error(pixel: Float, data: EnergyData, at: Int | slice = slice(None)) -> Float:
@@ -138,18 +167,18 @@ def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float
         moved = model(fit_robustly(miss, size), data.pixel_ray[at])
         return _mean(_error(project(data.K_next, moved), data, at))
 
-    return error(turned, 4), error(shifted, 6)
+    return error(turned, TURN_SIZE), error(shifted, 6)
 
 
 def _open_motion(
-    soup: Soup, data: EnergyData, at: Int, valid: Mask, error: float, focal_sigma: float
+    soup: Soup, data: EnergyData, at: Int, valid: Mask, error: float, camera: Float
 ) -> Float:
     """(K,) standard deviation of log depth by a motion undetermined within a systematic error.
 
     A change of the component's motion moves a superpixel along its epipolar line, which its depth
     follows, and across it, which the flow contradicts. The information on the motion is that of
-    one measurement with the error of the flow, and of relief with the deviation `RELIEF`. The focal
-    length is not part of the answer: its whole deviation counts, and the motion follows it.
+    one measurement with the error of the flow, and of relief with the deviation `RELIEF`. Errors of
+    the camera are not part of the answer: they count wholly, and the motion follows them.
 
     Args:
         soup: The answer.
@@ -157,7 +186,7 @@ def _open_motion(
         at: (K,) superpixels of the component.
         valid: (K,) True where the superpixel's flow is known.
         error: Systematic error of the flow, pixels.
-        focal_sigma: Standard deviation of the log focal length.
+        camera: (K,) errors of the camera, in the order of `KINDS`.
     """
     ray, focal = data.anchor_ray[at], np.diag(data.K_next)[:2]
     z = soup.depth_at(data.anchor_ray)[at]
@@ -168,11 +197,14 @@ def _open_motion(
     slope[:, 0, 0], slope[:, 1, 1] = focal[0] / depth, focal[1] / depth
     slope[:, :, 2] = -focal * X[:, :2] / depth[:, None] ** 2
     length = max(float(np.median(np.linalg.norm(soup.translation[at], axis=1))), 1e-12)
-    # with a longer focal length the ray of a pixel is closer to the axis, and a ray's pixel farther
-    flat = z[:, None] * ray * [1.0, 1.0, 0.0]
-    longer = focal * X[:, :2] / depth[:, None]
-    longer -= np.einsum("nij,njk,nk->ni", slope, soup.R[at], flat)
-    J = np.concatenate([-slope @ rotation.hat(X), slope * length, longer[..., None]], axis=2)
+    # places of the answer's points that a small error of the camera changes, per unit of it
+    place = X / depth[:, None]
+    columns = [-slope @ rotation.hat(X), slope * length]
+    for kind in KINDS:
+        first, second = corrected(kind, SMALL, ray, place)
+        shift = np.einsum("nij,njk,nk->ni", slope, soup.R[at], z[:, None] * (first - ray))
+        columns.append(((shift - focal * (second - place)[:, :2]) / SMALL)[..., None])
+    J = np.concatenate(columns, axis=2)
     along = np.einsum("nij,nj->ni", slope, turned)
     # squared image motion by log depth, at least that at which one deviation of relief is visible
     squared = np.sum(along**2, axis=1) + (error / RELIEF) ** 2
@@ -189,5 +221,5 @@ def _open_motion(
         return np.full(len(at), np.inf)
     covariance = np.linalg.pinv(information[:6, :6], rcond=1e-12, hermitian=True)
     motion = np.einsum("ni,ij,nj->n", follow[:, :6], covariance, follow[:, :6])
-    by_focal = focal_sigma * (follow[:, 6] - follow[:, :6] @ (covariance @ information[:6, 6]))
-    return np.sqrt(np.maximum(motion, 0.0) + error**2 / squared + by_focal**2)
+    by_camera = camera * (follow[:, 6:] - follow[:, :6] @ (covariance @ information[:6, 6:]))
+    return np.sqrt(np.maximum(motion, 0.0) + error**2 / squared + np.sum(by_camera**2, axis=1))

@@ -40,6 +40,10 @@ FAST = 0.05
 """Median length of the flow, relative to the image's width, above which motion is fast."""
 UNSURE_FOCAL = 0.2
 """Standard deviation of the log focal length above which it is called a guess."""
+SAME_PX = 0.1
+"""Median length of the flow, pixels, below which the frames count as the same."""
+MATCHED = 0.2
+"""Share of usable flow below which the frames may show two scenes."""
 LISTED = 5
 """Number of moving components that are listed."""
 WAYS = (("to the right", "to the left"), ("down", "up"), ("ahead", "back"))
@@ -147,7 +151,11 @@ def flow_words(run: Run) -> list[str]:
 
 
 def hints(
-    uv: AnyFloat, confidence: AnyFloat, shares: Mapping[str, float], focal_sigma: float = 0.0
+    uv: AnyFloat,
+    confidence: AnyFloat,
+    shares: Mapping[str, float],
+    focal_sigma: float = 0.0,
+    camera: str | None = None,
 ) -> list[str]:
     """What would give a better depth.
 
@@ -156,16 +164,25 @@ def hints(
         confidence: (H, W) of the flow; 0 is unusable.
         shares: Those of `certainty`.
         focal_sigma: Standard deviation of the log focal length; 0 where it is given.
+        camera: Error of the given camera that the flow shows, one of `evaluate.camera.KINDS`.
     """
     usable, out = confidence > 0, []
-    if usable.mean() < USABLE:
-        length = np.linalg.norm(uv, axis=-1)[usable]
-        fast = len(length) and np.median(length) > FAST * uv.shape[1]
+    length = float(np.median(np.linalg.norm(uv, axis=-1)[usable])) if usable.any() else 0.0
+    if usable.mean() < MATCHED and shares["guess"] > 0.5:
+        out.append("two frames of the same scene, closer in time: hardly anything is in both")
+    elif usable.mean() < USABLE:
+        fast = length > FAST * uv.shape[1]
         out.append("frames closer in time" if fast else "a better flow (--flow)")
-    if shares["rest"] > 0.5:
-        out.append("frames between which the camera moves aside, not only turns")
+    elif length < SAME_PX and shares["guess"] > 0.5:
+        out.append("frames farther apart in time: these two are nearly the same")
+    if shares["rest"] > 0.5 or shares["flat"] > 0.5:
+        out.append("frames between which the camera moves aside, not only turns or zooms")
     elif shares["flat"] >= SHARE:
         out.append("frames farther apart in time")
+    if camera is not None:
+        out.append(
+            f"undistorted images and exact intrinsics: the flow suggests an error of {camera}"
+        )
     if focal_sigma > UNSURE_FOCAL and shares["weak"] >= SHARE:
         out.append("the focal length of the camera (--fov or --intrinsics)")
     if shares["scale"] >= SHARE:
@@ -186,7 +203,9 @@ def limits(result: Result) -> list[str]:
         share = float(result.bends[result.labels].mean())
         lines.append(f"{share:.0%} of the image bends: its relief is weakly determined.")
     if uv is not None:
-        lines += [f"Try {text}." for text in hints(uv, result.flow_confidence, shares, focal)]
+        by_camera = focal, s.get("camera_error")
+        told = hints(uv, result.flow_confidence, shares, *by_camera)
+        lines += [f"Try {text}." for text in told]
     return lines or ["Nothing stands out: flow, parallax and convergence are good."]
 
 
@@ -269,6 +288,7 @@ def summary(run: Run) -> dict[str, Any]:
         "versions": versions(),
         "seed": run.problem.seed,
         "focal_sigma": run.pair.focal_sigma,
+        "camera_error": run.confidence.evidence.camera,
     }
 
 

@@ -51,7 +51,8 @@ def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
 
     The rotation does if the main rigid motion, with depths, lowers the error by no more than the
     systematic error of the flow in the median, which movers assigned to that motion do not change.
-    The focal length is free in the fit, because a wrong one leaves a residual that depths explain.
+    The focal lengths and a shift of the next image are free in the fit, because wrong ones leave a
+    residual that depths explain.
     """
     at = np.flatnonzero(flow.views.usable & (choice.label == 0))
     if not len(at):
@@ -61,10 +62,19 @@ def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
     return None if gain > systematic_error(reference_noise(flow.residual)) else turn
 
 
+TURN_SIZE = 7
+"""Number of parameters of `turned`."""
+
+
 def turned(x: Float, ray: Float) -> Float:
-    """Rays (..., 3) turned by the rotation vector x[:3], with the focal length times exp(x[3])."""
-    longer = np.array([1.0, 1.0, np.exp(x[3])])
-    return (ray / longer) @ rotation.exp(x[:3]).T * longer
+    """Rays (..., 3) turned by the rotation vector x[:3], with the focal lengths times exp(-x[3:5]).
+
+    The next image is shifted by x[5:7], as by stabilisation or another principal point.
+    """
+    first, second = (np.array([f, f, 1.0]) for f in np.exp(x[3:5]))
+    moved = (ray * first) @ rotation.exp(x[:3]).T / second
+    moved[..., :2] += x[5:7] * moved[..., 2:]
+    return np.asarray(moved)
 
 
 def fit_robustly(miss: Callable[[Float], Float], size: int) -> Float:
@@ -76,7 +86,7 @@ def fit_robustly(miss: Callable[[Float], Float], size: int) -> Float:
 
 
 def fit_turn(views: Views) -> tuple[Float, Float]:
-    """Rotation that explains a flow best, focal length free, and (N,) its mean error, pixels."""
+    """Rotation that explains a flow best (`turned`), and (N,) its mean error, pixels."""
     ray, target, weight, _ = views.matches(most=FIT_PIXELS)
 
     def miss(x: Float) -> Float:
@@ -84,7 +94,7 @@ def fit_turn(views: Views) -> tuple[Float, Float]:
         off = moved[..., :2] / moved[..., 2:] - target[..., :2]
         return np.sqrt(weight)[:, None] * off * np.asarray(views.focal)
 
-    x = fit_robustly(miss, 4)
+    x = fit_robustly(miss, TURN_SIZE)
     return rotation.exp(x[:3]), views.distance(turned(x, views.ray))
 
 

@@ -280,7 +280,7 @@ def test_the_background_of_a_camera_at_rest_is_a_guess(small_room):
     assert sure_of(small_room).guessed < 0.2
 
 
-def test_a_focal_length_that_was_guessed_wrong_makes_depth_unsure():
+def test_a_focal_length_that_was_guessed_or_given_wrong_makes_depth_unsure():
     scene = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
     raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 100}}
     problem = make_problem(raw)
@@ -298,7 +298,8 @@ def test_a_focal_length_that_was_guessed_wrong_makes_depth_unsure():
         sigma = sure_of(replace(case, pair=replace(case.pair, focal_sigma=focal_sigma))).sigma
         return np.mean(error < 2 * sigma)
 
-    assert within_two(0.0) < 0.5
+    # the flow shows the error of a given one
+    assert within_two(0.0) > 0.8
     assert within_two(GUESS_SIGMA) > 0.88
 
 

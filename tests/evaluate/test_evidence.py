@@ -68,6 +68,17 @@ def test_a_turn_is_no_evidence_with_a_wrong_focal_length(small_room):
     assert result.guess[0]
 
 
+def test_a_turn_of_a_stabilised_camera_is_no_evidence(small_room):
+    soup, data = scene(small_room, 0.4, (0.0, 0.0, 0.0), turn=0.1)
+    # stabilisation moves the next image back, and crops it
+    target = 1.03 * data.pixel_target - 0.08 * data.K_next[0, 0]
+    result = evidence(
+        soup, replace(data, pixel_target=target), np.zeros(len(soup), np.int64), NOISE
+    )
+    assert result.constant[0] > result.turn[0] + 0.2
+    assert result.turn[0] < 0.02
+
+
 def test_less_parallax_leaves_more_open(small_room):
     near, far = (np.median(evidence_of(small_room, 0.3, (x, 0.0, 0.0)).sigma) for x in (0.3, 0.06))
     assert far > 3 * near
