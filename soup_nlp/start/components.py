@@ -11,6 +11,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation, connected
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.views import FlowFit
 
 
 def connected_pieces(mask: Mask, seg: Segmentation, hold: Mask | bool = True) -> Int:
@@ -140,15 +141,7 @@ def outlines(label: Int, seg: Segmentation) -> Outlines:
     return Outlines(component, other, neighbour, contact, below, contact * low**2, top)
 
 
-def contact_scales(
-    soup: Soup,
-    label: Int,
-    seg: Segmentation,
-    K_ref: Float,
-    upright: bool = True,
-    fixed: Mask | None = None,
-    usable: Mask | None = None,
-) -> tuple[Float, Int]:
+def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[Float, Int]:
     """Relative scale of every component, such that components touch their surroundings.
 
     In an upright image a component stands on its lower neighbours. Its scale is then the quantile
@@ -164,17 +157,15 @@ def contact_scales(
     No component stands on one that is fixed in the image.
 
     Args:
+        flow: The flow of every superpixel.
         soup: Planes, every motion in its own scale.
         label: (N,) index of the component.
-        seg: Superpixels and graphs.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        upright: Whether the image is upright.
         fixed: (N,) True in components that are fixed in the image.
-        usable: (N,) True where the flow is known; everywhere without it.
 
     Returns:
         (N,) scale of every superpixel's component, and (N,) its origin, an index of `TIES`.
     """
+    seg, upright = flow.seg, flow.options.upright
     count = int(label.max()) + 1
     log_scale = np.zeros(count)
     scene = largest(label)
@@ -182,11 +173,10 @@ def contact_scales(
     tie[scene] = TIES.index("reference")
     if count == 1 or not len(seg.pairs):
         return np.ones(len(soup)), tie[label]
-    zi, zk = depth_from_inside(soup, label, seg, K_ref)
+    zi, zk = depth_from_inside(soup, label, seg, flow.K_ref)
     ratio = np.log(np.concatenate([zk / zi, zi / zk]))
     at_camera = np.zeros(count, bool)
-    if fixed is not None:
-        at_camera[label[fixed]] = True
+    at_camera[label[fixed]] = True
     around = outlines(label, seg)
     keep = ~at_camera[around.other]
     a, b, contact, weight = (
@@ -218,11 +208,10 @@ def contact_scales(
             log_scale[c] = quantile(value[mine], contact[mine], OUTLINE)
             tie[c] = TIES.index("outline")
         placed[c] = True
-    moved = displacement(soup, rays(K_ref, seg.anchors), label)
+    moved = displacement(soup, flow.views.anchor, label)
     if upright:
-        usable = np.ones(len(soup), bool) if usable is None else usable
         far = moved * np.exp(log_scale)[label]
-        nearer = nearer_where_cut_off(far, label, seg, at_camera, usable)
+        nearer = nearer_where_cut_off(far, label, seg, at_camera, flow.views.usable)
         log_scale -= nearer
         tie[nearer > 0] = TIES.index("cut off below")
     stays = at_camera | (tie == TIES.index("cut off below"))

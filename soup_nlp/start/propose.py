@@ -158,8 +158,7 @@ def propose(flow: FlowFit) -> Start:
             # each connected region of the mask is a component
             regions = component.max() + 1 + connected_pieces(mask, seg)
             component = numbered(np.where(mask, regions, component))
-    usable = flow.views.usable
-    scale, tie = contact_scales(soup, component, seg, flow.K_ref, o.upright, fixed, usable)
+    scale, tie = contact_scales(flow, soup, component, fixed)
     soup = replace(soup, lam=soup.lam * scale)
     grounded = np.zeros(len(seg), bool)
     if o.upright and o.ground:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers_model import flow_of
 from helpers_truth import majority
 
 from soup_nlp.cli.main import main
@@ -32,7 +33,7 @@ from soup_nlp.start.bending import (
 from soup_nlp.start.choice import LEAST_NOISE, dominant, rigid_choice
 from soup_nlp.start.merge import gather
 from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import FlowFit, Views
+from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow
 
@@ -346,16 +347,6 @@ def strip(count: int) -> Segmentation:
     v, u = np.mgrid[0:16, 0 : 8 * count]
     labels = (v // 8 * count + u // 8).astype(np.int32)
     return build_segmentation(labels, np.zeros((*labels.shape, 3), np.uint8), neighbours=2)
-
-
-def flow_of(seg: Segmentation, jump: np.ndarray, usable: np.ndarray | None = None) -> FlowFit:
-    """The flow of superpixels, `usable` (N,) ones, that jumps by (P,) pixels."""
-    n = len(seg)
-    weight = np.ones((n, 1)) if usable is None else usable[:, None].astype(float)
-    ray = np.ones((n, 1, 3))
-    views = Views(ray, ray, weight, ray[:, 0], np.ones(n), (1.0, 1.0))
-    K, none = np.eye(3), np.zeros(n)
-    return FlowFit(seg, K, K, SEEDED, views, none > 0, np.zeros((n, 3, 2)), none, jump)
 
 
 def jumps(seg: Segmentation, column: float, size: np.ndarray, noise: float) -> np.ndarray:

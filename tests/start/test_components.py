@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_model import flow_of
 from helpers_truth import cropped
 
 from soup_nlp.config.problem import make_problem
@@ -145,7 +146,9 @@ def scales(z, component, far=0.01, **options):
     facing, still = np.tile([0, 0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
     moved = np.where(np.ravel(component), far, 1.0)[:, None] * [n, 0.0, 0.0]
     soup = Soup(np.full(n, 1 / n), facing, n * np.ravel(z), still, moved)
-    scale_found, _ = contact_scales(soup, np.ravel(component).astype(np.int64), seg, K, **options)
+    flow = flow_of(seg, K=K, **options)
+    none = np.zeros(n, bool)
+    scale_found, _ = contact_scales(flow, soup, np.ravel(component).astype(np.int64), none)
     return scale_found.reshape(rows, columns)
 
 

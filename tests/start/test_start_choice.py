@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from helpers_model import motion, plane_pose, plane_world
+from helpers_model import flow_of, motion, plane_pose, plane_world
 
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
@@ -84,18 +84,16 @@ class Turns:
         return self.weight.mean(axis=1) > USABLE
 
 
-def flow_of(
+def flow_of_turns(
     views: Turns,
     seg: Segmentation,
     jump: np.ndarray | float = 0.0,
     shift: np.ndarray | float = 0.0,
 ) -> FlowFit:
-    """The flow of superpixels whose anchors move by pixels (N, 2) and jump by (P,)."""
+    """The flow of superpixels that turn, whose anchors move by pixels (N, 2) and jump by (P,)."""
     fit = np.zeros((len(seg), 3, 2))
     fit[:, 0] = shift
-    none = np.zeros(len(seg))
-    jump = np.broadcast_to(jump, len(seg.pairs))
-    return FlowFit(seg, K, K, OPTIONS, views, none > 0, fit, none, jump)
+    return flow_of(seg, jump)._replace(views=views, fit=fit)
 
 
 def turn(angle: float | np.ndarray) -> np.ndarray:
@@ -119,7 +117,7 @@ def test_a_small_motion_counts_where_the_flow_is_exact(error, kept):
     block = seg.anchors[:, 0] > 48
     views = Turns(np.where(block, 0.1 / PER_RADIAN, 0.0))
     angle = np.where(block, 0.1 + error, error) / PER_RADIAN
-    choice, _ = gathering.earned(flow_of(views, seg), taken(views, angle))
+    choice, _ = gathering.earned(flow_of_turns(views, seg), taken(views, angle))
     np.testing.assert_array_equal(choice.label, block.astype(int) * kept)
 
 
@@ -144,7 +142,7 @@ def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, truste
     )
     cost = np.where(odd, 3.0, 0.0)[:, None]
     main = [Motion(np.eye(3), np.array([1.0, 0, 0]))]
-    assert bool(of_pieces(flow_of(views, seg), main, cost, 0.05)) == trusted
+    assert bool(of_pieces(flow_of_turns(views, seg), main, cost, 0.05)) == trusted
 
 
 # --- components ----------------------------------------------------------------------------------
@@ -176,7 +174,7 @@ def test_a_contradicted_motion_is_not_the_components(monkeypatch, enough):
     before = taken(views, true)
     offered(monkeypatch, 0.2)
     jump = np.where(across(seg, component), 10.0, 0.0)
-    after = gathering.gather(flow_of(views, seg, jump), before)
+    after = gathering.gather(flow_of_turns(views, seg, jump), before)
     assert (after.label[~component] == 0).all()
     if enough:
         assert (after.label[agree] > 0).all()
@@ -200,7 +198,7 @@ def test_components_with_a_gap_in_their_discontinuity_are_parted_there(monkeypat
     between = 0.5 * (least + most) * OPTIONS.discontinuity_px
     jump = np.where(across(seg, component), between, 0.0)
     jump[across(seg, component > 0)] = 10.0
-    after = gathering.gather(flow_of(views, seg, jump), before)
+    after = gathering.gather(flow_of_turns(views, seg, jump), before)
     for b in (1, 2):
         assert len(np.unique(after.label[component == b])) == 1
         assert after.error[component == b].max() < 1e-9
@@ -221,7 +219,7 @@ def test_one_of_a_component_goes_with_its_neighbours():
     label[odd] = 0
     before = taken(views, np.where(label == 1, 0.2, 0.0))
     jump = np.where(across(seg, right), 10.0, 0.0)
-    after = gathering.gather(flow_of(views, seg, jump), before)
+    after = gathering.gather(flow_of_turns(views, seg, jump), before)
     np.testing.assert_array_equal(after.label, right)
 
 
@@ -233,12 +231,12 @@ def test_the_main_motion_wins_between_equal_ones():
     views = Turns(np.where(right, middle, 0.0))
     before = taken(views, np.where(right, 0.2, 0.0))
     jump = np.full(len(seg.pairs), 10.0)
-    after = gathering.gather(flow_of(views, seg, jump), before)
+    after = gathering.gather(flow_of_turns(views, seg, jump), before)
     assert (after.label == 0).all()
     # where it is clearly better it stays
     views = Turns(np.where(right, 0.12, 0.0))
     before = taken(views, np.where(right, 0.2, 0.0))
-    after = gathering.gather(flow_of(views, seg, jump), before)
+    after = gathering.gather(flow_of_turns(views, seg, jump), before)
     np.testing.assert_array_equal(after.label, right)
 
 
@@ -287,7 +285,8 @@ def test_the_lowest_part_of_a_component_places_it():
     ground = [2.0, 2, 1.2, 1.2, 1.2, 2, 2]
     z = np.array([[9.0] * 7, [9, 1, 1, 1, 1, 1, 9], gap, ground, ground])
     component = z == 1
-    scale, tie = contact_scales(facing(z.ravel()), component.ravel().astype(int), cells(5, 7), K)
+    flow, none = flow_of(cells(5, 7), K=K), np.zeros(z.size, bool)
+    scale, tie = contact_scales(flow, facing(z.ravel()), component.ravel().astype(int), none)
     np.testing.assert_allclose(scale.reshape(z.shape), np.where(component, 2.0, 1.0), rtol=1e-12)
     named = np.array(TIES)[tie].reshape(z.shape)
     assert (named == np.where(component, "contact below", "reference")).all()
@@ -340,7 +339,7 @@ def test_only_a_piece_with_usable_flow_moves():
     weight = np.where(np.isin(component, (0, 1)), 1.0, 0.2)
     weight[[22, 23]] = 0.2
     views = Turns(np.zeros(32), np.repeat(weight[:, None], 4, axis=1))
-    part = proposing.moving_parts(flow_of(views, seg), component, component == 4)
+    part = proposing.moving_parts(flow_of_turns(views, seg), component, component == 4)
     expected = np.where(np.isin(np.arange(32), (16, 17, 22, 23)), 0, component)
     np.testing.assert_array_equal(part, expected)
 
@@ -364,7 +363,7 @@ def test_a_mixture_of_two_flows_does_not_move(shift, own_error, size, mixed):
     choice = taken(views, np.where(piece, 0.1 - own_error / PER_RADIAN, 0.0))
     flow = np.zeros((len(seg), 2))
     flow[:, 0] = np.where(piece, shift, np.where(row < 8, 0.0, 4.0))
-    still = gathering.unmoved(flow_of(views, seg, shift=flow), choice, piece.astype(int))
+    still = gathering.unmoved(flow_of_turns(views, seg, shift=flow), choice, piece.astype(int))
     np.testing.assert_array_equal(still, piece & mixed)
 
 
@@ -377,7 +376,7 @@ def test_a_motion_that_explains_little_more_is_dropped(gain, moves):
     views = Turns(np.where(piece, gain / PER_RADIAN, 0.0))
     choice = taken(views, np.where(piece, gain / PER_RADIAN, 0.0))
     flow = np.where(piece, 9.0, 0.0)[:, None] * [1.0, 0.0]
-    still = gathering.unmoved(flow_of(views, seg, shift=flow), choice, piece.astype(int))
+    still = gathering.unmoved(flow_of_turns(views, seg, shift=flow), choice, piece.astype(int))
     np.testing.assert_array_equal(still, piece & (not moves))
 
 
