@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from soup_nlp.arrays import Float
-from soup_nlp.start.epipolar import FOCAL_NOISE_PX, essential_motion, refine_near, sampson
+from soup_nlp.start.epipolar import FOCAL_NOISE_PX, Matches, essential_motion, refine_near
 
 KINDS = {
     "focal length": 0.3,
@@ -59,7 +59,7 @@ def camera_errors(r: Float, q: Float, weight: Float, focal: float) -> tuple[Floa
         (K,) sizes, in the order of `KINDS`, and the kind, None where the camera is believed.
     """
     size, best, most = np.zeros(len(KINDS)), None, 1.0
-    motion = essential_motion(r, q, focal, None)
+    motion = essential_motion(Matches(r, q, weight, focal), None)
     if motion is None:
         return size, best
     for k, (kind, sigma) in enumerate(KINDS.items()):
@@ -68,8 +68,9 @@ def camera_errors(r: Float, q: Float, weight: Float, focal: float) -> tuple[Floa
             a, b = corrected(kind, step * sigma, r, q)
             # the error in pixels of the corrected camera
             longer = focal * np.exp(step * sigma * (kind == "focal length"))
-            near = refine_near(motion, a, b, weight, longer, FOCAL_NOISE_PX)
-            error[j] = np.median(np.abs(sampson(near.essential(), a, b, longer)))
+            matches = Matches(a, b, weight, longer)
+            near = refine_near(motion, matches, FOCAL_NOISE_PX)
+            error[j] = np.median(np.abs(matches.distance(near)))
         rise = (error - error.min()) / max(RISE * error.min(), LEAST_RISE_PX)
         given = rise[len(STEPS) // 2]
         if given > 1.0:
