@@ -63,6 +63,8 @@ def list_(
         print(f"{printable(name):<14} {_first_line(path)}")
     if folder is None:
         print("\nsoup-nlp solve NAME; templates take --set input.root=DIR, folder input.path=DIR")
+    elif not files:
+        print(f"no problem files (*.yaml) in {printable(str(folder))}")
 
 
 def _first_line(path: Path) -> str:
