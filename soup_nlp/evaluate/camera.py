@@ -42,7 +42,7 @@ def corrected(kind: str, x: float, ref: Float, following: Float) -> tuple[Float,
     return np.pad(a, pad, constant_values=1.0), np.pad(b, pad, constant_values=1.0)
 
 
-def camera_errors(r: Float, q: Float, weight: Float, focal: float) -> tuple[Float, str | None]:
+def camera_errors(matches: Matches) -> tuple[Float, str | None]:
     """Size of every error of the camera by itself, and the kind that explains the flow best.
 
     With e(x) the median Sampson distance of the best motion if an error is x, its size is the mean
@@ -50,27 +50,24 @@ def camera_errors(r: Float, q: Float, weight: Float, focal: float) -> tuple[Floa
     no x lowers the median error by `RISE` of the least one: the given camera is believed.
 
     Args:
-        r: (M, 3) reference rays with the given camera.
-        q: (M, 3) next rays.
-        weight: (M,) confidence.
-        focal: The focal length, pixels.
+        matches: Correspondences with the given camera.
 
     Returns:
         (K,) sizes, in the order of `KINDS`, and the kind, None where the camera is believed.
     """
     size, best, most = np.zeros(len(KINDS)), None, 1.0
-    motion = essential_motion(Matches(r, q, weight, focal), None)
+    motion = essential_motion(matches, None)
     if motion is None:
         return size, best
     for k, (kind, sigma) in enumerate(KINDS.items()):
         error = np.zeros(len(STEPS))
         for j, step in enumerate(STEPS):
-            a, b = corrected(kind, step * sigma, r, q)
+            rays = corrected(kind, step * sigma, matches.ray, matches.target)
             # the error in pixels of the corrected camera
-            longer = focal * np.exp(step * sigma * (kind == "focal length"))
-            matches = Matches(a, b, weight, longer)
-            near = refine_near(motion, matches, FOCAL_NOISE_PX)
-            error[j] = np.median(np.abs(matches.distance(near)))
+            focal = matches.focal * np.exp(step * sigma * (kind == "focal length"))
+            tried = Matches(*rays, matches.weight, focal)
+            near = refine_near(motion, tried, FOCAL_NOISE_PX)
+            error[j] = np.median(np.abs(tried.distance(near)))
         rise = (error - error.min()) / max(RISE * error.min(), LEAST_RISE_PX)
         given = rise[len(STEPS) // 2]
         if given > 1.0:

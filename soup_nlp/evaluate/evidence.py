@@ -20,6 +20,7 @@ from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.start.bending import TURN_SIZE, fit_robustly, turned
+from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.settle import RELIEF
 
 LEAST_GAP_PX, LEAST_GAP = 0.5, 3.0
@@ -134,7 +135,8 @@ def _camera(data: EnergyData, at: Mask) -> tuple[Float, str | None]:
     use = np.flatnonzero((weight > 0) & np.isfinite(pixel).all(axis=1))
     use = use[:: max(1, len(use) // PIXELS)]
     target = rays(data.K_next, pixel[use])
-    return camera_errors(ray[use], target, weight[use] / weight.max(), data.K_next[0, 0])
+    weight = weight[use] / weight.max()
+    return camera_errors(Matches(ray[use], target, weight, data.K_next[0, 0]))
 
 
 def _error(pixel: Float, data: EnergyData, at: Int | slice = slice(None)) -> Float:

@@ -13,12 +13,13 @@ from soup_nlp.evaluate.camera import KINDS, camera_errors, corrected
 from soup_nlp.geometry import rotation
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.findings import certainty, hints
+from soup_nlp.start.epipolar import Matches
 
 FOCAL = 400.0
 
 
-def matches(seed: int = 0):
-    """Rays of both frames of points with relief, seen by a camera that turns and shifts."""
+def matches(seed: int = 0) -> Matches:
+    """Correspondences of points with relief, seen by a camera that turns and shifts."""
     rng = np.random.default_rng(seed)
     place = np.column_stack([rng.uniform(-0.6, 0.6, 1500), rng.uniform(-0.4, 0.4, 1500)])
     ray = np.pad(place, [(0, 0), (0, 1)], constant_values=1.0)
@@ -26,16 +27,16 @@ def matches(seed: int = 0):
     moved = X @ rotation.exp(np.array([0.02, 0.04, 0.01])).T + [0.3, 0.05, 0.1]
     target = moved / moved[:, 2:]
     target[:, :2] += rng.normal(0.0, 0.03 / FOCAL, (1500, 2))
-    return ray, target
+    return Matches(ray, target, np.ones(len(ray)), FOCAL)
 
 
-def seen_by(kind: str, x: float, ray, target):
-    """Rays by a camera that does not know its error x, by fixed-point iteration of `corrected`."""
-    a, b = ray.copy(), target.copy()
+def seen_by(kind: str, x: float, exact: Matches) -> Matches:
+    """Correspondences by a camera that does not know its error x; inverts `corrected`."""
+    a, b = exact.ray, exact.target
     for _ in range(50):
         back = corrected(kind, x, a, b)
-        a, b = a + (ray - back[0]), b + (target - back[1])
-    return a, b
+        a, b = a + (exact.ray - back[0]), b + (exact.target - back[1])
+    return exact._replace(ray=a, target=b)
 
 
 @pytest.mark.parametrize(
@@ -49,23 +50,20 @@ def seen_by(kind: str, x: float, ray, target):
     ],
 )
 def test_the_error_of_a_camera_is_found(kind, x):
-    ray, target = seen_by(kind, x, *matches())
-    size, found = camera_errors(ray, target, np.ones(len(ray)), FOCAL)
+    size, found = camera_errors(seen_by(kind, x, matches()))
     assert found == kind
     assert size[list(KINDS).index(kind)] == pytest.approx(x, rel=0.3)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_right_camera_is_believed(seed):
-    ray, target = matches(seed)
-    size, found = camera_errors(ray, target, np.ones(len(ray)), FOCAL)
+    size, found = camera_errors(matches(seed))
     assert found is None
     np.testing.assert_array_equal(size, 0.0)
 
 
 def test_too_few_matches_show_no_error():
-    ray, target = (v[:7] for v in matches())
-    assert camera_errors(ray, target, np.ones(7), FOCAL)[1] is None
+    assert camera_errors(matches().at(slice(7)))[1] is None
 
 
 def solved(pair: Pair):
