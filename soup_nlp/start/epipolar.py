@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -145,20 +145,21 @@ def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
     The scale of the loss falls from the inlier distance to the noise, so that components that move
     otherwise drop out.
     """
-    root, scale = np.sqrt(matches.weight), max(0.1, 0.5 * threshold)
+    root, moved = np.sqrt(matches.weight), around(motion)
+    x, scale = np.zeros(5), max(0.1, 0.5 * threshold)
 
-    def residual(now: Motion) -> Float:
-        return root * matches.distance(now)
+    def residual(x: Float) -> Float:
+        return root * matches.distance(moved(x))
 
     for _ in range(REFINEMENTS):
-        _, motion = minimum(motion, residual, np.ones(5), loss="cauchy", f_scale=scale)
-        error = np.abs(residual(motion))
+        x = least_squares(residual, x, loss="cauchy", f_scale=scale, max_nfev=STEPS).x
+        error = np.abs(residual(x))
         near = error[error < max(3 * scale, LEAST_NOISE)]
         noise = 1.5 * float(np.median(near)) if len(near) else scale
         if noise > 0.8 * scale:
             break
         scale = max(noise, LEAST_NOISE)
-    return motion
+    return moved(x)
 
 
 def refine_near(
@@ -206,29 +207,15 @@ def tangent(t: Float) -> Float:
     return np.asarray(np.linalg.svd(t[None])[2][1:])
 
 
-def minimum(
-    motion: Motion, residual: Callable[[Motion], Float], scale: Float, **loss: Any
-) -> tuple[float, Motion]:
-    """Least sum of squares of a function of motions near a given one, and the motion there.
-
-    The change (5,) has a rotation vector and two shifts along `tangent`.
-
-    Args:
-        motion: Where to begin.
-        residual: (K,) residuals of a motion.
-        scale: (5,) usual sizes of the change.
-        loss: Loss and scale of it, see `scipy.optimize.least_squares`; squares without it.
-    """
+def around(motion: Motion) -> Callable[[Float], Motion]:
+    """Motions near a given one by (5,) parameters: rotation vector, and shifts along `tangent`."""
     basis = tangent(motion.t)
 
     def moved(x: Float) -> Motion:
         t = motion.t + x[3:] @ basis
         return Motion(motion.R @ rotation.exp(x[:3]), t / np.linalg.norm(t))
 
-    end = least_squares(
-        lambda x: residual(moved(x)), np.zeros(5), x_scale=scale, max_nfev=STEPS, **loss
-    )
-    return float(end.cost), moved(end.x)
+    return moved
 
 
 def fit_translation(R: Float, matches: Matches, noise: float, rounds: int = 6) -> Motion:

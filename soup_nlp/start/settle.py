@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float
 from soup_nlp.start.choice import PIECE_SIZE, Choice, limited_noise
-from soup_nlp.start.epipolar import Matches, Motion, minimum, triangulate
+from soup_nlp.start.epipolar import STEPS, Matches, Motion, around, triangulate
 from soup_nlp.start.views import FlowFit
 
 SYSTEMATIC, MOST_SYSTEMATIC_PX = 1.5, 0.15
@@ -64,14 +65,18 @@ def most_probable(
         expected: (M,) log depth by a depth prior, from which relief is counted.
         spread: Standard deviation of the relief.
     """
-    root = np.sqrt(matches.weight / matches.weight.sum())
+    root, results = np.sqrt(matches.weight / matches.weight.sum()), []
 
     def residual(motion: Motion) -> Float:
         distance = cauchy(matches.distance(motion), CLIP_PX)
         depth = cauchy(relief(motion, matches.ray, matches.target, expected), spread)
         return np.concatenate([root * distance / error, root * depth / spread])
 
-    results = [minimum(motion, residual, CHANGE) for motion in motions]
+    for moved in map(around, motions):
+        end = least_squares(
+            lambda x, moved=moved: residual(moved(x)), np.zeros(5), x_scale=CHANGE, max_nfev=STEPS
+        )
+        results.append((float(end.cost), moved(end.x)))
     return min(results, key=lambda result: result[0])[1]
 
 
