@@ -67,12 +67,14 @@ TURN_SIZE = 7
 
 
 def turned(x: Float, ray: Float) -> Float:
-    """Rays (..., 3) turned by the rotation vector x[:3], with the focal lengths times exp(-x[3:5]).
+    """Rays (..., 3) turned by the rotation vector x[:3], with the focal length times exp(x[3]).
 
-    The next image is shifted by x[5:7], as by stabilisation or another principal point.
+    The next image is enlarged by exp(x[4]) and shifted by x[5:7], as by stabilisation or zoom;
+    parameters that are left out are 0.
     """
-    first, second = (np.array([f, f, 1.0]) for f in np.exp(x[3:5]))
-    moved = (ray * first) @ rotation.exp(x[:3]).T / second
+    x = np.pad(x, (0, TURN_SIZE - len(x)))
+    first, second = (np.array([1.0, 1.0, np.exp(f)]) for f in (x[3], x[3] - x[4]))
+    moved = (ray / first) @ rotation.exp(x[:3]).T * second
     moved[..., :2] += x[5:7] * moved[..., 2:]
     return np.asarray(moved)
 
