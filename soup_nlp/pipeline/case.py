@@ -108,7 +108,8 @@ def prepare(
     begun, evidence, given_depth = _begun(problem, pair, seg), None, None
     if pair.depth_prior is not None and problem.energy.weights.depth > 0:
         begun, evidence = _judged(problem, labels, begun)
-    start, seg, *_ = begun
+    start, _, flow = begun
+    seg = flow.seg
     if evidence is not None:
         start, given_depth = by_prior(*begun, evidence)
         if log:
@@ -128,8 +129,8 @@ def prepare(
     return replace(case, soup=answer.soup)
 
 
-Begun = tuple[Start, Segmentation, Pair, FlowFit]
-"""A start, its superpixels, its pair, and the flow as affine maps."""
+Begun = tuple[Start, Pair, FlowFit]
+"""A start, its pair, and the flow of its superpixels as affine maps."""
 
 
 def _segmented(problem: Problem, pair: Pair, labels: Labels) -> Segmentation:
@@ -152,7 +153,7 @@ def _begun(problem: Problem, pair: Pair, seg: Segmentation) -> Begun:
     start = propose(fitted)
     if problem.energy.weights.order > 0:
         start = in_order(start, seg, pair, fitted, fitted.options)
-    return start, seg, pair, fitted
+    return start, pair, fitted
 
 
 def _judged(problem: Problem, labels: Labels, begun: Begun) -> tuple[Begun, Evidence]:
@@ -160,7 +161,7 @@ def _judged(problem: Problem, labels: Labels, begun: Begun) -> tuple[Begun, Evid
 
     Superpixels follow a prior that is used although the flow does not confirm it.
     """
-    s, pair, few = problem.segmentation, begun[2], begun
+    s, pair, few = problem.segmentation, begun[1], begun
     if s.superpixels > PIECES:
         pieces = superpixels(problem, pair, PIECES)
         few = _begun(problem, pair, _segmented(problem, pair, pieces))
@@ -218,11 +219,11 @@ def build_energy(
     if given_depth is not None and given_depth.evidence.used:
         # the flow holds no slopes where the prior decides: E_orient does, as in bending regions
         stiffer = np.where(bends, 1.0, bending.orient / max(e.weights.orient, 1e-12))
-        values = given_depth.log_depth, given_depth.opened, given_depth.error
+        values = given_depth.log_depth, given_depth.beside, given_depth.opened, given_depth.error
         arguments = *values, start.component, prior_weight, stiffer
         data = with_prior(data, start.soup, *arguments, creased=not given_depth.evidence.confirmed)
         # a given depth may have steps inside a component too
-        parts = np.arange(len(seg))
+        parts = np.where(given_depth.opened > 0.5, len(seg) + np.arange(len(seg)), start.component)
     data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)
     if whole:
         pieces = start.surface * (int(start.component.max()) + 1) + start.component

@@ -10,27 +10,26 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.choice import CLIP, PIECE_SIZE
+from soup_nlp.start.choice import PIECE_SIZE
 from soup_nlp.start.components import FIXED, TIES, largest
-from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.prior_evidence import FEWEST, LEAST_SIGMA, Evidence, Seen, without_gaps
 from soup_nlp.start.propose import Start
-from soup_nlp.start.settle import MOST_SYSTEMATIC_PX, SYSTEMATIC, most_probable
-from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
+from soup_nlp.start.views import FlowFit
 
 STANDS = {"contact below": 0.7, "ground": 0.7, "outline": 0.4, "cut off below": 0.4}
 """Probability that the scale of a component by contact is right, by its origin (`TIES`)."""
 RIGHT, WRONG = 0.05, 0.5
 """Standard deviation of the log of such a scale if it is right, and if it is not."""
-HELD, NEAR = 4.0, 15
-"""Weight of the whole component's error beside the residuals of NEAR neighbours."""
+HELD, NEAR = 4 / 300, 0.1
+"""Weight of the whole image's error beside residuals, as a share of its area; standard deviation of
+the distance up to which a residual counts, relative to the square root of that area."""
 REACH, STEEPEST = 4, 0.5
 """Pixels to either side between which a prior's slope is a difference, and the largest change of
 relative inverse depth from the middle of a superpixel to its border."""
@@ -43,6 +42,7 @@ class Given:
     Attributes:
         evidence: Evidence of flow and image for it.
         log_depth: (N,) log depth at the anchors, up to a common scale.
+        beside: (N,) that depth, by the flow where it determines that of the largest component.
         sigma: (N,) its standard deviation, estimated from the flow; inf where it decides nothing.
         opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
         error: (N,) standard deviation of log depth by which E_depth weighs the prior.
@@ -51,6 +51,7 @@ class Given:
 
     evidence: Evidence
     log_depth: Float
+    beside: Float
     sigma: Float
     opened: Float
     error: Float
@@ -63,58 +64,57 @@ class Given:
         return {**numbers, "held": float(self.held.mean())}
 
 
-def by_prior(
-    start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, evidence: Evidence
-) -> tuple[Start, Given]:
+def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tuple[Start, Given]:
     """The start with depths and scales of the pair's prior where the flow leaves them open.
 
     Args:
         start: Start without the prior.
-        seg: Superpixels and graphs.
         pair: Images and depth prior.
-        fitted: The flow as affine maps.
+        flow: The flow of its superpixels.
         evidence: Evidence of flow and image for the prior.
     """
-    n, sigma = len(seg), evidence.sigma
+    seg, anchor, n = flow.seg, flow.views.anchor, len(flow.seg)
     value, with_value, whole = without_gaps(pair, seg)
-    prior = evidence.log_depth(value)
+    prior, sigma = evidence.log_depth(value), np.full(n, evidence.sigma)
     if not evidence.used:
-        never = np.full(n, np.inf)
-        return start, Given(evidence, prior, never, np.zeros(n), never, np.zeros(n, bool))
-    seen, main = Seen(start, fitted), largest(start.component)
-    soup, anchor = start.soup, fitted.views.anchor
-    before = np.log(soup.depth_at(anchor)) - prior
-    contact = np.median(before[start.component == main])
+        return start, Given(evidence, prior, prior, sigma, np.zeros(n), sigma, np.zeros(n, bool))
+    seen, main = Seen(start, flow), start.component == largest(start.component)
+    soup, contact = start.soup, np.log(start.soup.depth_at(anchor))
     # components that are fixed in the image keep their depth relative to the scene
     fixed = start.tie == FIXED
-    from_prior, opened, strong = np.zeros(n, bool), np.ones(n), fixed.copy()
-    sigmas = np.where(fixed | ~with_value, np.inf, sigma)
-    # surfaces that bend have a motion for every superpixel, which grows with its depth
-    off = np.where(start.bends, before, np.where(fixed, contact, 0.0))
-    for c in np.unique(start.component[~start.bends & ~fixed]):
-        at = np.flatnonzero(start.component == c)
-        determined = evidence.determined if c == main else seen.relief(int(c))[0] > seen.tells
-        soup, strong[at] = _settled(seen, soup, int(c), prior, sigma, determined)
-        firm = at[strong[at]]
-        if not len(firm):
+    off, from_prior, strong = np.zeros(n), np.zeros(n, bool), fixed.copy()
+    rigid = np.unique(start.component[~start.bends & ~fixed])
+    for c in sorted(rigid, key=lambda c: not main[start.component == c].all()):
+        mask = start.component == c
+        reference = bool(main[mask].all())
+        determined = evidence.determined if reference else seen.relief(c) > seen.tells
+        soup, strong[mask] = _shaped(seen, soup, c, prior, evidence.sigma, determined)
+        firm = mask & strong
+        if not firm.any():
             continue
-        residual = np.log(soup.depth_at(anchor)[firm]) - prior[firm]
-        off[at] = np.median(residual)
-        local = _local(anchor[at, :2], strong[at], residual - off[firm], sigma)
-        sigmas[at] = np.where(with_value[at], local, np.inf)
-        flow = (start.noise / np.maximum(fitted.views.parallax(soup)[at], 1e-3)) ** 2
-        opened[at] = np.where(strong[at], flow / (flow + local**2), 1.0)
-        if c != main:
-            gap = float(np.median(before[at])) - contact
+        gap = np.log(soup.depth_at(anchor)) - prior
+        off[mask] = np.median(gap[firm])
+        if reference:
+            shift, sigma = _local(seg, firm & with_value, gap - off, evidence.sigma)
+            prior = np.where(main, prior + shift, prior)
+        else:
+            wrong = float(np.median((contact - prior)[mask]) - np.median((contact - prior)[main]))
             # a contact is no evidence where depths of the scene are the prior's
-            stands = STANDS.get(TIES[start.tie[at[0]]], 0.0) if evidence.determined else 0.0
-            keep = _kept(gap, sigma, stands)
-            off[at] -= keep * gap
-            prior[at] += keep * gap
-            from_prior[at] = keep < 0.5
+            stands = STANDS.get(TIES[start.tie[mask][0]], 0.0) if evidence.determined else 0.0
+            keep = _kept(wrong, float(np.median(sigma[mask])), stands)
+            off[mask] -= keep * wrong
+            prior[mask] += keep * wrong
+            from_prior |= mask & (keep < 0.5)
+    off[fixed] = np.median((contact - prior)[main])
+    # surfaces that bend have a motion for every superpixel, which grows with its depth
+    off = np.where(start.bends, contact - prior, off)
+    sigma = np.where(fixed | ~with_value, np.inf, sigma)
+    noise = start.noise / np.maximum(flow.views.parallax(soup), 1e-3)
+    opened = np.where(strong & ~fixed, 1 / (1 + (sigma / noise) ** 2) ** 2, 1.0)
     from_prior |= ~strong
     # a superpixel has the translation of its component, whatever its depth
     scaled = replace(soup, lam=soup.lam * np.exp(-off))
+    beside = np.where(main & strong, np.log(scaled.depth_at(anchor)), prior)
     planes = about_anchor(
         np.exp(prior), _slopes(np.exp(-evidence.log_depth(whole)), pair, seg), anchor
     )
@@ -123,11 +123,42 @@ def by_prior(
     soup = scaled.taking(tilted, ~strong).normalised()
     tie = np.where(from_prior & (start.component != main), TIES.index("given depth"), start.tie)
     # without a flow to weigh it against, terms on shape must not undo the prior
-    error = sigmas if evidence.determined else np.where(np.isfinite(sigmas), LEAST_SIGMA, np.inf)
-    decides = np.where(from_prior, sigmas, np.inf)
+    error = sigma if evidence.determined else np.where(np.isfinite(sigma), LEAST_SIGMA, np.inf)
+    decides = np.where(from_prior, sigma, np.inf)
     return replace(start, soup=soup, tie=tie), Given(
-        evidence, prior, decides, opened, error, from_prior
+        evidence, prior, beside, decides, opened, error, from_prior
     )
+
+
+def _shaped(
+    seen: Seen, soup: Soup, c: int, prior: Float, sigma: float, determined: bool
+) -> tuple[Soup, Mask]:
+    """Soup with the planes and the motion of a rigid component by flow and prior.
+
+    Where any depth explains the flow, it takes the motion that fits the depths of the prior.
+
+    Args:
+        seen: The start and its flow.
+        soup: Planes and motions so far.
+        c: The component.
+        prior: (N,) log depth.
+        sigma: Its standard deviation.
+        determined: Whether the flow determines the depth of the component.
+
+    Returns:
+        The soup, and for every member of the component whether the flow determines its depth.
+    """
+    mask, use, views = seen.start.component == c, seen.members(c), seen.flow.views
+    every = np.ones(mask.sum(), bool)
+    rigid = np.ptp(soup.R[mask], axis=0).max() < 1e-9 and np.any(soup.translation[mask][0])
+    if len(use) < FEWEST or not rigid:
+        return soup, every
+    if not determined:
+        _, R, T, _ = seen.motion(use, np.exp(-prior[use]))
+        by_prior = views.soup(np.exp(-prior), np.zeros((len(prior), 2)), R, T)
+        return soup.taking(by_prior, mask), ~every
+    settled, strong = seen.settled(soup, c, prior, sigma)
+    return (settled, strong[mask]) if strong.sum() >= PIECE_SIZE else (soup, every)
 
 
 def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:
@@ -148,50 +179,6 @@ def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:
     return np.asarray(out / np.maximum(1.0, steep / STEEPEST)[:, None])
 
 
-def _settled(
-    seen: Seen, soup: Soup, c: int, prior: Float, sigma: float, determined: bool
-) -> tuple[Soup, Mask]:
-    """Soup with the planes and the motion of a rigid component by flow and prior.
-
-    Of the motions that explain the flow about as well, it takes the one that agrees with the prior.
-    Where any depth explains the flow, it takes the motion that fits the depths of the prior.
-
-    Args:
-        seen: The start and its flow.
-        soup: Planes and motions so far.
-        c: The component.
-        prior: (N,) log depth.
-        sigma: Its standard deviation.
-        determined: Whether the flow determines the depth of the component.
-
-    Returns:
-        The soup, and for every member of the component whether the flow determines its depth.
-    """
-    start, views = seen.start, seen.fitted.views
-    mask = start.component == c
-    at, use = np.flatnonzero(mask), seen.members(c)
-    T = soup.translation[at[0]]
-    length, rigid = float(np.linalg.norm(T)), np.ptp(soup.R[at], axis=0).max() < 1e-9
-    all_members = np.ones(len(at), bool)
-    if len(use) < FEWEST or not rigid or not length > 0:
-        return soup, all_members if start.borrowed[at].all() else ~start.borrowed[at]
-    _, R, T_prior, _ = seen.motion(use, np.exp(-prior[use]))
-    flat = np.zeros((len(prior), 2))
-    if not determined:
-        return soup.taking(views.soup(np.exp(-prior), flat, R, T_prior), mask), ~all_members
-    error = min(SYSTEMATIC * start.noise, MOST_SYSTEMATIC_PX)
-    tried = Motion(soup.R[at[0]], T / length), Motion(R, T_prior / np.linalg.norm(T_prior))
-    best = most_probable(tried, seen.fitted.anchor_matches(use), error, prior[use], sigma)
-    planes = views.fit([best])
-    mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
-    strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP)
-    strong &= seen.usable & mask
-    if strong.sum() < PIECE_SIZE:
-        return soup, all_members
-    mu, slope = np.where(strong, mu, 1.0), np.where(strong[:, None], planes.slope[:, 0], flat)
-    return soup.taking(views.soup(mu, slope, best.R, best.t), mask), strong[at]
-
-
 def _kept(gap: float, sigma: float, stands: float) -> float:
     """Weight of the scale by contact in a component's scale, beside the scale by the prior.
 
@@ -203,13 +190,22 @@ def _kept(gap: float, sigma: float, stands: float) -> float:
     return float(odds[0] / odds.sum() * sigma**2 / spread[0] ** 2)
 
 
-def _local(position: Float, strong: Mask, residual: Float, sigma: float) -> Float:
-    """(K,) standard deviation of a prior by its residuals in log depth at the nearest known depths.
+def _local(seg: Segmentation, known: Mask, residual: Float, sigma: float) -> tuple[Float, Float]:
+    """(N,) correction of a prior's log depth by known depths near it, and its standard deviation.
 
-    `position` (K, 2) are a component's anchors, `strong` (K,) marks the known depths, which have
-    residuals, and `sigma` is the deviation in the whole component.
+    A Gaussian window averages the residuals and their squares, beside `HELD` of none and sigma^2.
+
+    Args:
+        seg: Superpixels.
+        known: (N,) True where the depth is known.
+        residual: (N,) log ratio of known depths to the prior's.
+        sigma: Standard deviation in the whole image.
     """
-    near = min(NEAR, len(residual))
-    index = cKDTree(position[strong]).query(position, k=near)[1].reshape(len(position), near)
-    squared = np.minimum(residual**2, 1.0)[index].sum(axis=1)
-    return np.maximum(np.sqrt((HELD * sigma**2 + squared) / (HELD + near)), LEAST_SIGMA)
+    area = seg.labels.size
+    squared = cdist(seg.anchors, seg.anchors[known], "sqeuclidean")
+    weight = np.exp(-0.5 * squared / (NEAR**2 * area)) * seg.sizes[known] / area
+    total = HELD + weight.sum(axis=1)
+    gap = np.clip(residual[known], -1.0, 1.0)
+    mean = weight @ gap / total
+    variance = (HELD * sigma**2 + weight @ gap**2) / total - mean**2
+    return mean, np.sqrt(np.maximum(variance, LEAST_SIGMA**2))

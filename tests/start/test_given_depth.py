@@ -49,7 +49,7 @@ class Seen:
     def by(self, prior: np.ndarray, kind: str | None = None) -> tuple[Start, Given]:
         pair = replace(self.pair, depth_prior=prior)
         fitted = FlowFit.of(self.seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
-        start_data = self.start, self.seg, pair, fitted
+        start_data = self.start, pair, fitted
         return by_prior(*start_data, judged(*start_data, kind))
 
     def error(self, start: Start) -> np.ndarray:
@@ -116,7 +116,15 @@ def test_orientation_is_held_inside_a_plane_and_released_at_creases(pan):
     pair, seg = pan.pair, pan.seg
     data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 4, 0, True)
     free, stiffer = np.ones(len(data.edges)), np.full(len(seg), 100.0)
-    prior_data = given.log_depth, given.opened, given.error, start.component, free, stiffer
+    prior_data = (
+        given.log_depth,
+        given.beside,
+        given.opened,
+        given.error,
+        start.component,
+        free,
+        stiffer,
+    )
     gain = (
         with_prior(data, start.soup, *prior_data, creased=True).orient_weight / data.orient_weight
     )
@@ -127,9 +135,33 @@ def test_orientation_is_held_inside_a_plane_and_released_at_creases(pan):
     plain = with_prior(data, start.soup, *prior_data, creased=False).orient_weight
     np.testing.assert_allclose(plain, 100 * data.orient_weight)
     # where the flow determines the slopes nothing changes
-    prior_data = given.log_depth, np.zeros(len(seg)), *prior_data[2:]
+    prior_data = given.log_depth, given.beside, np.zeros(len(seg)), *prior_data[3:]
     flat = with_prior(data, start.soup, *prior_data, creased=True).orient_weight
     np.testing.assert_array_equal(flat, data.orient_weight)
+
+
+def test_components_differ_from_depths_by_the_flow_by_their_scales():
+    """A prior that the depth of the background confirms does not move it, but scales objects."""
+    road = Seen("street")
+    seg = road.seg
+    start, given = road.by(road.depth * np.exp(0.4 * WAVE))
+    assert given.evidence.determined
+    assert 0.1 < given.evidence.ratio < CONFIRMED
+    main = start.component == np.bincount(start.component).argmax()
+    firm = main & ~given.held
+    apart = given.beside - np.log(start.soup.depth_at(road.anchor))
+    assert np.ptp(apart[firm]) < 1e-9
+    assert np.abs(given.beside - given.log_depth)[firm].max() > 0.05
+    np.testing.assert_array_equal(given.beside[~firm], given.log_depth[~firm])
+    data = build_energy_data(seg, road.pair.flow, road.pair.K_ref, road.pair.K_next, 4, 0, True)
+    values = given.log_depth, given.beside, given.opened, given.error, start.component
+    changed = with_prior(
+        data, start.soup, *values, np.ones(len(data.edges)), np.ones(len(seg)), creased=False
+    )
+    i, k = data.edges.T
+    same = start.component[i] == start.component[k]
+    for depth, at in ((given.log_depth, same), (given.beside, ~same)):
+        np.testing.assert_allclose(changed.depth_change[at], (depth[i] - depth[k])[at])
 
 
 def across_steps(seg: Segmentation, depth: np.ndarray) -> float:
