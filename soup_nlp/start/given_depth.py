@@ -121,7 +121,7 @@ def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tup
     normal, D = normal_and_distance(planes)
     tilted = Soup(D, normal, np.ones(n), soup.R, scaled.translation / D[:, None])
     soup = scaled.taking(tilted, ~strong).normalised()
-    tie = np.where(from_prior & (start.component != main), TIES.index("given depth"), start.tie)
+    tie = np.where(from_prior & ~main, TIES.index("given depth"), start.tie)
     # without a flow to weigh it against, terms on shape must not undo the prior
     error = sigma if evidence.determined else np.where(np.isfinite(sigma), LEAST_SIGMA, np.inf)
     decides = np.where(from_prior, sigma, np.inf)

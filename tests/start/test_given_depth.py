@@ -149,6 +149,8 @@ def test_components_differ_from_depths_by_the_flow_by_their_scales():
     assert 0.1 < given.evidence.ratio < CONFIRMED
     main = start.component == np.bincount(start.component).argmax()
     firm = main & ~given.held
+    assert (main & given.held).any()
+    assert TIES.index("given depth") not in start.tie[main]
     apart = given.beside - np.log(start.soup.depth_at(road.anchor))
     assert np.ptp(apart[firm]) < 1e-9
     assert np.abs(given.beside - given.log_depth)[firm].max() > 0.05
