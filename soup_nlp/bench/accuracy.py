@@ -121,7 +121,10 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
 
 
 def _sigma(result: Run) -> Row:
-    """ "within" and "sparsification" of sigma at true pixels, after a median scale, if any."""
+    """Entries "within" and "sparsification" at true pixels, after a median scale.
+
+    There are none without a true depth or without sigma.
+    """
     truth, sigma = result.pair.truth, result.reconstruction.sigma_ref
     if truth is None or not has_depth(truth) or sigma is None:
         return {}
@@ -146,10 +149,13 @@ def has_depth(truth: Truth | None) -> bool:
 
 def _applies(truth: Truth | None, convention: Preset) -> bool:
     """Whether a true pixel counts under a convention; a crop needs a depth map."""
-    if truth is not None and truth.depth_ref is not None:
+    if truth is None:
+        return False
+    if truth.depth_ref is not None:
         return convention.counts(truth.depth_ref)
-    points = None if truth is None or convention.crop is not None else truth.points
-    return points is not None and convention.counts(points[:, 2])
+    if truth.points is None or convention.crop is not None:
+        return False
+    return convention.counts(truth.points[:, 2])
 
 
 def _metrics(

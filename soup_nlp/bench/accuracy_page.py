@@ -93,11 +93,12 @@ def _better_baselines(frame: pd.DataFrame) -> list[str]:
         return []
     better["difference"] = better["theirs"] - better["mre"]
     text = "The solution's MRE is on the pixels that the baseline has a depth for."
-    return ["## Baselines that are better", text, titled(_by_pair(better), BETTER)]
+    return ["## Baselines that are better", text, titled(better.set_axis(_pairs(better)), BETTER)]
 
 
-def _by_pair(frame: pd.DataFrame) -> pd.DataFrame:
-    return frame.set_axis(pd.Index(frame["title"], name="pair, flow"))
+def _pairs(frame: pd.DataFrame) -> pd.Index:
+    """Title of pair and flow of every row, as the index of a table."""
+    return pd.Index(frame["title"], name="pair, flow")
 
 
 def _convention(name: str, frame: pd.DataFrame) -> list[str]:
@@ -109,7 +110,7 @@ def _convention(name: str, frame: pd.DataFrame) -> list[str]:
     numbers = numbers.dropna(axis=1, how="all")
     text = preset(name).text
     blocks = [f"## MRE, {preset(name)}", f"{text[0].upper()}{text[1:]}."]
-    blocks.append(markdown(numbers.set_axis(_by_pair(scored).index)))
+    blocks.append(markdown(numbers.set_axis(_pairs(scored))))
     for level, by in (("sequence", ["suite", "sequence", "flow"]), ("dataset", ["suite", "flow"])):
         groups = pd.concat([scored[by], numbers], axis=1).groupby(by, sort=False)
         if 0 < groups.ngroups < len(scored):
@@ -150,7 +151,7 @@ def _details(frame: pd.DataFrame) -> str:
     out[SURENESS] = frame[SURENESS]
     out[["status", "s"]] = frame[["status", "cpu_seconds"]]
     forms = dict.fromkeys(out.columns, ".4f") | {"s": ".0f"}
-    return markdown(out.set_axis(_by_pair(frame).index), forms)
+    return markdown(out.set_axis(_pairs(frame)), forms)
 
 
 def _plot_sparsification(path: Path, frame: pd.DataFrame) -> bool:

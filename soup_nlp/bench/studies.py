@@ -166,9 +166,14 @@ DEPARTURES = (
         needs="on: at 0.001 in the paper's units",
     ),
     Departure(
-        "E_arap and E_prior weak across components", ("energy.arap_across",), (), _SHARED, _FINDS
+        "E_arap and E_prior weak across components",
+        ("energy.arap_across",),
+        with_on=_SHARED,
+        needs=_FINDS,
     ),
-    Departure("E_cont weak at occlusions", ("energy.cont_occluded",), (), _SHARED, _FINDS),
+    Departure(
+        "E_cont weak at occlusions", ("energy.cont_occluded",), with_on=_SHARED, needs=_FINDS
+    ),
     Departure(
         "another energy where surfaces bend",
         ("start.bending",),
@@ -179,7 +184,7 @@ DEPARTURES = (
     Departure(
         "depth prior", ("energy.weights.depth",), needs="a file: without one it has no elements"
     ),
-    Departure("order by occlusion", ("energy.weights.order",), (), _SHARED, _FINDS),
+    Departure("order by occlusion", ("energy.weights.order",), with_on=_SHARED, needs=_FINDS),
     Departure("borders that follow the flow", ("segmentation.follow_flow_px",)),
     Departure("confidence of the flow", ("flow.consistency",)),
     Departure("flow seen through reflections", ("flow.see_through",)),

@@ -300,7 +300,7 @@ def list_suite(
     """The available pairs of a suite, each with every flow.
 
     `data` is the root folder of the dataset, or a folder that holds it. `say` is called with a line
-    on the number of pairs, and of those of the list that are not in the folder.
+    on the number of pairs that were found, and of those of the list.
 
     Raises:
         DataError: the suite is unknown, or none of its pairs is in the folder; the message names
@@ -316,10 +316,8 @@ def list_suite(
         here = [i for i in listed if all(is_file(f) for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):
             if say:
-                pairs = len({i.name for i in here})
-                missing = len({i.name for i in listed}) - pairs
-                lack = f", {missing} of the list are not in the folder" if missing else ""
-                say(f"suite {name}: {pairs} pairs{lack}")
+                found, total = (len({i.name for i in items}) for items in (here, listed))
+                say(f"suite {name}: {found} of {total} pairs found")
             return here
     if o.only and not listed and (not suite.layout or is_folder(root)):
         raise DataError(

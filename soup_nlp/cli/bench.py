@@ -73,9 +73,9 @@ def _run(
         overwrite: Also over files of the user.
         running: Further options of `measure_all`.
     """
-    good = True
     # check all names before the first study is measured
     claim(out, [name for study in studies for name in (study.page, *study.files)], overwrite)
+    good = True
     for study in studies:
         page, say = out / study.page, options.RowProgress(quiet, study.line)
         measure_rows, rows = partial(measure_all, say=say, **running), page.with_suffix(".jsonl")
@@ -100,10 +100,10 @@ def _wanted(flow: list[str] | None, width: int, seeds: str, only: list[str] | No
     return Options(tuple(flow or ()), width, chosen, tuple(only or ()))
 
 
-def _command(name: str, data: Path | None, options: Mapping[str, Any]) -> str:
+def _command(name: str, data: Path | None, settings: Mapping[str, Any]) -> str:
     """A command as text, without the place of its data; an option may have several values."""
     words = ["--data DIR"] * (data is not None)
-    for key, value in options.items():
+    for key, value in settings.items():
         values = value if isinstance(value, list) else [] if value is None else [value]
         words += [f"--{key} {shlex.quote(str(item))}" for item in values]
     return f"soup-nlp bench {name} {' '.join(words)}"

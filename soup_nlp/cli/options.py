@@ -101,7 +101,7 @@ def located(name: str | None, what: str) -> str | None:
     return name and json.dumps(str(as_path(name, what, home=True).absolute()))
 
 
-def numbers(text: str, option: str, least: int = 0, most: int = MAX_SEED) -> list[int]:
+def numbers(text: str, where: str, least: int = 0, most: int = MAX_SEED) -> list[int]:
     """Different whole numbers of a comma-separated list.
 
     Raises:
@@ -114,7 +114,7 @@ def numbers(text: str, option: str, least: int = 0, most: int = MAX_SEED) -> lis
     if not values or min(values) < least or max(values) > most:
         raise ConfigError(
             "not a list of whole numbers",
-            where=option,
+            where=where,
             found=text,
             expected=f"whole numbers from {least} to {most}, comma separated",
         )
@@ -126,7 +126,7 @@ def listed(text: str) -> list[str]:
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
-def camera(text: str | None, option: str) -> list[float] | str | None:
+def camera(text: str | None, where: str) -> list[float] | str | None:
     """Value of the key `intrinsics`: four numbers, or the name of a file; None without a text.
 
     Raises:
@@ -143,7 +143,7 @@ def camera(text: str | None, option: str) -> list[float] | str | None:
     if len(values) != 4:
         raise ConfigError(
             "camera is neither four numbers nor a file",
-            where=option,
+            where=where,
             found=text,
             expected="fx,fy,cx,cy or a text file of 4 or 9 numbers",
         )

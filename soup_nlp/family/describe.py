@@ -34,9 +34,10 @@ RANK = 1e-8
 def degree(value: ca.SX, x: ca.SX) -> int:
     """0 constant, 1 linear, 2 quadratic, 3 anything else, as an expression of x."""
     for order in range(3):
+        if order:
+            value = ca.vertcat(*ca.jacobian(value, x).nonzeros())
         if not any(ca.which_depends(value, x, 1, True)):
             return order
-        value = ca.vertcat(*ca.jacobian(value, x).nonzeros())
     return 3
 
 

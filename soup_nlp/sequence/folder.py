@@ -210,7 +210,6 @@ def renew_chain_page(folder: Path) -> Path:
 
 def summary(chain: Chain) -> dict[str, Any]:
     """Scales, links, poses and tracks as plain values."""
-    parts = {track: chain.members(track) for track in chain.track_numbers}
     return {
         "frames": len(chain),
         "unit": UNIT,
@@ -232,8 +231,12 @@ def summary(chain: Chain) -> dict[str, Any]:
         ],
         "world_from_camera": [m.matrix for m in chain.world_from_camera],
         "tracks": [
-            {"track": t, "path": chain.path(t), "pixels": {k: c.pixels for k, c in of_t.items()}}
-            for t, of_t in parts.items()
+            {
+                "track": track,
+                "path": chain.path(track),
+                "pixels": {k: part.pixels for k, part in chain.members(track).items()},
+            }
+            for track in chain.track_numbers
         ],
     }
 

@@ -51,9 +51,17 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     for k, z in depths.items():
         separate = depth_metrics(z, true[k])
         common = depth_metrics(scale * z, true[k], scale="none")
-        row = {"frame": k, "mre_own_scale": separate.mre, "mre_one_scale": common.mre}
-        frames.append({**row, "own_scale": separate.scale, "coverage": separate.coverage})
-    mre = {key: float(np.mean([f[key] for f in frames])) for key in list(row)[1:]}
+        frames.append(
+            {
+                "frame": k,
+                "mre_own_scale": separate.mre,
+                "mre_one_scale": common.mre,
+                "own_scale": separate.scale,
+                "coverage": separate.coverage,
+            }
+        )
+    averaged = "mre_own_scale", "mre_one_scale"
+    mre = {key: float(np.mean([f[key] for f in frames])) for key in averaged}
     own = {f["frame"]: f["own_scale"] for f in frames}
     # the true ratio is that of the pairs' own depths, without the scales of the chain
     ratio = chain.scales[1:] / chain.scales[:-1]

@@ -147,7 +147,9 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     words += [w for o in QUICK for w in ("--set", o)]
     assert main(words) == 0
     out = capsys.readouterr()
-    assert out.err.startswith("suite rendered: 1 pairs\n1/1  rendered/orbit-s0-128x54/truth  MRE 0")
+    listed, measured = out.err.splitlines()
+    assert listed == "suite rendered: 1 of 1 pairs found"
+    assert measured.startswith("1/1  rendered/orbit-s0-128x54/truth  MRE 0.")
     assert f"{tmp_path}/: rendered.md, rendered.png\n" in out.out
     assert "one median scale per image, no cap" in out.out
     assert (tmp_path / "rendered.md").read_text() in out.out

@@ -37,7 +37,7 @@ def test_a_suite_lists_the_pairs_whose_files_exist(tmp_path):
     (base / f"frame_{frames[0] + 1:04d}.png").touch()
     told = []
     listed = list_suite("sintel", tmp_path / "data", say=told.append)
-    assert told == ["suite sintel: 1 pairs, 119 of the list are not in the folder"]
+    assert told == ["suite sintel: 1 of 120 pairs found"]
     assert [(i.input["frame"], i.presets[0]) for i in listed] == [(frames[0], "sintel70")]
 
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 import soup_nlp
-from soup_nlp.config.problem import SegmentationOptions
+from soup_nlp.config.problem import Problem, SegmentationOptions
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.pipeline.run import ProblemKeys
 
 SMALL = {"superpixels": 12, "neighbours": 4}
 
@@ -70,6 +71,10 @@ def test_options_may_be_records_and_progress_is_reported(capsys):
     assert {p.stage for p in seen} >= {"constrained NLP"}
     soup_nlp.solve_pair(pair, progress=True, **options)
     assert "evaluation" in capsys.readouterr().err
+
+
+def test_editors_know_every_key_of_a_problem():
+    assert set(ProblemKeys.__annotations__) == set(Problem.model_fields) - {"base", "input", "name"}
 
 
 @pytest.mark.parametrize(

@@ -122,11 +122,11 @@ def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
     if x is None:
         return row
     energy = np.inf
-    with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
-        soup = task.layout.unpack(x).retracted()
-        energy = oracle.energy(soup, task.data, task.weights)["total"]
     with np.errstate(all="ignore"):
         value = task.nlp.value(x)
+        with suppress(np.linalg.LinAlgError):
+            soup = task.layout.unpack(x).retracted()
+            energy = oracle.energy(soup, task.data, task.weights)["total"]
     finite = bool(np.isfinite(x).all())
     row["energy"] = float(energy) if finite and np.isfinite(energy) else float("inf")
     row["objective"] = value if np.isfinite(value) else None
