@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import casadi as ca
 import numpy as np
 from hypothesis import settings
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, View, render
@@ -24,7 +24,6 @@ from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.kernel import Group
 from soup_nlp.model.layout import GAUGES as GAUGES
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
@@ -145,27 +144,6 @@ class Tiny:
     def nlp(self, weights: Weights, form: Formulation) -> tuple[NLP, MatrixLayout]:
         """The constrained NLP at the tiny soup."""
         return build_matrix_nlp(self.soup, self.data, weights, form)
-
-
-def plain_nlp(name: str, groups: Sequence[Group], x0: ArrayLike, **given: object) -> NLP:
-    """A textbook problem of kernels: free and without parameters, unless fields of NLP are given.
-
-    Bounds may be single numbers; names may be lists.
-    """
-    x0 = np.asarray(x0, float)
-    rows = max((int(g.table.rows.max(initial=-1)) + 1 for g in groups), default=0)
-    free = {"lbx": -np.inf, "ubx": np.inf, "lbg": -np.inf, "ubg": np.inf}
-    bounds = {}
-    for side, bound in free.items():
-        count = rows if side.endswith("g") else len(x0)
-        bounds[side] = np.broadcast_to(np.asarray(given.pop(side, bound), float), count)
-    lists = {
-        f"{v}_names": given.pop(f"{v}_names", [f"{v}[{i}]" for i in range(n)])
-        for v, n in (("x", len(x0)), ("g", rows))
-    }
-    names = {key: partial(list, words) for key, words in lists.items()}
-    rest = {"theta": {}, "hessian_kind": "exact", "compiled": False, **given}
-    return NLP(name, tuple(groups), x0, **bounds, **names, **rest)
 
 
 # --- values and finite differences of an NLP ---------------------------------------------------

@@ -1,16 +1,39 @@
-"""Tools of tests of .nl files: plain SX problems as files, and files as CasADi reads them."""
+"""Textbook problems of kernels, plain SX problems as .nl files, and files as CasADi reads them."""
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Sequence
+from functools import cached_property, partial
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
-from helpers_model import plain_nlp
+from numpy.typing import ArrayLike
 
 from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.model.kernel import Group, Kernel, Table
+from soup_nlp.model.nlp import NLP
+
+
+def plain_nlp(name: str, groups: Sequence[Group], x0: ArrayLike, **given: object) -> NLP:
+    """A textbook problem of kernels: free and without parameters, unless fields of NLP are given.
+
+    Bounds may be single numbers; names may be lists.
+    """
+    x0 = np.asarray(x0, float)
+    rows = max((int(g.table.rows.max(initial=-1)) + 1 for g in groups), default=0)
+    free = {"lbx": -np.inf, "ubx": np.inf, "lbg": -np.inf, "ubg": np.inf}
+    bounds = {}
+    for side, bound in free.items():
+        count = rows if side.endswith("g") else len(x0)
+        bounds[side] = np.broadcast_to(np.asarray(given.pop(side, bound), float), count)
+    lists = {
+        f"{v}_names": given.pop(f"{v}_names", [f"{v}[{i}]" for i in range(n)])
+        for v, n in (("x", len(x0)), ("g", rows))
+    }
+    names = {key: partial(list, words) for key, words in lists.items()}
+    rest = {"theta": {}, "hessian_kind": "exact", "compiled": False, **given}
+    return NLP(name, tuple(groups), x0, **bounds, **names, **rest)
 
 
 def write_sx_nl(path: Path, problem: dict[str, ca.SX], **given: object) -> NLFile:

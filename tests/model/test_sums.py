@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from helpers_model import plain_nlp
+from helpers_nl import plain_nlp
 
 from soup_nlp.errors import ModelError
 from soup_nlp.model import compile as compiling

@@ -10,7 +10,7 @@ from functools import partial
 import casadi as ca
 import numpy as np
 import pytest
-from helpers_model import plain_nlp
+from helpers_nl import plain_nlp
 
 from soup_nlp.errors import SolverError
 from soup_nlp.model.kernel import Group, Kernel, Table
