@@ -2,7 +2,8 @@
 
 A command first checks the names that it will write (`claim`). Later it writes its files into a
 hidden folder in the target (`staged`). One rename marks that folder as complete; its files are then
-renamed to their places. After a kill, a later call finishes the renaming (`recover`).
+renamed to their places. After a kill, a later call finishes the renaming (`recover`). A lock on the
+folder makes processes that write into the same folder wait for each other.
 
 The hidden file MARK lists the files in a folder that the program made, with their SHA-256. A file
 that is not listed, or that was changed, belongs to the user. The mark also has the subject of the
@@ -11,13 +12,14 @@ result, such as the frames that were solved.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
 
@@ -113,12 +115,12 @@ def claim(
         DataError: the folder cannot be written, holds a file of the user or a folder with one of
             the names, or is the result of another subject.
     """
-    with _named_errors(folder):
-        target = Path(os.path.realpath(as_path(folder, "output folder")))
+    target = Path(os.path.realpath(as_path(folder, "output folder")))
+    with _named_errors(folder), _locked(target):
         existing = next(p for p in (target, *target.parents) if os.path.lexists(p))
         # fails where nothing can be written
         with tempfile.TemporaryFile(dir=existing):
-            recover(target)
+            _finish(target)
         before = subject_of(target)
         if subject and before not in ("", subject) and not overwrite:
             raise DataError(
@@ -175,8 +177,10 @@ def staged(
         try:
             with temporary_folder(target, _STAGE) as stage:
                 yield stage
-                with deferred_signals():
-                    _commit(stage, target, whole, overwrite, subject or subject_of(target))
+                claim(target, files_in(stage), overwrite)
+                with _locked(target), deferred_signals():
+                    _finish(target)
+                    _commit(stage, target, whole, subject or subject_of(target))
         except DataError as error:
             # name the final path instead of the temporary one
             if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
@@ -190,10 +194,9 @@ def staged(
                     path.rmdir()
 
 
-def _commit(stage: Path, target: Path, whole: bool, overwrite: bool, subject: str) -> None:
+def _commit(stage: Path, target: Path, whole: bool, subject: str) -> None:
     """Mark a temporary folder as complete and move its files to their places."""
     new = {name: digest_of(stage / name) for name in files_in(stage)}
-    claim(target, new, overwrite)
     old = {k: v for k, v in made_files(target).items() if not is_foreign(target, k)}
     for name in old.keys() & new.keys():
         # a file of the program may have been removed
@@ -206,20 +209,30 @@ def _commit(stage: Path, target: Path, whole: bool, overwrite: bool, subject: st
             os.fsync(file.fileno())
     # from here on, the new files are the result
     os.replace(stage, target / stage.name.replace(_STAGE, _COMPLETE))
-    recover(target)
+    _finish(target)
 
 
 def recover(folder: Path) -> None:
     """Move the files of complete temporary folders to their places; remove incomplete ones.
 
-    The folders of running processes are kept. Another process may be moving the same files.
+    The incomplete folders of running processes are kept.
+    """
+    with _locked(folder):
+        _finish(folder)
+
+
+def _finish(folder: Path) -> None:
+    """The same for a process that has locked the folder.
+
+    Where locks are not supported, another process may be moving the same files.
     """
     for stage in folder.glob(f"{_COMPLETE}*"):
         if stage.is_symlink():
             continue
+        new = made_files(stage)
         # the mark is moved last: without it, every file was moved
         if (stage / MARK).is_file():
-            for name in made_files(folder).keys() - made_files(stage).keys():
+            for name in made_files(folder).keys() - new.keys():
                 if not is_foreign(folder, name):
                     (folder / name).unlink(missing_ok=True)
                     with suppress(OSError):
@@ -231,6 +244,18 @@ def recover(folder: Path) -> None:
                     os.replace(stage / name, folder / name)
         shutil.rmtree(stage, ignore_errors=True)
     sweep(folder, _STAGE)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Wait for the lock of a folder and keep it until the block ends; a kill releases it."""
+    with ExitStack() as stack:
+        # the folder may be missing, and some network file systems have no locks
+        with suppress(OSError):
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            stack.callback(os.close, handle)
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
 
 
 @contextmanager

@@ -305,7 +305,7 @@ def test_temporary_folders_of_a_kill_are_removed_by_the_next_run(tmp_path):
 def test_a_move_that_was_killed_is_finished(moves, tmp_path):
     target = tmp_path / "out"
     write(target, a="1", b="1")
-    # the mark of the new files is the first that is replaced, their empty folder the last
+    # the temporary folder is renamed first and removed last
     killed(target, moves)
     recover(target)
     assert content(target) == {"a": "2", "c": "2", "d": "2"}
@@ -342,6 +342,26 @@ def test_files_that_another_process_moves_first_are_not_lost(tmp_path, monkeypat
     monkeypatch.setattr(os, "replace", moved_twice)
     write(tmp_path, a="1", c="1")
     assert content(tmp_path) == {"a": "1", "c": "1"}
+
+
+WRITER = """
+import sys
+from soup_nlp.storage.folders import staged
+for k in range(20):
+    with staged(sys.argv[1]) as new:
+        (new / f"{sys.argv[2]}{k}").write_text("1")
+        (new / sys.argv[2]).write_text(str(k))
+"""
+
+
+def test_processes_that_write_into_one_folder_lose_no_files(tmp_path):
+    writers = [
+        subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path), name]) for name in "abc"
+    ]
+    assert [writer.wait() for writer in writers] == [0, 0, 0]
+    expected = {f"{name}{k}": "1" for name in "abc" for k in range(20)} | dict.fromkeys("abc", "19")
+    assert content(tmp_path) == expected
+    assert made_files(tmp_path) == {name: digest_of(tmp_path / name) for name in expected}
 
 
 def test_scratch_folders_are_removed(tmp_path, monkeypatch):
