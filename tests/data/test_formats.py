@@ -48,8 +48,8 @@ def test_real_files(shared_data: Path, tmp_path: Path) -> None:
     """A header of 1024 x 436 and the values that are read are the bytes of the file."""
     header, sintel = struct.pack("<4sii", b"PIEH", 1024, 436), shared_data / "sintel" / "training"
     for path, read in (
-        (sintel / "flow" / "alley_1" / "frame_0002.flo", fmt.read_flo),
-        (sintel / "depth" / "alley_1" / "frame_0020.dpt", fmt.read_dpt),
+        (sintel / "flow" / "alley_1" / "frame_0002.flo", fmt.read_flow),
+        (sintel / "depth" / "alley_1" / "frame_0020.dpt", fmt.read_depth),
     ):
         values = read(path)
         assert values.shape[:2] == (436, 1024)
