@@ -80,7 +80,7 @@ def test_depth_range_is_robust():
     assert 2.9 < far < 3.1
     near, far = depth_range(np.full((2, 2), 5.0))
     assert near < 5.0 < far
-    # a plane within 1 % of a constant has nearly the colour of a constant
+    # a plane that is nearly a constant has the range of a constant
     near, far = depth_range(np.linspace(4.999, 5.001, 100)[None])
     np.testing.assert_allclose([near, far], [5.0 / 1.01, 5.0 * 1.01], rtol=1e-3)
     assert depth_range(np.full((2, 2), np.nan)) == (1.0, 2.0)
