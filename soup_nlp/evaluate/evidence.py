@@ -19,7 +19,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.start.bending import fit_robustly, turned
+from soup_nlp.start.bending import PLAIN_TURN, fit_robustly, turned
 from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.settle import RELIEF
 
@@ -169,7 +169,7 @@ def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float
         moved = model(fit_robustly(miss, size), data.pixel_ray[at])
         return _mean(_error(project(data.K_next, moved), data, at))
 
-    return error(turned, 4), error(shifted, 6)
+    return error(turned, PLAIN_TURN), error(shifted, 6)
 
 
 def _open_motion(

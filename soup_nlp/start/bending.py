@@ -47,23 +47,25 @@ def systematic_error(noise: float) -> float:
 
 
 def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
-    """The camera's (3, 3) rotation, if it explains the flow of the main motion without depth.
+    """The camera's (3, 3) rotation, if a turn explains the flow of the main motion without depth.
 
-    The rotation does if the main rigid motion, with depths, lowers the error by no more than the
-    systematic error of the flow in the median, which movers assigned to that motion do not change.
-    The focal lengths and a shift of the next image are free in the fit, because wrong ones leave a
-    residual that depths explain.
+    It does if the main rigid motion, with depths, lowers the error by no more than the systematic
+    error of the flow in the median, which movers assigned to that motion do not change. A zoom and
+    a shift of the next image are free there, because they leave a residual that depths explain;
+    the rotation itself, which a shift can replace, is that of the plain turn.
     """
     at = np.flatnonzero(flow.views.usable & (choice.label == 0))
     if not len(at):
         return None
-    turn, error = fit_turn(flow.views.subset(at))
-    gain = np.median(error - choice.fit.cost[at, 0])
-    return None if gain > systematic_error(reference_noise(flow.residual)) else turn
+    views = flow.views.subset(at)
+    gain = np.median(fit_turn(views, ANY_TURN)[1] - choice.fit.cost[at, 0])
+    if gain > systematic_error(reference_noise(flow.residual)):
+        return None
+    return fit_turn(views)[0]
 
 
-TURN_SIZE = 7
-"""Number of parameters of `turned`."""
+PLAIN_TURN, ANY_TURN = 4, 7
+"""Parameters of `turned`: rotation and focal length; and with zoom and shift between the images."""
 
 
 def turned(x: Float, ray: Float) -> Float:
@@ -72,7 +74,7 @@ def turned(x: Float, ray: Float) -> Float:
     The next image is enlarged by exp(x[4]) and shifted by x[5:7], as by stabilisation or zoom;
     parameters that are left out are 0.
     """
-    x = np.pad(x, (0, TURN_SIZE - len(x)))
+    x = np.pad(x, (0, ANY_TURN - len(x)))
     first, second = (np.array([1.0, 1.0, np.exp(f)]) for f in (x[3], x[3] - x[4]))
     moved = (ray / first) @ rotation.exp(x[:3]).T * second
     moved[..., :2] += x[5:7] * moved[..., 2:]
@@ -87,8 +89,13 @@ def fit_robustly(miss: Callable[[Float], Float], size: int) -> Float:
     return x
 
 
-def fit_turn(views: Views) -> tuple[Float, Float]:
-    """Rotation that explains a flow best (`turned`), and (N,) its mean error, pixels."""
+def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
+    """Rotation of the turn that explains a flow best, and (N,) mean error of that turn, pixels.
+
+    Args:
+        views: The flow.
+        size: Number of parameters of `turned` that are free.
+    """
     ray, target, weight, _ = views.matches(most=FIT_PIXELS)
 
     def miss(x: Float) -> Float:
@@ -96,7 +103,7 @@ def fit_turn(views: Views) -> tuple[Float, Float]:
         off = moved[..., :2] / moved[..., 2:] - target[..., :2]
         return np.sqrt(weight)[:, None] * off * np.asarray(views.focal)
 
-    x = fit_robustly(miss, TURN_SIZE)
+    x = fit_robustly(miss, size)
     return rotation.exp(x[:3]), views.distance(turned(x, views.ray))
 
 

@@ -11,7 +11,7 @@ from soup_nlp.evaluate.evidence import LEAST_GAP_PX, evidence
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import TURN_SIZE, fit_robustly, turned
+from soup_nlp.start.bending import ANY_TURN, PLAIN_TURN, fit_robustly, turned
 
 NOISE = 0.05
 
@@ -80,8 +80,8 @@ def test_a_turn_explains_a_stabilised_flow_with_all_parameters_only(small_room):
 
         return float(np.mean(np.abs(miss(fit_robustly(miss, size)))))
 
-    assert error(4) > 0.3
-    assert error(TURN_SIZE) < 0.02
+    assert error(PLAIN_TURN) > 0.3
+    assert error(ANY_TURN) < 0.02
 
 
 def test_less_parallax_leaves_more_open(small_room):

@@ -237,6 +237,22 @@ def test_depth_that_explains_the_flow_is_no_turn():
     assert turn_alone(flow._replace(views=still), choice) is not None
 
 
+def test_a_stabilised_turn_is_a_turn():
+    """The next image is moved back by stabilisation; the rotation is that of the plain turn."""
+    c = case("orbit")
+    flow = fitted(c)._replace(residual=np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c))))
+    choice = rigid_choice(flow, dominant(flow))
+    target = flow.views.ray @ rotation.exp(np.array([0.02, -0.2, 0.05])).T
+    target = 1.03 * target / target[..., 2:] + np.array([0.2, 0.02, 0.0])
+    target[..., 2] = 1.0
+    stabilised = flow._replace(views=replace(flow.views, target=target))
+    turn = turn_alone(stabilised, choice)
+    assert turn is not None
+    plain, error = fit_turn(stabilised.views)
+    assert np.median(error) > 1.0
+    np.testing.assert_allclose(turn, plain, atol=0.01)
+
+
 def test_noise_where_surfaces_bend_is_that_of_affine_flows():
     """The error of a start without relief is no noise."""
     quiet = case("sheet").start
