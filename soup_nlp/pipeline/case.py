@@ -152,7 +152,7 @@ def _begun(problem: Problem, pair: Pair, seg: Segmentation) -> Begun:
     fitted = _flow_fit(problem, pair, seg)
     start = propose(fitted)
     if problem.energy.weights.order > 0:
-        start = in_order(start, seg, pair, fitted, fitted.options)
+        start = in_order(start, pair, fitted)
     return start, pair, fitted
 
 

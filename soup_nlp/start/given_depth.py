@@ -152,7 +152,8 @@ def _shaped(
     every = np.ones(mask.sum(), bool)
     rigid = np.ptp(soup.R[mask], axis=0).max() < 1e-9 and np.any(soup.translation[mask][0])
     if len(use) < FEWEST or not rigid:
-        return soup, every
+        borrowed = seen.start.borrowed[mask]
+        return soup, every if borrowed.all() else ~borrowed
     if not determined:
         _, R, T, _ = seen.motion(use, np.exp(-prior[use]))
         by_prior = views.soup(np.exp(-prior), np.zeros((len(prior), 2)), R, T)

@@ -29,7 +29,6 @@ from soup_nlp.start.components import (
 )
 from soup_nlp.start.merge import SMALL
 from soup_nlp.start.propose import Start
-from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
 
 WIDEST = 8
@@ -53,7 +52,7 @@ STANDING = 0.23
 upper outline it agrees with the order."""
 
 
-def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
+def covering(pair: Pair, flow: FlowFit) -> Float:
     """(P,) contrast, grey levels: positive where the second superpixel of a pair covers the first.
 
     It is 0 without a flow discontinuity, and where too little is visible. With a strip S of each
@@ -66,12 +65,11 @@ def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
     where G is the area of the next frame between the boundary moved by u_i and moved by u_k.
 
     Args:
-        seg: Superpixels and graphs.
         pair: Images and cameras.
-        fitted: The flow as affine maps.
+        flow: The flow of its superpixels.
     """
-    out = np.zeros(len(seg.pairs))
-    rows = np.flatnonzero(fitted.jump >= CLOSING_PX)
+    seg, out = flow.seg, np.zeros(len(flow.seg.pairs))
+    rows = np.flatnonzero(flow.jump >= CLOSING_PX)
     if not len(rows):
         return out
     before, after = (
@@ -83,7 +81,7 @@ def covering(seg: Segmentation, pair: Pair, fitted: FlowFit) -> Float:
 
     def target(which: Int, at: Float) -> Float:
         # (M, ..., 2) pixels of the next frame
-        moved = fitted.followed(which, rays(pair.K_ref, at))
+        moved = flow.followed(which, rays(pair.K_ref, at))
         return moved + pair.K_next[:2, 2]
 
     landed = [target(ends[:, e], edge) for e in (0, 1)]
@@ -162,7 +160,7 @@ def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
     return np.where(holds, np.sign(lead[outline]) * turned * sure[outline], 0.0)
 
 
-def in_order(start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, o: SeededStart) -> Start:
+def in_order(start: Start, pair: Pair, flow: FlowFit) -> Start:
     """The start with its components in the order that their outlines show.
 
     Only scales that neither flow nor parallax determines change. A region before a camera at rest,
@@ -170,13 +168,10 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, o: Se
 
     Args:
         start: The start before its components are ordered.
-        seg: Superpixels and graphs.
         pair: Images and cameras.
-        fitted: The flow as affine maps.
-        o: Jump of the flow where a surface ends.
+        flow: The flow of its superpixels.
     """
-    region = regions(start, fitted, seg, o)
-    contrast = covering(seg, pair, fitted)
+    seg, region, contrast = flow.seg, regions(start, flow), covering(pair, flow)
     # the flow of a small piece may be a mixture of those around it, or wrong
     small = np.bincount(region)[region] <= SMALL * len(seg)
     contrast[small[seg.pairs].any(axis=1)] = 0.0
@@ -187,7 +182,7 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, o: Se
     factor = placed(start.soup, region, order, start.tie, seg, pair.K_ref)
     moved = factor != 1
     # the scale of a placed region is held along its whole outline
-    beside_moved = moved[seg.pairs].any(axis=1) & (fitted.jump >= CLOSING_PX)
+    beside_moved = moved[seg.pairs].any(axis=1) & (flow.jump >= CLOSING_PX)
     order = np.where(beside_moved, whole, order)
     soup = replace(start.soup, lam=start.soup.lam * factor).normalised()
     tie = np.where(moved, TIES.index("occlusion"), start.tie)
@@ -197,17 +192,18 @@ def in_order(start: Start, seg: Segmentation, pair: Pair, fitted: FlowFit, o: Se
     return replace(start, soup=soup, tie=tie, component=component, part=part, order=order)
 
 
-def regions(start: Start, fitted: FlowFit, seg: Segmentation, o: SeededStart) -> Int:
+def regions(start: Start, flow: FlowFit) -> Int:
     """(N,) regions with one scale each: rigid components, and surfaces in components that bend.
 
     Before a camera at rest everything that does not move is one region; the others are connected
     pieces of moving superpixels.
     """
+    seg, jump = flow.seg, flow.options.discontinuity_px
     if not start.at_rest:
         return np.where(start.bends, len(seg) + start.surface, start.component)
-    still = fit_turn(fitted.views)[1] < o.discontinuity_px
+    still = fit_turn(flow.views)[1] < jump
     i, k = seg.pairs.T
-    continuous = (still[i] == still[k]) & (fitted.jump < o.discontinuity_px)
+    continuous = (still[i] == still[k]) & (flow.jump < jump)
     return np.where(still, 0, 1 + connected_labels(continuous, seg))
 
 

@@ -93,8 +93,11 @@ class Evidence:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the flow confirms the prior."""
-        return self.ratio <= CONFIRMED
+        """Whether the flow confirms the prior.
+
+        Where it does not determine depth, that has to make the prior surer.
+        """
+        return self.ratio <= CONFIRMED and (self.determined or self.sigma < UNCONFIRMED)
 
     @property
     def used(self) -> bool:
@@ -226,7 +229,7 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Eviden
         # lower parts of an image are mostly nearer
         far = stats.rankdata(-anchor[:, 1]), stats.rankdata(value)
     kind = kind or ("inverse" if np.cov(*far)[0, 1] < 0 else "relative")
-    log_depth, ratio = as_log_depth(kind, value), np.nan
+    log_depth, ratio, gap = as_log_depth(kind, value), np.nan, np.inf
     if tells:
         at = np.flatnonzero(known)
         shift = seen.motion(at, value[at], True)[3] if kind == "inverse" else 0.0
@@ -239,9 +242,10 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Eviden
                 for log in (depth, depth - shifted(value))
             )
             ratio = gap / by_flow
-        if ratio <= CONFIRMED:
-            sigma = float(np.clip(gap, LEAST_SIGMA, RELIEF))
-            return Evidence(kind, shifted, ratio, sigma, determined)
+        sigma = float(np.clip(gap, LEAST_SIGMA, RELIEF))
+        evidence = Evidence(kind, shifted, ratio, sigma, determined)
+        if evidence.confirmed:
+            return evidence
     right = not determined and follows_edges(log_depth(whole), pair.image_ref)
     return Evidence(kind, log_depth, ratio, UNCONFIRMED if right else np.inf, determined)
 

@@ -57,13 +57,13 @@ def fitted(pair: Pair, seg: Segmentation) -> FlowFit:
 
 
 def ordered(before: Start, seg: Segmentation, pair: Pair) -> Start:
-    return in_order(before, seg, pair, fitted(pair, seg), SeededStart())
+    return in_order(before, pair, fitted(pair, seg))
 
 
 @pytest.mark.parametrize("covers", [True, False])
 def test_the_side_that_loses_or_gains_pixels_is_behind(covers):
     pair, seg = sliding(covers)
-    contrast = covering(seg, pair, fitted(pair, seg))
+    contrast = covering(pair, fitted(pair, seg))
     moves = pair.flow.uv[..., 0].ravel()[np.unique(seg.labels, return_index=True)[1]] != 0
     i, k = seg.pairs.T
     # upper and lower edges slide along each other: neither closes nor opens
@@ -154,7 +154,7 @@ def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
     one = fitted(pair, seg)
 
     def changed() -> int:
-        start = in_order(before, seg, pair, one, SeededStart())
+        start = in_order(before, pair, one)
         return int((start.tie == TIES.index("occlusion")).sum())
 
     assert changed() == 0
