@@ -15,6 +15,7 @@ from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.sources import (
     FlowOptions,
+    content,
     flow_from_truth,
     is_named,
     resolve_flow,
@@ -70,6 +71,39 @@ def test_a_problem_can_ask_for_noise(pair):
         resolve_flow(pair, "truth+noise:much")
     assert is_named("dis")
     assert not is_named("flow.flo")
+
+
+@pytest.mark.parametrize("quality", [100, 25])
+@pytest.mark.parametrize("bars", [(16, 8, 0, 0), (0, 0, 40, 40), (16, 16, 16, 24)])
+def test_black_bars_do_not_change_the_flow_between_them(pair, bars, quality):
+    above, below, left, right = bars
+
+    def coded(image):
+        frame = cv2.copyMakeBorder(image, above, below, left, right, cv2.BORDER_CONSTANT)
+        data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        return cv2.imdecode(data, cv2.IMREAD_COLOR)
+
+    inside = slice(above, 96 + above), slice(left, 160 + left)
+    first, second = coded(pair.image_ref), coded(pair.image_next)
+    flow = resolve_flow(Pair(first, second, pair.K_ref, pair.K_next), "dis")
+    alone = dis_flow(first[inside], second[inside])
+    assert np.median(np.abs(flow.uv[inside] - alone.uv)) < 0.02
+    assert flow.confidence[inside].mean() == pytest.approx(alone.confidence.mean(), abs=0.03)
+    bar = np.ones(flow.confidence.shape, bool)
+    bar[inside] = False
+    assert flow.confidence[bar].max() == 0.0
+
+
+def test_pictures_without_black_bars_are_whole(pair):
+    whole = slice(0, 96), slice(0, 160)
+    dark = np.zeros_like(pair.image_ref)
+    for first, second in ((pair.image_ref, pair.image_next), (dark, dark), (pair.image_ref, dark)):
+        assert content(first, second) == whole
+    night = pair.image_ref.copy()
+    night[:30] = 0
+    # dark in one of the frames only
+    assert content(night, pair.image_next) == whole
+    assert content(night, night) == (slice(30, 96), slice(0, 160))
 
 
 @pytest.fixture(scope="module")

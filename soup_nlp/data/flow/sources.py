@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
@@ -39,6 +40,11 @@ CORRELATION = 5.0
 
 FEW = 0.2
 """Share of usable pixels below which the focal lengths are doubted."""
+
+BLACK = 24
+"""Largest grey level of a black bar: black of limited range is 16, and its coding has errors."""
+LEAST_CONTENT = 64
+"""Least side of the picture between black bars, pixels."""
 
 
 def load_flow(path: PathLike) -> Flow:
@@ -216,8 +222,39 @@ def is_network(source: str) -> bool:
     return Path(source).suffix == ".onnx"
 
 
+def content(image_ref: Image, image_next: Image) -> tuple[slice, slice]:
+    """Rows and columns between the black bars that both images have along their borders."""
+    whole = slice(0, image_ref.shape[0]), slice(0, image_ref.shape[1])
+    if image_ref.shape != image_next.shape:
+        return whole
+    light = np.maximum(image_ref, image_next).max(axis=2) > BLACK
+    lines = (np.flatnonzero(light.any(axis=1 - axis)) for axis in (0, 1))
+    inside = [slice(line[0], line[-1] + 1) if len(line) else slice(0, 0) for line in lines]
+    if min(side.stop - side.start for side in inside) < LEAST_CONTENT:
+        return whole
+    return inside[0], inside[1]
+
+
+def flow_between_bars(match: FlowSource, image_ref: Image, image_next: Image) -> Flow:
+    """Flow of the picture between black bars, with confidence 0 on the bars.
+
+    A bar stands still whatever the camera does, and a method that smooths the flow would spread
+    that into the picture.
+    """
+    inside = content(image_ref, image_next)
+    first, second = (np.ascontiguousarray(image[inside]) for image in (image_ref, image_next))
+    flow = match(first, second)
+    if first.shape == image_ref.shape:
+        return flow
+    uv, confidence = np.zeros((*image_ref.shape[:2], 2), np.float32), np.zeros(image_ref.shape[:2])
+    uv[inside], confidence[inside] = flow.uv, flow.confidence
+    return Flow(uv, confidence.astype(np.float32), flow.source)
+
+
 METHODS: dict[str, Callable[[Pair, bool], Flow]] = {
-    "dis": lambda pair, consistency: dis_flow(pair.image_ref, pair.image_next, consistency),
+    "dis": lambda pair, consistency: flow_between_bars(
+        partial(dis_flow, consistency=consistency), pair.image_ref, pair.image_next
+    ),
     "truth": lambda pair, _: flow_from_truth(pair),
 }
 """Flow methods of this package by name: functions of a pair and of `FlowOptions.consistency`."""
@@ -240,7 +277,7 @@ def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
     if source.startswith(NOISE):
         return noisy_truth(pair, source)
     if is_network(source):
-        return learned_flow(source, pair.image_ref, pair.image_next)
+        return flow_between_bars(partial(learned_flow, source), pair.image_ref, pair.image_next)
     plugins = flow_sources()
     if source in plugins:
         return _run_plugin(plugins[source], pair)
