@@ -74,11 +74,8 @@ def camera_of(source: CameraLike, where: str) -> Float:
     """
     if is_path(source):
         return read_intrinsics(Path(source))
-    try:
-        four = np.array(source, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return check_intrinsics(source, where)
-    return check_intrinsics(intrinsics(*four) if four.shape == (4,) else source, where)
+    numbers = array_of(source, "intrinsics", where, "(3, 3), or fx, fy, cx, cy")
+    return check_intrinsics(intrinsics(*numbers) if numbers.shape == (4,) else numbers, where)
 
 
 def prior_of(source: object) -> Float:

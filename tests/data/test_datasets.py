@@ -18,15 +18,21 @@ H, W = 6, 9
 K = np.array([[100.0, 0.0, 4.0], [0.0, 110.0, 3.0], [0.0, 0.0, 1.0]])
 
 
-def picture(path: Path, seed: int = 0, channels: int = 3) -> None:
+def picture(path: Path, values: int | np.ndarray) -> None:
+    """An image file of these values, or of the noise of a seed, below folders that it makes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    noise = np.random.default_rng(seed).integers(0, 256, (H, W, channels)).astype(np.uint8)
-    cv2.imwrite(str(path), noise)
+    if isinstance(values, int):
+        values = np.random.default_rng(values).integers(0, 256, (H, W, 3)).astype(np.uint8)
+    cv2.imwrite(str(path), values)
 
 
 def png16(path: Path, values: np.ndarray) -> None:
+    picture(path, values.astype(np.uint16))
+
+
+def kitti_flow(path: Path, flow: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), values.astype(np.uint16))
+    write_kitti_flow(path, flow)
 
 
 def load(kind: str, where: Path, **options: object):
@@ -60,10 +66,10 @@ def test_folder_with_everything(folder: Path) -> None:
     png16(folder / "depth.png", np.full((H, W), 1500))
     write_dpt(folder / "depth_next.dpt", np.full((H, W), 2.5))
     write_flo(folder / "flow.flo", np.full((H, W, 2), np.nan))
-    cv2.imwrite(str(folder / "occluded.png"), np.full((H, W), 255, np.uint8))
+    picture(folder / "occluded.png", np.full((H, W), 255, np.uint8))
     moving = np.zeros((H, W), np.uint8)
     moving[:2, :2] = moving[4:, 4:] = 255
-    cv2.imwrite(str(folder / "moving.png"), moving)
+    picture(folder / "moving.png", moving)
     xyz = np.array([[1.0, 2.0, 550.0], [1.0, 2.0, np.nan]])
     np.savez(folder / "points.npz", uv_0=np.array([[3.5, 2.5], [1, 1]]), xyz_mm_0=xyz)
     pair = load("folder", folder, depth_scale=1000.0)
@@ -93,34 +99,30 @@ def test_folder_missing(folder: Path, name: str) -> None:
     (folder / name).unlink()
     with raises(rf"dataset is missing[\s\S]*{name}[\s\S]*expected: frame_0\.png"):
         load("folder", folder)
+    with raises("dataset folder is missing"):
+        load("folder", folder / "nowhere")
 
 
 def test_folder_bad_truth(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    np.save(folder / "depth.npy", np.ones((H, W + 1)))
-    with raises("truth and reference image differ in size"):
-        load("folder", folder)
-    (folder / "depth.npy").unlink()
-    for arrays, match in [
-        ({"uv_0": np.zeros((2, 2))}, "lacks an array"),
-        ({"uv_0": np.zeros((2, 2)), "xyz_mm_0": np.zeros((3, 3))}, "wrong shape"),
+    for arrays, unit, match in [
+        ({}, "m", "lacks an array"),
+        ({"xyz_mm_0": np.zeros((3, 3))}, "m", "wrong shape"),
+        ({"xyz_mm_0": np.ones((2, 3))}, "feet", "millimetres"),
+        ({"xyz_mm_0": np.ones((2, 3), complex)}, "m", r"points file, xyz_mm_0\.npy[\s\S]*complex"),
     ]:
-        np.savez(folder / "points.npz", **arrays)
+        np.savez(folder / "points.npz", uv_0=np.zeros((2, 2)), **arrays)
         with raises(match):
-            load("folder", folder)
-    with raises("millimetres"):
-        np.savez(folder / "points.npz", uv_0=np.zeros((2, 2)), xyz_mm_0=np.ones((2, 3)))
-        load("folder", folder, unit="feet")
-    np.savez(folder / "points.npz", uv_0=np.zeros((2, 2)), xyz_mm_0=np.ones((2, 3), complex))
-    with raises(r"points file, xyz_mm_0\.npy[\s\S]*complex"):
-        load("folder", folder)
+            load("folder", folder, unit=unit)
     with monkeypatch.context() as m, raises("points file is too large"):
         m.setattr("soup_nlp.data.formats.map_files.MAX_PIXELS", 1)
         load("folder", folder)
     (folder / "points.npz").write_bytes(b"PK no zip")
     with raises(r"is no \.npz"):
         load("folder", folder)
-    with raises("dataset folder is missing"):
-        load("folder", folder / "nowhere")
+    np.save(folder / "depth.npy", np.ones((H, W + 1)))
+    (folder / "points.npz").unlink()
+    with raises("truth and reference image differ in size"):
+        load("folder", folder)
 
 
 # --- KITTI --------------------------------------------------------------------------------------
@@ -129,7 +131,7 @@ def test_folder_bad_truth(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
 def kitti2012(root: Path) -> Path:
     base = root / "training"
     for k in (10, 11):
-        picture(base / "image_0" / f"000007_{k}.png", k, channels=1)
+        picture(base / "image_0" / f"000007_{k}.png", np.full((H, W), k, np.uint8))
     (base / "calib").mkdir()
     (base / "calib" / "000007.txt").write_text(
         "P0: 100 0 4 0 0 100 3 0 0 0 1 0\nP1: 100 0 4 -54 0 100 3 0 0 0 1 0\n"
@@ -142,8 +144,7 @@ def kitti2012(root: Path) -> Path:
     visible[1] = np.nan
     for suffix, values in (("occ", flow), ("noc", visible)):
         png16(base / f"disp_{suffix}" / "000007_10.png", disparity)
-        (base / f"flow_{suffix}").mkdir()
-        write_kitti_flow(base / f"flow_{suffix}" / "000007_10.png", values)
+        kitti_flow(base / f"flow_{suffix}" / "000007_10.png", values)
     return root
 
 
@@ -166,16 +167,15 @@ def test_kitti2012_errors(tmp_path: Path) -> None:
     for index in ("seven", "-7", ""):
         with pytest.raises(ConfigError, match=r"input\.index[\s\S]*such as '27' or '000027'"):
             load("kitti2012", root, index=index)
-    calib = root / "training" / "calib" / "000007.txt"
-    calib.write_text("P0: 100 0 4 0 0 100 3 0 0 0 1 0\n")
-    with raises(r"lacks P1"):
-        load("kitti2012", root, index="7")
-    calib.write_text("P0: 1 2 3\nP1: 1 2 3\n")
-    with raises(r"P0 is no projection"):
-        load("kitti2012", root, index="7")
-    calib.write_text("P0: 100 0 4 0 0 100 3 0 0 0 1 0\nP1: 100 0 4 0 0 100 3 0 0 0 1 0\n")
-    with raises("no baseline"):
-        load("kitti2012", root, index="7")
+    first = "P0: 100 0 4 0 0 100 3 0 0 0 1 0\n"
+    for text, match in {
+        first: "lacks P1",
+        "P0: 1 2 3\nP1: 1 2 3\n": "P0 is no projection",
+        first + first.replace("P0", "P1"): "no baseline",
+    }.items():
+        (root / "training" / "calib" / "000007.txt").write_text(text)
+        with raises(match):
+            load("kitti2012", root, index="7")
     with raises(r"has no training|has no image_0|nothing"):
         load("kitti2012", tmp_path / "nowhere", index="7")
 
@@ -190,10 +190,8 @@ def test_kitti2015(tmp_path: Path) -> None:
         "P_rect_02: 100 0 4 5 0 100 3 0 0 0 1 0\nP_rect_03: 100 0 4 -49 0 100 3 0 0 0 1 0\n"
     )
     png16(base / "disp_occ_0" / "000001_10.png", np.full((H, W), 10 * 256))
-    (base / "flow_occ").mkdir()
-    write_kitti_flow(base / "flow_occ" / "000001_10.png", np.full((H, W, 2), 2.0))
-    (base / "obj_map").mkdir()
-    cv2.imwrite(str(base / "obj_map" / "000001_10.png"), np.eye(H, W, dtype=np.uint8))
+    kitti_flow(base / "flow_occ" / "000001_10.png", np.full((H, W, 2), 2.0))
+    picture(base / "obj_map" / "000001_10.png", np.eye(H, W, dtype=np.uint8))
     truth = load("kitti2015", tmp_path, index="1").truth
     assert truth.depth_next is None
     assert truth.occluded is None
@@ -255,19 +253,18 @@ def test_vkitti2(tmp_path: Path) -> None:
 def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("soup_nlp.data.datasets.benchmarks.DEFAULT_CAMERA", (688, 688, 4, 2.5))
     base = tmp_path / "training"
-    for number in (1, 2):
-        picture(base / "final" / "cave_2" / f"frame_{number:04d}.png", number)
+    for scene in ("cave_2", "alley_1"):
+        for number in (1, 2):
+            picture(base / "final" / scene / f"frame_{number:04d}.png", number)
     with pytest.warns(DataWarning, match=r"cave_2/frame_0001\.cam.*alley_1"):
         pair = load("sintel", tmp_path, scene="cave_2", frame=1, render="final")
     assert pair.K_ref[0, 0] == 688
-    for number in (1, 2):
-        picture(base / "final" / "alley_1" / f"frame_{number:04d}.png", number)
     # the default camera is that of alley_1, but the warning still says that no file gives it
     with pytest.warns(
         DataWarning, match=r"camdata_left.*assumed: the focal length of alley_1, 688 pixels$"
     ):
         assert load("sintel", tmp_path, scene="alley_1", frame=1, render="final").K_ref[0, 0] == 688
-    for kind in ("camdata_left", "depth", "flow", "occlusions", "invalid"):
+    for kind in ("camdata_left", "depth", "flow"):
         (base / kind / "cave_2").mkdir(parents=True)
     for number, focal in ((1, 100.0), (2, 120.0)):
         name = f"cave_2/frame_{number:04d}"
@@ -279,15 +276,15 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_flo(base / "flow" / "cave_2" / "frame_0001.flo", flow)
     mask = np.zeros((H, W), np.uint8)
     mask[0, 5] = 255
-    cv2.imwrite(str(base / "occlusions" / "cave_2" / "frame_0001.png"), mask)
-    cv2.imwrite(str(base / "invalid" / "cave_2" / "frame_0001.png"), np.roll(mask, 1, axis=0))
+    picture(base / "occlusions" / "cave_2" / "frame_0001.png", mask)
+    picture(base / "invalid" / "cave_2" / "frame_0001.png", np.roll(mask, 1, axis=0))
     pair = load("sintel", tmp_path, scene="cave_2", frame=1, render="final")
     truth = pair.truth
     assert (pair.K_ref[0, 0], pair.K_next[0, 0]) == (100.0, 120.0)
     assert truth.depth_next[0, 0] == 120.0
     assert truth.occluded.sum() == H + 1
     assert np.isnan(truth.flow).any(axis=2).sum() == 1
-    cv2.imwrite(str(base / "invalid" / "cave_2" / "frame_0001.png"), mask[1:])
+    picture(base / "invalid" / "cave_2" / "frame_0001.png", mask[1:])
     with raises("mask and flow differ in size"):
         load("sintel", tmp_path, scene="cave_2", frame=1, render="final")
     with raises(r"clean/cave_2|has no clean"):
@@ -311,9 +308,20 @@ def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
     np.testing.assert_array_equal(pair.truth.depth_ref, 1.0)
     np.testing.assert_array_equal(pair.truth.depth_next, 3.0)
     (root / "camera.txt").write_text("90 91 4 3")
-    pair_1 = load("tum", root, frame=1, depth_scale=5000.0)
+    pair_1 = load("tum", root, frame=1, depth_scale=1000.0)
     assert pair_1.truth.depth_ref is None
+    assert pair_1.truth.depth_next[0, 0] == 15
     assert (pair_1.K_ref[0, 0], pair_1.K_next[1, 1]) == (90, 91)
+    with pytest.warns(DataWarning, match="depth is not given; assumed: 5000 values"):
+        assert load("tum", root).truth.depth_ref[0, 0] == 1
+    (root / "camera.txt").rename(root / "K.txt")
+    assert load("tum", root, depth_scale=5000.0).K_ref[0, 0] == 90
+    (root / "K.txt").unlink()
+    other = root.rename(tmp_path / "other")
+    with pytest.warns(DataWarning, match="assumed: the intrinsics of the default camera"):
+        assert load("tum", other, depth_scale=5000.0).K_ref[0, 0] == 525
+    other.rename(root)
+    (root / "K.txt").write_text("90 91 4 3")
     with raises(r"not in the sequence[\s\S]*0 to 2"):
         load("tum", root, frame=2, depth_scale=5000.0)
     (root / "rgb" / "1.png").unlink()

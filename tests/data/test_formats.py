@@ -1,39 +1,157 @@
-"""Flow and depth files: golden bytes, round trips, malformed files."""
+"""Files of flow, depth, cameras and images: golden bytes, round trips, malformed files."""
 
 from __future__ import annotations
 
+import io
 import struct
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from helpers_files import put, raises, write_dpt, write_flo, write_kitti_flow, write_pfm
+from helpers_files import put, raises, write_cam, write_dpt, write_flo, write_kitti_flow, write_pfm
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from soup_nlp.data.formats import camera_files
 from soup_nlp.data.formats import map_files as fmt
-from soup_nlp.data.formats.camera_files import read_kitti_projections
+from soup_nlp.data.formats.images import read_image, read_mask
 
 many = settings(
     max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 shapes = st.tuples(st.integers(1, 7), st.integers(1, 7))
+K = np.array([[688.0, 0.0, 511.5], [0.0, 688.5, 217.5], [0.0, 0.0, 1.0]])
 
 
-def floats(low: float, high: float) -> st.SearchStrategy[np.ndarray]:
-    return shapes.flatmap(
-        lambda s: hnp.arrays(np.float32, s, elements=st.floats(low, high, width=32))
-    )
-
-
-def flows(low: float, high: float) -> st.SearchStrategy[np.ndarray]:
+def floats(low: float, high: float, *channels: int) -> st.SearchStrategy[np.ndarray]:
     number = st.floats(low, high, width=32)
-    return shapes.flatmap(lambda s: hnp.arrays(np.float32, (*s, 2), elements=number))
+    return shapes.flatmap(lambda s: hnp.arrays(np.float32, (*s, *channels), elements=number))
 
 
-# --- .flo ---------------------------------------------------------------------------------------
+# --- malformed files ----------------------------------------------------------------------------
+
+
+def stored(path: Path, content: bytes | str | np.ndarray) -> Path:
+    """A file of these bytes, or of an image, whose format is the suffix."""
+    if isinstance(content, np.ndarray):
+        cv2.imwrite(str(path), content)
+        return path
+    return put(path, content if isinstance(content, bytes) else content.encode())
+
+
+def npy(values: object) -> bytes:
+    """Content of a .npy file."""
+    stream = io.BytesIO()
+    np.save(stream, np.asarray(values))
+    return stream.getvalue()
+
+
+def sized(width: int, height: int, count: int) -> bytes:
+    """A .flo or .dpt file with a body of `count` bytes."""
+    return b"PIEH" + struct.pack("<ii", width, height) + bytes(count)
+
+
+COLUMNS = "frame cameraID K[0,0] K[1,1] K[0,2] K[1,2]"
+READERS = {
+    ".flo": fmt.read_flow,
+    ".dpt": fmt.read_depth,
+    "flow": fmt.read_flow,
+    "depth": partial(fmt.read_depth, scale=1000.0),
+    "cam": camera_files.read_cam,
+    "camera": camera_files.read_intrinsics,
+    "kitti": partial(camera_files.read_kitti_projections, names=["P0"]),
+    "vkitti": partial(camera_files.read_vkitti2_intrinsics, frames=(0,)),
+    "image": read_image,
+}
+MALFORMED = [
+    *(
+        (suffix, f"a{suffix}", content, match)
+        for suffix, size in ((".flo", 96), (".dpt", 48))
+        for content, match in (
+            (b"", "is empty"),
+            (b"PIEX" + bytes(16), "wrong magic number"),
+            (b"PIEH\x01", "truncated"),
+            (sized(4, 3, size - 1), "truncated"),
+            (sized(4, 3, size + 1), "left over"),
+            (sized(0, 3, 0), "impossible size"),
+            (sized(-4, 3, size), "impossible size"),
+            (sized(2**31 - 1, 2**31 - 1, 0), "impossible size"),
+        )
+    ),
+    ("flow", "a.png", np.zeros((4, 4, 3), np.uint8), "uint8 with 3 channel"),
+    ("flow", "a.png", np.zeros((4, 4), np.uint16), "uint16 with 1 channel"),
+    ("flow", "a.png", np.full((8, 9, 3), (2**15, 2**15, 1), np.uint16), "channels exchanged"),
+    ("flow", "a.tiff", "", r"unknown suffix[\s\S]*\.flo, \.png, \.npy"),
+    ("flow", "a.npy", npy(["x"]), "does not hold numbers"),
+    ("flow", "a.npy", npy(np.ones((3, 4, 2)))[:-9], r"not a readable \.npy"),
+    ("flow", "a.npy", npy(np.ones((3, 4, 2))) + b"x", "left over"),
+    ("flow", "a.npy", npy(np.zeros((3, 4))), "wrong shape"),
+    ("depth", "a.npy", npy(np.zeros((2, 2, 1))), "wrong shape"),
+    ("depth", "a.png", np.zeros((4, 4), np.uint8), "16-bit PNG with 1 channel"),
+    ("depth", "a.pfm", b"PF\n1 1\n-1.0\n" + bytes(12), "in colour"),
+    ("depth", "a.pfm", b"P5\n1 1\n255\n0", "damaged header"),
+    ("depth", "a.pfm", b"Pf\n1 1\n0\n" + bytes(4), "damaged header"),
+    ("depth", "a.pfm", b"Pf\n1 1\n1e1e\n" + bytes(4), "damaged header"),
+    ("depth", "a.pfm", b"Pf\n0 1\n-1\n", "impossible size"),
+    ("depth", "a.pfm", b"Pf\n2 2\n-1\n" + bytes(15), "truncated"),
+    ("cam", "a.cam", b"PIEH" + bytes(100), "truncated"),
+    ("cam", "a.cam", bytes(172), "wrong magic"),
+    ("cam", "a.cam", b"PIEH" + bytes(168), "focal lengths must be positive"),
+    ("camera", "K.txt", "1 2 3", "wrong number of values"),
+    ("camera", "K.txt", "80 80 47.5 31.5 640 480", "wrong number of values"),
+    ("camera", "K.txt", "688 f 1 2", "not a number"),
+    ("camera", "K.txt", "-688 688 1 2", "must be positive"),
+    ("camera", "K.txt", "481.2 0 319.5\n0 -480 239.5\n0 0 1\n", "fy without its sign"),
+    ("camera", "K.txt", "nan 688 1 2", "not finite"),
+    ("camera", "K.txt", "688 0 5 1 688 2 0 0 1", "upper triangular"),
+    ("camera", "K.txt", b"\xff\xfe\x00\x81", "is not text"),
+    ("camera", "K.yaml", "camera_model: equidistant\nK: [1, 0, 0, 0, 1, 0, 0, 0, 1]", "fisheye"),
+    ("kitti", "calib.txt", "1 2 3", "lacks P0"),
+    ("kitti", "calib.txt", "P1: 1 2", r"lacks P0[\s\S]*found: P1"),
+    ("kitti", "calib.txt", "P0: 1 2 x", "not a number"),
+    ("kitti", "calib.txt", "P0: 1 2 3", r"no projection[\s\S]*3 numbers"),
+    ("kitti", "calib.txt", "P0:" + 12 * " nan", r"no projection[\s\S]*0 of them finite"),
+    ("vkitti", "a.txt", "frame K[0,0]\n0 1\n", "lacks columns"),
+    ("vkitti", "a.txt", f"{COLUMNS}\n0 0 725 x 620.5 187\n", "not a number"),
+    ("vkitti", "a.txt", f"{COLUMNS}\n0 1 7 7 6 1\n\n0 0 7\n", r"1 complete rows[\s\S]*frame 0"),
+    ("image", "a.png", b"not an image at all", r"cannot be decoded[\s\S]*not an i"),
+    ("image", "a.tiff", np.zeros((4, 4), np.float32), "neither 8-bit nor 16-bit"),
+]
+
+
+@pytest.mark.parametrize(("kind", "name", "content", "match"), MALFORMED)
+def test_a_malformed_file_is_refused(
+    kind: str, name: str, content: bytes | str | np.ndarray, match: str, tmp_path: Path
+) -> None:
+    with raises(match) as caught:
+        READERS[kind](stored(tmp_path / name, content))
+    assert name in str(caught.value)
+
+
+def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
+    put(tmp_path / "flow_0.flo", b"x")
+    (tmp_path / "flow_2.flo").mkdir()
+    for name, match in {
+        "flow_1.flo": r"flow file is missing[\s\S]*flow_0\.flo",
+        "nowhere/a.flo": r"folder .* does not exist",
+        "flow_2.flo": "cannot be read",
+    }.items():
+        with raises(match):
+            fmt.read_flow(tmp_path / name)
+    with raises("image is missing"):
+        read_image(tmp_path / "none.png")
+
+
+@pytest.mark.parametrize("scale", [0, -1, np.nan, np.inf])
+def test_a_scale_of_depth_is_positive(scale: float, tmp_path: Path) -> None:
+    with raises("scale must be positive"):
+        fmt.read_depth_png16(tmp_path / "a.png", scale)
+
+
+# --- flow ---------------------------------------------------------------------------------------
 
 
 def test_flo_golden_bytes(tmp_path: Path) -> None:
@@ -58,137 +176,45 @@ def test_real_files(shared_data: Path, tmp_path: Path) -> None:
     flow = fmt.read_flow(folder / "flow_occ" / "000027_10.png")
     write_kitti_flow(tmp_path / "a.png", flow)
     np.testing.assert_array_equal(fmt.read_flow(tmp_path / "a.png"), flow)
-    (projection,) = read_kitti_projections(folder / "calib" / "000027.txt", ["P1"])
+    calibration = folder / "calib" / "000027.txt"
+    (projection,) = camera_files.read_kitti_projections(calibration, ["P1"])
     assert projection[0, 3] == -386.1448
 
 
-@many
-@given(flow=flows(-1e9, 1e9))
-def test_flo_round_trip(tmp_path: Path, flow: np.ndarray) -> None:
-    write_flo(tmp_path / "a.flo", flow)
-    np.testing.assert_array_equal(fmt.read_flow(tmp_path / "a.flo"), flow)
-
-
 @pytest.mark.parametrize("mark", [np.nan, np.inf, -np.inf, 1.1e9, -2e9])
-def test_flo_unknown(tmp_path: Path, mark: float) -> None:
-    body = struct.pack("<fii4f", 202021.25, 2, 1, 1.0, mark, 1.0, 1.0)
-    flow = fmt.read_flow(put(tmp_path / "a.flo", body))
-    assert np.isnan(flow[0, 0]).all()
-    assert np.isfinite(flow[0, 1]).all()
-
-
-def sized(width: int, height: int, count: int) -> bytes:
-    """A .flo or .dpt file with a body of `count` bytes."""
-    return b"PIEH" + struct.pack("<ii", width, height) + bytes(count)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "match"),
-    [
-        ("a.flo", b"", "is empty"),
-        ("a.flo", b"PIEX" + bytes(16), "wrong magic number"),
-        ("a.flo", b"PIEH\x01", "truncated"),
-        ("a.flo", sized(4, 3, 95), "truncated"),
-        ("a.flo", sized(4, 3, 97), "left over"),
-        ("a.flo", sized(0, 3, 0), "impossible size"),
-        ("a.flo", sized(-4, 3, 96), "impossible size"),
-        ("a.flo", sized(2**31 - 1, 2**31 - 1, 0), "impossible size"),
-        ("a.dpt", b"", "is empty"),
-        ("a.dpt", b"PIEX" + bytes(16), "wrong magic number"),
-        ("a.dpt", b"PIEH\x01", "truncated"),
-        ("a.dpt", sized(4, 3, 47), "truncated"),
-        ("a.dpt", sized(4, 3, 49), "left over"),
-        ("a.dpt", sized(0, 3, 0), "impossible size"),
-        ("a.dpt", sized(-4, 3, 48), "impossible size"),
-        ("a.dpt", sized(2**31 - 1, 2**31 - 1, 0), "impossible size"),
-        ("a.pfm", b"PF\n1 1\n-1.0\n" + bytes(12), "in colour"),
-        ("a.pfm", b"P5\n1 1\n255\n0", "damaged header"),
-        ("a.pfm", b"Pf\n1 1\n0\n" + bytes(4), "damaged header"),
-        ("a.pfm", b"Pf\n1 1\n1e1e\n" + bytes(4), "damaged header"),
-        ("a.pfm", b"Pf\n0 1\n-1\n", "impossible size"),
-        ("a.pfm", b"Pf\n2 2\n-1\n" + bytes(15), "truncated"),
-    ],
-)
-def test_a_malformed_file_is_refused(name: str, content: bytes, match: str, tmp_path: Path) -> None:
-    read = fmt.read_flow if name == "a.flo" else fmt.read_depth
-    with raises(match) as caught:
-        read(put(tmp_path / name, content))
-    assert name in str(caught.value)
-
-
-def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
-    put(tmp_path / "flow_0.flo", b"x")
-    with raises(r"flow file is missing[\s\S]*flow_0\.flo"):
-        fmt.read_flow(tmp_path / "flow_1.flo")
-    with raises(r"folder .* does not exist"):
-        fmt.read_flow(tmp_path / "nowhere" / "a.flo")
-    (tmp_path / "flow_2.flo").mkdir()
-    with raises("cannot be read"):
-        fmt.read_flow(tmp_path / "flow_2.flo")
-
-
-# --- flow in PNG --------------------------------------------------------------------------------
-
-
-def test_kitti_flow_channel_order(tmp_path: Path) -> None:
-    rgb = np.array([[[2**15 + 64, 2**15 - 128, 1], [1, 2, 0]]], np.uint16)
-    cv2.imwrite(str(tmp_path / "a.png"), rgb[:, :, ::-1])
-    flow = fmt.read_flow(tmp_path / "a.png")
-    np.testing.assert_array_equal(flow, [[[1.0, -2.0], [np.nan, np.nan]]])
+def test_unknown_flow(tmp_path: Path, mark: float) -> None:
+    flow = np.array([[[1, mark], [1, 1]]], "<f4")
+    files = {"a.flo": sized(2, 1, 0) + flow.tobytes(), "a.npy": npy(flow)}
+    for path in (put(tmp_path / name, content) for name, content in files.items()):
+        np.testing.assert_array_equal(fmt.read_flow(path), [[[np.nan, np.nan], [1, 1]]])
 
 
 @many
-@given(flow=flows(-512, 511.875))
-def test_kitti_flow_round_trip(tmp_path: Path, flow: np.ndarray) -> None:
+@given(flow=floats(-512, 511.875, 2))
+def test_flow_round_trips(tmp_path: Path, flow: np.ndarray) -> None:
     flow[0, 0] = np.nan
+    # capital letters are a suffix, too
+    write_flo(tmp_path / "A.FLO", 1e6 * flow)
+    np.testing.assert_array_equal(fmt.read_flow(tmp_path / "A.FLO"), 1e6 * flow)
     write_kitti_flow(tmp_path / "a.png", flow)
     np.testing.assert_allclose(fmt.read_flow(tmp_path / "a.png"), flow, atol=1 / 128, rtol=0)
 
 
-def test_kitti_flow_rejects_8_bit(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4, 3), np.uint8))
-    with raises(r"uint8 with 3 channel"):
-        fmt.read_flow(tmp_path / "a.png")
-    cv2.imwrite(str(tmp_path / "b.png"), np.zeros((4, 4), np.uint16))
-    with raises(r"uint16 with 1 channel"):
-        fmt.read_flow(tmp_path / "b.png")
+def test_kitti_flow_channel_order(tmp_path: Path) -> None:
+    rgb = np.array([[[2**15 + 64, 2**15 - 128, 1], [1, 2, 0]]], np.uint16)
+    flow = fmt.read_flow(stored(tmp_path / "a.png", rgb[:, :, ::-1]))
+    np.testing.assert_array_equal(flow, [[[1.0, -2.0], [np.nan, np.nan]]])
 
 
 def test_vkitti_flow(tmp_path: Path) -> None:
     height, width = 5, 11
-    flow = np.zeros((height, width, 2))
-    flow[..., 0], flow[..., 1] = 3.0, -1.5
+    flow = np.full((height, width, 2), (3.0, -1.5))
     code = np.rint((flow / [width - 1, height - 1] + 1) / 2 * 65535)
     bgr = np.dstack([np.ones((height, width)), code[..., 1], code[..., 0]]).astype(np.uint16)
     bgr[0, 0, 0] = 0
-    cv2.imwrite(str(tmp_path / "a.png"), bgr)
-    back = fmt.read_vkitti_flow(tmp_path / "a.png")
+    back = fmt.read_vkitti_flow(stored(tmp_path / "a.png", bgr))
     assert np.isnan(back[0, 0]).all()
     np.testing.assert_allclose(back[1:], flow[1:], atol=2 * (width - 1) / 65535)
-
-
-def test_read_flow_npy_and_suffixes(tmp_path: Path) -> None:
-    flow = np.ones((3, 4, 2))
-    flow[0, 0, 1] = np.inf
-    flow[0, 1, 0] = 1e10
-    np.save(tmp_path / "a.npy", flow)
-    back = fmt.read_flow(tmp_path / "a.npy")
-    assert np.isnan(back[0, :2]).all()
-    assert (back[1:] == 1).all()
-    write_flo(tmp_path / "A.FLO", flow[1:])
-    assert (fmt.read_flow(tmp_path / "A.FLO") == 1).all()
-    with raises(r"unknown suffix[\s\S]*\.flo, \.png, \.npy"):
-        fmt.read_flow(tmp_path / "a.tiff")
-    np.save(tmp_path / "b.npy", np.array(["x"]))
-    with raises("does not hold numbers"):
-        fmt.read_flow(tmp_path / "b.npy")
-    whole = (tmp_path / "a.npy").read_bytes()
-    for content, match in ((whole[:-9], "not a readable .npy"), (whole + b"x", "left over")):
-        with raises(match):
-            fmt.read_flow(put(tmp_path / "c.npy", content))
-    np.save(tmp_path / "d.npy", np.zeros((3, 4)))
-    with raises("wrong shape"):
-        fmt.read_flow(tmp_path / "d.npy")
 
 
 # --- depth --------------------------------------------------------------------------------------
@@ -210,14 +236,13 @@ def test_dpt_and_pfm_round_trip(tmp_path: Path, depth: np.ndarray) -> None:
     scale=st.sampled_from([100, 256, 1000, 5000.0]),
 )
 def test_png16_values(tmp_path: Path, code: np.ndarray, scale: float) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), code)
-    depth = fmt.read_depth_png16(tmp_path / "a.png", scale)
+    depth = fmt.read_depth_png16(stored(tmp_path / "a.png", code), scale)
     np.testing.assert_array_equal(np.isnan(depth), code == 0)
     np.testing.assert_allclose(depth[code > 0], code[code > 0] / scale)
     np.testing.assert_array_equal(fmt.read_depth(tmp_path / "a.png", scale), depth)
 
 
-def test_depth_unknown_values(tmp_path: Path) -> None:
+def test_unknown_depth(tmp_path: Path) -> None:
     depth = np.array([[1.0, 0.0, -1.0, np.inf, np.nan]])
     np.save(tmp_path / "a.npy", depth)
     write_dpt(tmp_path / "a.dpt", depth)
@@ -229,38 +254,71 @@ def test_depth_unknown_values(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("scale", "order"), [(b"-1.0", "<f4"), (b"1", ">f4"), (b"-3.5e-1", "<f4")])
-def test_pfm_golden_bytes(tmp_path: Path, scale: bytes, order: str) -> None:
+@pytest.mark.parametrize("comment", [b"# made by a program\n", b"# one\n# two\r\n", b""])
+def test_pfm_golden_bytes(tmp_path: Path, scale: bytes, order: str, comment: bytes) -> None:
     rows = np.array([[1, 2, 3], [4, 5, 6]], order)
-    path = put(tmp_path / "a.pfm", b"Pf\n3 2\n" + scale + b"\n" + rows[::-1].tobytes())
+    head = b"Pf\n" + comment + b"3 2\n" + comment + scale + b"\n"
+    path = put(tmp_path / "a.pfm", head + rows[::-1].tobytes())
     np.testing.assert_array_equal(fmt.read_pfm(path), rows)
 
 
-@pytest.mark.parametrize("comment", [b"# made by a program\n", b"# one\n# two\r\n", b""])
-def test_a_pfm_with_comments_is_read(comment: bytes, tmp_path: Path) -> None:
-    depth = np.arange(1, 13, dtype=np.float32).reshape(3, 4)
-    write_pfm(tmp_path / "a.pfm", depth)
-    content = (tmp_path / "a.pfm").read_bytes()
-    for line in (b"Pf\n", b"4 3\n"):
-        head, tail = content.split(line, 1)
-        (tmp_path / "a.pfm").write_bytes(head + line + comment + tail)
-        np.testing.assert_array_equal(fmt.read_depth(tmp_path / "a.pfm"), depth)
-
-
-def test_png16_errors(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
-    with raises("16-bit PNG with 1 channel"):
-        fmt.read_depth(tmp_path / "a.png", 1000.0)
-    for scale in (0, -1, np.nan, np.inf):
-        with raises("scale must be positive"):
-            fmt.read_depth_png16(tmp_path / "a.png", scale)
-    np.save(tmp_path / "c.npy", np.zeros((2, 2, 1)))
-    with raises("wrong shape"):
-        fmt.read_depth(tmp_path / "c.npy")
-
-
 def test_kitti_disparity_and_vkitti_depth(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, 256, 384, 65535]], np.uint16))
-    disparity = fmt.read_depth_png16(tmp_path / "a.png", fmt.KITTI_DISPARITY)
+    path = stored(tmp_path / "a.png", np.array([[0, 256, 384, 65535]], np.uint16))
+    disparity = fmt.read_depth_png16(path, fmt.KITTI_DISPARITY)
     np.testing.assert_array_equal(disparity, [[np.nan, 1.0, 1.5, 65535 / 256]])
-    depth = fmt.read_vkitti_depth(tmp_path / "a.png")
-    np.testing.assert_array_equal(depth, [[np.nan, 2.56, 3.84, np.nan]])
+    np.testing.assert_array_equal(fmt.read_vkitti_depth(path), [[np.nan, 2.56, 3.84, np.nan]])
+
+
+# --- cameras ------------------------------------------------------------------------------------
+
+
+def test_cameras(tmp_path: Path) -> None:
+    write_cam(tmp_path / "a.cam", K)
+    np.testing.assert_array_equal(camera_files.read_cam(tmp_path / "a.cam"), K)
+    for text in ("# camera\n688, 0, 511.5\n0 688.5 217.5\n0 0 1\n", "688 688.5 511.5 217.5"):
+        path = put(tmp_path / "K.txt", text.encode())
+        np.testing.assert_array_equal(camera_files.read_intrinsics(path), K)
+    path = put(tmp_path / "K.txt", b"80 80 47.5 31.5 0 0 0 0 0")
+    assert camera_files.read_intrinsics(path)[0, 0] == 80
+
+
+def test_kitti_projections(tmp_path: Path) -> None:
+    path = tmp_path / "calib.txt"
+    path.write_text(
+        "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.950000e-02\n"
+        "K_00: 1 2 3 4 5 6 7 8 9\n\nP_rect_00: 1 2 3 4 5 6 7 8 9 10 11 12\nT_00: 1 2 3\n"
+    )
+    (projection,) = camera_files.read_kitti_projections(path, ["P_rect_00"])
+    np.testing.assert_array_equal(projection, np.arange(1, 13).reshape(3, 4))
+
+
+def test_vkitti_intrinsics(tmp_path: Path) -> None:
+    path = tmp_path / "intrinsic.txt"
+    path.write_text(f"{COLUMNS}\n0 0 725 726 620.5 187\n0 1 7 7 6 1\n1 0 730 730 6 1\n\n2 0 725\n")
+    first, second = camera_files.read_vkitti2_intrinsics(path, (0, 1))
+    np.testing.assert_array_equal(first, [[725, 0, 620.5], [0, 726, 187], [0, 0, 1]])
+    assert second[0, 0] == 730
+    for missing in (2, 3):
+        with raises(rf"3 complete rows[\s\S]*a row of frame {missing}"):
+            camera_files.read_vkitti2_intrinsics(path, (0, missing))
+
+
+# --- images -------------------------------------------------------------------------------------
+
+
+def test_image_kinds(tmp_path: Path) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (6, 5, 3)).astype(np.uint8)
+    bgr, path = rgb[:, :, ::-1], tmp_path / "a.png"
+    grey = np.repeat(rgb[:, :, :1], 3, axis=2)
+    with_alpha = np.dstack([bgr, np.zeros((6, 5), np.uint8)])
+    for content, image in ((bgr, rgb), (with_alpha, rgb), (rgb[:, :, 0], grey)):
+        np.testing.assert_array_equal(read_image(stored(path, content)), image)
+    out = read_image(stored(path, bgr.astype(np.uint16) * 257), white=65535)
+    np.testing.assert_array_equal(out, rgb)
+    assert out.dtype == np.uint8
+    assert out.flags.c_contiguous
+
+
+def test_mask(tmp_path: Path) -> None:
+    path = stored(tmp_path / "m.png", np.array([[0, 127, 128, 255]], np.uint8))
+    assert read_mask(path).tolist() == [[False, False, True, True]]

@@ -13,8 +13,7 @@ from helpers_photos import load, photo, photos, said, texture
 from PIL import Image
 
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.datasets.folders import TumInput
-from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
+from soup_nlp.data.formats.camera_files import read_camera
 from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.working_size import scaled_camera
@@ -164,52 +163,7 @@ def test_undistortion_needs_the_file_of_a_camera_and_no_truth(folder: Path) -> N
             load(folder, undistort=True, **keys)
 
 
-def test_undistorted_lenses_and_other_distortion_models(folder: Path) -> None:
-    (folder / "K.txt").write_text("80 80 47.5 31.5 0 0 0 0 0")
-    assert read_intrinsics(folder / "K.txt")[0, 0] == 80
-    (folder / "K.yaml").write_text("camera_model: equidistant\nK: [1, 0, 0, 0, 1, 0, 0, 0, 1]")
-    with pytest.raises(DataError, match="fisheye"):
-        read_intrinsics(folder / "K.yaml")
-    (folder / "K.txt").write_text("80 80 47.5 31.5 640 480")
-    with pytest.raises(DataError, match="wrong number of values"):
-        read_intrinsics(folder / "K.txt")
-
-
-# --- layouts of other TUM sensors ----------------------------------------------------------------
-
-
-def tum(folder: Path, **options):
-    return TumInput(kind="tum", path=str(folder), **options).load(Path)
-
-
-@pytest.mark.parametrize("name", ["K.txt", "camera.txt", None])
-def test_tum_format_of_other_sensors(name: str | None, tmp_path: Path) -> None:
-    (tmp_path / "rgb").mkdir()
-    for k in range(2):
-        # the middle of the default camera of TUM
-        cv2.imwrite(str(tmp_path / "rgb" / f"{k}.png"), texture(640, 480, k))
-    (tmp_path / "rgb.txt").write_text("0.0 rgb/0.png\n0.1 rgb/1.png\n")
-    if name is None:
-        with pytest.warns(DataWarning, match="assumed: the intrinsics of the default camera"):
-            assert tum(tmp_path).K_ref[0, 0] == 525
-        return
-    (tmp_path / name).write_text("# fx fy cx cy\n542.8 542.6 315.6 237.8\n")
-    assert tum(tmp_path).K_next[0, 0] == 542.8
-    # the assumed scale of depth is in a warning, too
-    cv2.imwrite(str(tmp_path / "d.png"), np.full((480, 640), 1000, np.uint16))
-    (tmp_path / "depth.txt").write_text("0.0 d.png\n")
-    with pytest.warns(DataWarning, match="depth is not given; assumed: 5000 values"):
-        assert tum(tmp_path).truth.depth_ref[0, 0] == 0.2
-    assert (
-        TumInput(kind="tum", path=str(tmp_path), depth_scale=1000.0)
-        .load(Path)
-        .truth.depth_ref[0, 0]
-        == 1
-    )
-    # a camera whose y axis points up
-    (tmp_path / name).write_text("481.2 0 319.5\n0 -480 239.5\n0 0 1\n")
-    with pytest.raises(DataError, match="fy without its sign"):
-        tum(tmp_path)
+# --- depth ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["files", "folder"])

@@ -1,4 +1,4 @@
-"""Plain loops of the original TRW-S, brute force, linear programs and random problems."""
+"""Plain loops of the original TRW-S, brute force and random problems."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 from hypothesis import strategies as st
-from scipy.optimize import linprog
-from scipy.sparse import coo_array
 
 from soup_nlp.mrf.levels import colours
 from soup_nlp.mrf.trws import solve_trws
@@ -123,33 +121,6 @@ def brute(unary, edges, tables):
         + sum(t[labels[a], labels[b]] for (a, b), t in zip(edges, tables))
         for labels in itertools.product(*(range(len(u)) for u in unary))
     )
-
-
-def local_polytope(unary, edges, tables):
-    """Optimum of the linear program over the local polytope, by HiGHS."""
-    starts = np.concatenate([[0], np.cumsum([len(u) for u in unary])])
-    at = int(starts[-1])
-    cost = [np.asarray(u, float) for u in unary]
-    row, column, value, right = [], [], [], []
-    for i, u in enumerate(unary):
-        row += [len(right)] * len(u)
-        column += list(range(starts[i], starts[i] + len(u)))
-        value += [1.0] * len(u)
-        right.append(1.0)
-    for (a, b), table in zip(edges, tables):
-        index = at + np.arange(table.size).reshape(table.shape)
-        at += table.size
-        cost.append(table.ravel())
-        for node, lines in ((a, index), (b, index.T)):
-            for x, line in enumerate(lines):
-                row += [len(right)] * (len(line) + 1)
-                column += [*line.tolist(), int(starts[node]) + x]
-                value += [1.0] * len(line) + [-1.0]
-                right.append(0.0)
-    matrix = coo_array((value, (row, column)), shape=(len(right), at)).tocsr()
-    solved = linprog(np.concatenate(cost), A_eq=matrix, b_eq=right, bounds=(0, None))
-    assert solved.status == 0
-    return solved.fun
 
 
 def random_tree(rng, n):

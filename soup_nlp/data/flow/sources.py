@@ -29,6 +29,9 @@ from soup_nlp.storage.files import PathLike, is_file
 
 FlowSource = Callable[[Image, Image], Flow]
 
+METHODS = ("dis", "truth")
+"""Flow methods of this package."""
+
 ENTRY_POINTS = "soup_nlp.flow"
 """Entry-point group in which other packages register flow methods."""
 
@@ -251,29 +254,23 @@ def flow_between_bars(match: FlowSource, image_ref: Image, image_next: Image) ->
     return Flow(uv, confidence.astype(np.float32), flow.source)
 
 
-METHODS: dict[str, Callable[[Pair, bool], Flow]] = {
-    "dis": lambda pair, consistency: flow_between_bars(
-        partial(dis_flow, consistency=consistency), pair.image_ref, pair.image_next
-    ),
-    "truth": lambda pair, _: flow_from_truth(pair),
-}
-"""Flow methods of this package by name: functions of a pair and of `FlowOptions.consistency`."""
-
-
 def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
     """The flow of a pair from a named source.
 
     Args:
         pair: The pair; its `flow` is ignored.
-        source: One of `METHODS`, "truth+noise:SIGMA" (`noisy_truth`), the name of a plug-in, the
-            path of a network (.onnx) or of a flow file.
+        source: "dis", "truth", "truth+noise:SIGMA" (`noisy_truth`), the name of a plug-in, the path
+            of a network (.onnx) or of a flow file.
         consistency: Whether DIS weights its flow by the forward-backward consistency.
 
     Raises:
         DataError: the source is unknown or fails, or its flow has another size.
     """
-    if source in METHODS:
-        return METHODS[source](pair, consistency)
+    if source == "dis":
+        method = partial(dis_flow, consistency=consistency)
+        return flow_between_bars(method, pair.image_ref, pair.image_next)
+    if source == "truth":
+        return flow_from_truth(pair)
     if source.startswith(NOISE):
         return noisy_truth(pair, source)
     if is_network(source):

@@ -12,11 +12,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.images import check_body
 from soup_nlp.data.formats.map_files import after_magic
-from soup_nlp.errors import DataError, printable, repr_of
+from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.storage.files import PathLike, parse_yaml, read_text
 
@@ -24,7 +25,7 @@ CAMERA = ("fx", "fy", "cx", "cy")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of distortion in OpenCV's order; up to six more have no common names."""
 
-_VKITTI2_COLUMNS = ("frame", "cameraID", "K[0,0]", "K[1,1]", "K[0,2]", "K[1,2]")
+_VKITTI2_COLUMNS = ["frame", "cameraID", "K[0,0]", "K[1,1]", "K[0,2]", "K[1,2]"]
 
 
 def _numbers(text: str, where: PathLike, what: str) -> list[float]:
@@ -40,21 +41,13 @@ def _numbers(text: str, where: PathLike, what: str) -> list[float]:
     return values
 
 
-def check_intrinsics(rows: object, where: object) -> Float:
-    """Rows of numbers as (3, 3) intrinsics.
+def check_intrinsics(matrix: NDArray[Any], where: object) -> Float:
+    """A matrix as (3, 3) intrinsics.
 
     Raises:
         DataError: it is not a finite, upper-triangular 3x3 matrix with positive focal lengths.
     """
-    try:
-        K = np.array(rows, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(
-            "intrinsics are no matrix of numbers",
-            where=where,
-            found=printable(repr_of(rows), 80),
-            expected="(3, 3)",
-        ) from error
+    K = np.array(matrix, dtype=np.float64)
     if K.shape != (3, 3):
         raise DataError("intrinsics must be 3x3", where=where, found=K.shape, expected="(3, 3)")
     if not np.isfinite(K).all():
@@ -214,30 +207,24 @@ def read_vkitti2_intrinsics(path: PathLike, frames: Sequence[int]) -> list[Float
     Its columns are: frame cameraID K[0,0] K[1,1] K[0,2] K[1,2].
     """
     lines = [line.split() for line in read_text(path, "intrinsics file").splitlines()]
-    header = lines[0] if lines else []
-    if not set(_VKITTI2_COLUMNS) <= set(header):
+    if lines[:1] != [_VKITTI2_COLUMNS]:
         raise DataError(
             "intrinsics file lacks columns",
             where=path,
-            found=" ".join(header),
+            found=" ".join(lines[0]) if lines else "",
             expected=" ".join(_VKITTI2_COLUMNS),
         )
-    rows = {}
-    for words in lines[1:]:
-        # a row that is too short lacks a column
-        row = dict(zip(header, words))
-        if row.keys() >= set(_VKITTI2_COLUMNS):
-            rows[row["frame"], row["cameraID"]] = row
+    rows = {tuple(words[:2]): words[2:] for words in lines[1:] if len(words) == 6}
     out = []
     for frame in frames:
-        if (str(frame), "0") not in rows:
+        row, where = rows.get((str(frame), "0")), f"{path}, frame {frame}"
+        if row is None:
             raise DataError(
                 "intrinsics of the frame are missing",
                 where=path,
                 found=f"{len(rows)} complete rows",
                 expected=f"a row of frame {frame}, camera 0",
             )
-        row, where = rows[str(frame), "0"], f"{path}, frame {frame}"
-        numbers = _numbers(" ".join(row[c] for c in _VKITTI2_COLUMNS[2:]), where, "intrinsics row")
+        numbers = _numbers(" ".join(row), where, "intrinsics row")
         out.append(check_intrinsics(intrinsics(*numbers), where))
     return out

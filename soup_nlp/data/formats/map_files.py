@@ -29,7 +29,7 @@ from soup_nlp.errors import DataError, repr_of
 from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, as_path, read_bytes
 
-Reader = Callable[[PathLike], Float]
+Reader = Callable[[PathLike], NDArray[Any]]
 
 MAGIC = b"PIEH"
 """First four bytes of .flo, .dpt and .cam files; as a little-endian float32 they read 202021.25."""
@@ -124,7 +124,7 @@ def read_npz(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
     }
 
 
-def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> Float:
+def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> NDArray[Any]:
     suffix = as_path(path, f"{what} file").suffix.lower()
     if suffix not in readers:
         raise DataError(
@@ -206,11 +206,11 @@ def read_flow(path: PathLike) -> Float:
     - `.npy` is an array (H, W, 2) or (2, H, W) in pixels, unknown as in `.flo`.
     """
     readers: dict[str, Reader] = {
-        ".flo": lambda p: _known_flow(_read_pieh(p, "flow file", 2), p),
+        ".flo": lambda p: _read_pieh(p, "flow file", 2),
         ".png": lambda p: (_read_flow_png(p, "KITTI flow") - 2.0**15) / 64.0,
-        ".npy": lambda p: _known_flow(_array(read_bytes(p, "flow file"), p, "flow file"), p),
+        ".npy": lambda p: _array(read_bytes(p, "flow file"), p, "flow file"),
     }
-    return _by_suffix(path, readers, "flow")
+    return _known_flow(_by_suffix(path, readers, "flow"), path)
 
 
 def read_confidence(path: PathLike) -> NDArray[Any]:
@@ -308,9 +308,9 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
         return read_depth_png16(path, usual if scale is None else scale)
 
     readers: dict[str, Reader] = {
-        ".dpt": lambda p: known_depth(_read_pieh(p, "depth file"), p),
-        ".npy": lambda p: known_depth(_array(read_bytes(p, "depth file"), p, "depth file"), p),
+        ".dpt": lambda p: _read_pieh(p, "depth file"),
+        ".npy": lambda p: _array(read_bytes(p, "depth file"), p, "depth file"),
         ".pfm": read_pfm,
         ".png": by_scale,
     }
-    return _by_suffix(path, readers, "depth")
+    return known_depth(_by_suffix(path, readers, "depth"), path)
