@@ -76,8 +76,6 @@ def build_segmentation(
     labels: NDArray[np.int32],
     image: Image,
     neighbours: int = 15,
-    beta: float = BETA,
-    beta_colour: float = BETA_COLOUR,
     boundary_samples: int | None = 3,
 ) -> Segmentation:
     """Graphs and weights of a segmentation.
@@ -86,8 +84,6 @@ def build_segmentation(
         labels: (H, W) superpixel labels 0..N-1.
         image: (H, W, 3) uint8 RGB.
         neighbours: K of the K-NN graph; at most N - 1 (a larger K is an error).
-        beta: Fall-off of w1, w2 with anchor distance, 1/pixel (Eq. 2).
-        beta_colour: Fall-off of w4 with colour difference, colours in [0, 1] (Eq. 5).
         boundary_samples: Boundary points kept per pair, evenly spaced; None takes as many as the
             longest boundary has (shorter ones repeat their points, nearly evenly).
 
@@ -111,9 +107,7 @@ def build_segmentation(
     knn = _nearest(anchors, neighbours)
     edges, multiplicity = _fold(knn)
     distance = np.linalg.norm(anchors[edges[:, 0]] - anchors[edges[:, 1]], axis=1)
-    pairs, boundary, length, weight = _shared_boundaries(
-        labels, image, beta_colour, boundary_samples
-    )
+    pairs, boundary, length, weight = _shared_boundaries(labels, image, boundary_samples)
     return Segmentation(
         labels=labels,
         anchors=anchors,
@@ -122,7 +116,7 @@ def build_segmentation(
         knn=knn,
         edges=edges,
         edge_multiplicity=multiplicity,
-        edge_weight=multiplicity * np.exp(-beta * distance),
+        edge_weight=multiplicity * np.exp(-BETA * distance),
         pairs=pairs,
         boundary=boundary,
         boundary_length=length,
@@ -152,7 +146,7 @@ def _fold(knn: Int) -> tuple[Int, Int]:
 
 
 def _shared_boundaries(
-    labels: NDArray[np.int32], image: Image, beta_colour: float, samples: int | None
+    labels: NDArray[np.int32], image: Image, samples: int | None
 ) -> tuple[Int, Float, Int, Float]:
     width = labels.shape[1]
     n = int(labels.max()) + 1
@@ -173,13 +167,12 @@ def _shared_boundaries(
     key, which = np.unique(i * n + k, return_inverse=True)
     pairs = np.stack([key // n, key % n], axis=1)
     count = np.bincount(which)
-    weight = _colour_weight(image, p, which, len(key), beta_colour)
-    weight += _colour_weight(image, q, which, len(key), beta_colour)
+    weight = _colour_weight(image, p, which, len(key)) + _colour_weight(image, q, which, len(key))
     middle = np.stack([(p % width + q % width) / 2, (p // width + q // width) / 2], axis=1)
     return pairs, _sample_along(middle, which, count, samples), count, weight
 
 
-def _colour_weight(image: Image, pixel: Int, which: Int, n_pairs: int, beta: float) -> Float:
+def _colour_weight(image: Image, pixel: Int, which: Int, n_pairs: int) -> Float:
     """Sum over the four neighbours of `exp(-beta |I(X_b) - I(zeta_j)|_F)`, paper Eq. 5."""
     height, width = image.shape[:2]
     # a pixel that touches the other superpixel twice counts once
@@ -191,7 +184,7 @@ def _colour_weight(image: Image, pixel: Int, which: Int, n_pairs: int, beta: flo
     for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         neighbour = colour[np.clip(v + dv, 0, height - 1), np.clip(u + du, 0, width - 1)]
         gap2 = np.sum((colour[v, u] - neighbour) ** 2, axis=1)
-        total += np.exp(-beta * np.sqrt(np.bincount(which, gap2, n_pairs)))
+        total += np.exp(-BETA_COLOUR * np.sqrt(np.bincount(which, gap2, n_pairs)))
     return total
 
 

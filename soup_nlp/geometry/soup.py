@@ -60,14 +60,10 @@ class Soup:
 
     def taking(self, other: Soup, which: Mask) -> Soup:
         """This soup with the superpixels `which` (N,) of another soup."""
-
-        def put(values: Float, replacements: Float) -> Float:
-            out = values.copy()
-            out[which] = replacements[which]
-            return out
-
-        parts = ("lam", "n", "d", "R", "t")
-        return Soup(*(put(getattr(self, k), getattr(other, k)) for k in parts))
+        out = Soup(*(values.copy() for values in vars(self).values()))
+        for values, replacements in zip(vars(out).values(), vars(other).values()):
+            values[which] = replacements[which]
+        return out
 
     def depth_at(self, ray: Float) -> Float:
         """z (N, ...) of rays (N, ..., 3), each on its superpixel's plane, docs/formulation.md 3."""

@@ -140,11 +140,8 @@ def kitti2012(root: Path) -> Path:
     disparity[0, 0] = 0
     flow = np.ones((H, W, 2))
     flow[0, 0] = np.nan
-    visible = flow.copy()
-    visible[1] = np.nan
-    for suffix, values in (("occ", flow), ("noc", visible)):
-        png16(base / f"disp_{suffix}" / "000007_10.png", disparity)
-        kitti_flow(base / f"flow_{suffix}" / "000007_10.png", values)
+    png16(base / "disp_occ" / "000007_10.png", disparity)
+    kitti_flow(base / "flow_occ" / "000007_10.png", flow)
     return root
 
 
@@ -157,7 +154,8 @@ def test_kitti2012(tmp_path: Path, below: str, index: str) -> None:
     assert pair.K_ref[0, 2] == 4.0
     assert np.isnan(truth.depth_ref[0, 0])
     np.testing.assert_allclose(truth.depth_ref[1:], 54 / 10)
-    assert truth.occluded.sum(axis=1).tolist() == [0, W, 0, 0, 0, 0]
+    assert np.isnan(truth.flow[0, 0]).all()
+    assert (truth.flow[1:] == 1).all()
 
 
 def test_kitti2012_errors(tmp_path: Path) -> None:
@@ -169,8 +167,8 @@ def test_kitti2012_errors(tmp_path: Path) -> None:
             load("kitti2012", root, index=index)
     first = "P0: 100 0 4 0 0 100 3 0 0 0 1 0\n"
     for text, match in {
-        first: "lacks P1",
-        "P0: 1 2 3\nP1: 1 2 3\n": "P0 is no projection",
+        first: "lacks projection P1",
+        "P0: 1 2 3\nP1: 1 2 3\n": "lacks projection P0",
         first + first.replace("P0", "P1"): "no baseline",
     }.items():
         (root / "training" / "calib" / "000007.txt").write_text(text)
@@ -194,7 +192,6 @@ def test_kitti2015(tmp_path: Path) -> None:
     picture(base / "obj_map" / "000001_10.png", np.eye(H, W, dtype=np.uint8))
     truth = load("kitti2015", tmp_path, index="1").truth
     assert truth.depth_next is None
-    assert truth.occluded is None
     np.testing.assert_allclose(truth.depth_ref, 5.4)
     assert (truth.flow == 2).all()
     assert truth.components.sum() == H
@@ -271,19 +268,15 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         camera = np.array([[focal, 0, 4.0], [0, focal, 3.0], [0, 0, 1]])
         write_cam(base / "camdata_left" / f"{name}.cam", camera)
         write_dpt(base / "depth" / f"{name}.dpt", np.full((H, W), focal))
-    flow = np.zeros((H, W, 2))
-    flow[:, 0, 0] = -1.0
-    write_flo(base / "flow" / "cave_2" / "frame_0001.flo", flow)
+    write_flo(base / "flow" / "cave_2" / "frame_0001.flo", np.zeros((H, W, 2)))
     mask = np.zeros((H, W), np.uint8)
     mask[0, 5] = 255
-    picture(base / "occlusions" / "cave_2" / "frame_0001.png", mask)
-    picture(base / "invalid" / "cave_2" / "frame_0001.png", np.roll(mask, 1, axis=0))
+    picture(base / "invalid" / "cave_2" / "frame_0001.png", mask)
     pair = load("sintel", tmp_path, scene="cave_2", frame=1, render="final")
     truth = pair.truth
     assert (pair.K_ref[0, 0], pair.K_next[0, 0]) == (100.0, 120.0)
     assert truth.depth_next[0, 0] == 120.0
-    assert truth.occluded.sum() == H + 1
-    assert np.isnan(truth.flow).any(axis=2).sum() == 1
+    np.testing.assert_array_equal(np.isnan(truth.flow).all(axis=2), mask > 0)
     picture(base / "invalid" / "cave_2" / "frame_0001.png", mask[1:])
     with raises("mask and flow differ in size"):
         load("sintel", tmp_path, scene="cave_2", frame=1, render="final")
@@ -341,7 +334,6 @@ def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_motorcycle_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
     image = np.zeros((4, 40, 3), np.uint8)
     disparity = np.full((4, 40), 5.0, np.float32)
-    disparity[:, 20:30] = 12.0
     disparity[0, 0], disparity[0, 1] = np.inf, 0.0
     monkeypatch.setattr("skimage.data.stereo_motorcycle", lambda: (image, image, disparity))
     pair = load("motorcycle", Path())
@@ -353,8 +345,6 @@ def test_motorcycle_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
     image_of = moved @ pair.K_next.T
     flow = image_of[..., :2] / image_of[..., 2:] - np.stack([u, v], -1)
     np.testing.assert_allclose(flow, truth.flow, atol=1e-9)
-    hidden = truth.occluded[2]
-    assert np.flatnonzero(hidden).tolist() == [0, 1, 2, 3, 4, *range(13, 20)]
 
 
 def test_motorcycle_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -380,12 +370,11 @@ def test_real_pairs(shared_data: Path) -> None:
     finite = np.isfinite(disparity)
     np.testing.assert_array_equal(np.isfinite(depth), finite)
     np.testing.assert_allclose(depth[finite] * disparity[finite], 718.856 * 0.53717, rtol=1e-4)
-    assert 0.01 < pair.truth.occluded.mean() < 0.1
     with pytest.warns(DataWarning, match="688 pixels"):
         sintel = load("sintel", shared_data / "sintel", scene="alley_1", frame=2)
     with pytest.warns(DataWarning, match="688 pixels"):
         far = load("sintel", shared_data / "sintel", scene="alley_1", frame=20, step=5)
-    assert "flow, occluded" in str(sintel)
+    assert str(sintel.truth) == "Truth(flow; m)"
     assert "depth_ref" in str(far)
     driving = load("folder", shared_data / "driving_synthetic")
     assert "depth_ref, flow" in str(driving)

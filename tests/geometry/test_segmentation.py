@@ -145,10 +145,9 @@ def test_folded_edges_keep_every_direction(seg):
 
 
 @pytest.mark.parametrize("beta", [0.02, 0.0, 0.3])
-def test_edge_weight_is_equation_2(seg, image, beta):
-    # 0.02 is the default
-    options = {} if beta == 0.02 else {"beta": beta}
-    seg = build_segmentation(seg.labels, image, neighbours=7, **options)
+def test_edge_weight_is_equation_2(seg, image, beta, monkeypatch):
+    monkeypatch.setattr("soup_nlp.geometry.graph.BETA", beta)
+    seg = build_segmentation(seg.labels, image, neighbours=7)
     i, k = seg.edges.T
     distance = np.linalg.norm(seg.anchors[i] - seg.anchors[k], axis=1)
     np.testing.assert_allclose(seg.edge_weight, seg.edge_multiplicity * np.exp(-beta * distance))
@@ -189,10 +188,11 @@ def small_labels(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_shared_boundaries_and_w4_are_brute_force(seed):
+def test_shared_boundaries_and_w4_are_brute_force(seed, monkeypatch):
+    monkeypatch.setattr("soup_nlp.geometry.graph.BETA_COLOUR", 0.7)
     labels, image = small_labels(seed), noise(12, 10, seed)
     expected = brute_pairs(labels)
-    seg = build_segmentation(labels, image, neighbours=1, beta_colour=0.7, boundary_samples=None)
+    seg = build_segmentation(labels, image, neighbours=1, boundary_samples=None)
     pairs = [tuple(p) for p in seg.pairs.tolist()]
     assert sorted(pairs) == sorted(expected)
     for p, key in enumerate(pairs):

@@ -145,7 +145,7 @@ def test_two_superpixels_by_hand():
     labels[:, 4:] = 1
     K = camera.intrinsics(10.0, 10.0, 3.5, 1.5)
     image = np.zeros((4, 8, 3), np.uint8)
-    seg = build_segmentation(labels, image, neighbours=1, beta=0.1, boundary_samples=None)
+    seg = build_segmentation(labels, image, neighbours=1, boundary_samples=None)
     flow = Flow(np.zeros((4, 8, 2), np.float32), np.ones((4, 8), np.float32), "zero")
     data = build_energy_data(seg, flow, K, K, None)
     D, T = np.array([1.0, 3.0]), np.array([[0.1, 0, 0], [0.3, 0, 0]])
@@ -159,7 +159,7 @@ def test_two_superpixels_by_hand():
     anchor = np.array([[-0.2, 0, 1], [0.2, 0, 1]])  # centroids 1.5 and 5.5 of columns about 3.5
     X = D[:, None] * anchor
     stretch = abs(np.linalg.norm(X[0] - X[1]) - np.linalg.norm(X[0] + T[0] - X[1] - T[1]))
-    w1 = 2 * np.exp(-0.1 * 4)
+    w1 = 2 * np.exp(-0.02 * 4)
     assert e["arap"] == pytest.approx(w1 * (0.2 + stretch) / mean)
     assert e["proj"] == pytest.approx(2 * 1.0)  # both move by one pixel
     rays = np.array([[0.0, (v - 1.5) / 10, 1] for v in range(4)])

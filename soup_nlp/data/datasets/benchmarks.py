@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator
 
 from soup_nlp.data.datasets.layout import Folder, PairInput, Resolve, make_pair
-from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import (
     read_cam,
     read_kitti_projections,
@@ -37,7 +35,7 @@ _KITTI = {
 """Folders of images and calibration, names of the projections, folder of disparities."""
 KITTI_LAYOUT = (
     "training/{0}/NNNNNN_10.png and _11.png, training/{1}/NNNNNN.txt ({2[0]}, {2[1]}); optional"
-    " {3}, flow_occ, flow_noc, obj_map with NNNNNN_10.png"
+    " {3}, flow_occ, obj_map with NNNNNN_10.png"
 )
 
 _VKITTI = {
@@ -61,7 +59,7 @@ VKITTI1_TEXT = "fx,fy,cx,cy 725,725,620.5,187, of its images of 1242 x 375"
 SINTEL_LAYOUT = (
     "training/{clean,final,albedo}/SCENE/frame_NNNN.png; optional "
     "camdata_left/SCENE/frame_NNNN.cam, depth/SCENE/frame_NNNN.dpt, "
-    "flow/SCENE/frame_NNNN.flo, occlusions/SCENE/frame_NNNN.png, invalid/SCENE/frame_NNNN.png"
+    "flow/SCENE/frame_NNNN.flo, invalid/SCENE/frame_NNNN.png"
 )
 DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
 """fx, fy, cx, cy of `DEFAULT_SCENE`, pixels; other scenes differ (some have 1120)."""
@@ -77,8 +75,8 @@ def _is_pair_number(index: str) -> str:
 class KittiInput(PairInput):
     """KITTI 2012 (grey camera 0) or 2015 (colour camera 2): frames 10 and 11 of a sequence.
 
-    Depth is f B / disparity. A pixel is occluded where the flow is known but absent from flow_noc.
-    The moving objects of the obj_map of 2015 are components; 0 is the static scene.
+    Depth is f B / disparity. The moving objects of the obj_map of 2015 are components; 0 is the
+    static scene.
     """
 
     kind: Literal["kitti2012", "kitti2015"]
@@ -107,17 +105,10 @@ class KittiInput(PairInput):
             )
         file = f"{{}}/{name}_10.png".format
         disparity = folder.read(read_depth_png16, file(disparities), scale=KITTI_DISPARITY)
-        flow, visible = (folder.read(read_flow, file(kind)) for kind in ("flow_occ", "flow_noc"))
-        occluded = None
-        if flow is not None and visible is not None:
-            where = folder.path / file("flow_noc")
-            check_size("flow_noc and flow_occ", visible.shape, flow.shape, where)
-            occluded = np.isfinite(flow[:, :, 0]) & ~np.isfinite(visible[:, :, 0])
         objects = folder.read(decode, file("obj_map"), what="object map")
         truth = Truth(
             depth_ref=None if disparity is None else K[0, 0] * baseline / disparity,
-            flow=flow,
-            occluded=occluded,
+            flow=folder.read(read_flow, file("flow_occ")),
             components=None if objects is None else objects.astype(np.int32),
         )
         return make_pair(images, [K, K], truth, f"{self.kind}_{name}")
@@ -179,9 +170,8 @@ class VkittiInput(SceneFrames):
 class SintelInput(SceneFrames):
     """MPI Sintel with its depth and camera extension; depth is in the scene's unit.
 
-    A pixel is occluded by the occlusion mask, or if its flow leaves the image; pixels of the mask
-    `invalid` have no true flow. Without `camdata_left` the camera is `DEFAULT_CAMERA`, with a
-    warning.
+    Pixels of the mask `invalid` have no true flow. Without `camdata_left` the camera is
+    `DEFAULT_CAMERA`, with a warning.
     """
 
     kind: Literal["sintel"]
@@ -205,23 +195,13 @@ class SintelInput(SceneFrames):
                 f"the focal length of {DEFAULT_SCENE}, {DEFAULT_CAMERA[0]:g} pixels{doubt}",
             )
         cameras = [intrinsics(*DEFAULT_CAMERA) if K is None else K for K in cameras]
-        truth = Truth(depths[0], depths[1])
+        flow = invalid = None
         if self.step == 1:
-            truth = replace(truth, **_sintel_flow(folder, names[0]))
-        return make_pair(images, cameras, truth, f"sintel_{self.scene}_{self.frame:04d}")
-
-
-def _sintel_flow(folder: Folder, name: str) -> dict[str, Any]:
-    """True flow and occlusion of a frame; None without their files."""
-    flow = folder.read(read_flow, f"flow/{name}.flo")
-    files = [f"{kind}/{name}.png" for kind in ("occlusions", "invalid")]
-    occluded, invalid = (folder.read(read_mask, file) for file in files)
-    if flow is not None:
-        for mask, file in zip((occluded, invalid), files, strict=True):
-            if mask is not None:
-                check_size("mask and flow", mask.shape, flow.shape, folder.path / file)
-        if occluded is not None:
-            occluded |= np.isfinite(flow[:, :, 0]) & leaves(flow, flow.shape[:2])
-        if invalid is not None:
+            flow = folder.read(read_flow, f"flow/{names[0]}.flo")
+            invalid = folder.read(read_mask, f"invalid/{names[0]}.png")
+        if flow is not None and invalid is not None:
+            where = folder.path / "invalid" / names[0]
+            check_size("mask and flow", invalid.shape, flow.shape, where)
             flow[invalid] = np.nan
-    return {"flow": flow, "occluded": occluded}
+        truth = Truth(depths[0], depths[1], flow)
+        return make_pair(images, cameras, truth, f"sintel_{self.scene}_{self.frame:04d}")

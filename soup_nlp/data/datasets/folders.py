@@ -15,7 +15,6 @@ from skimage.measure import label
 
 from soup_nlp.arrays import Float
 from soup_nlp.data.datasets.layout import Folder, FramesInput, PairInput, Resolve, make_pair
-from soup_nlp.data.flow.consistency import leaves
 from soup_nlp.data.formats.camera_files import read_intrinsics
 from soup_nlp.data.formats.images import assumed, read_mask
 from soup_nlp.data.formats.map_files import MILLIMETRES, read_depth, read_flow, read_npz
@@ -225,8 +224,7 @@ class MotorcycleInput(PairInput):
     The rectified cameras differ in their principal points, so a disparity d means
     Z = f B / (d + doffs) with f 994.978 px, doffs 31.086 px, B 0.193001 m, and the next (right)
     camera has cx + doffs. The motion of every pixel is the translation (-B, 0, 0); the true flow
-    is (-d, 0). A pixel is occluded if it leaves the right image, or if a nearer pixel of the same
-    row lands on it or beyond it.
+    is (-d, 0).
     """
 
     kind: Literal["motorcycle"]
@@ -250,18 +248,10 @@ class MotorcycleInput(PairInput):
         d = np.asarray(disparity, dtype=np.float64)
         d = np.where(np.isfinite(d) & (d > 0), d, np.nan)
         valid = np.isfinite(d)
-        flow = np.dstack([-d, np.where(valid, 0.0, np.nan)])
-        target = np.where(valid, np.arange(d.shape[1]) - d, np.inf)
-        right_of = np.full_like(target, np.inf)
-        right_of[:, :-1] = np.minimum.accumulate(target[:, :0:-1], axis=1)[:, ::-1]
-        motion = np.eye(4)
-        motion[0, 3] = -baseline
         truth = Truth(
             depth_ref=focal * baseline / (d + doffs),
-            flow=flow,
-            occluded=valid & ((target >= right_of) | leaves(flow, right.shape[:2])),
+            flow=np.dstack([-d, np.where(valid, 0.0, np.nan)]),
             components=np.where(valid, 0, -1).astype(np.int32),
-            motions=motion[None],
             scene_flow=np.where(valid[:, :, None], [-baseline, 0.0, 0.0], np.nan),
         )
         return Pair(

@@ -182,20 +182,14 @@ def read_kitti_projections(path: PathLike, names: Sequence[str]) -> list[Float]:
     entries = {name.strip(): text for name, _, text in (line.partition(":") for line in lines)}
     out = []
     for name in names:
-        if name not in entries:
-            raise DataError(
-                f"calibration file lacks {name}",
-                where=path,
-                found=", ".join(entries),
-                expected=f"a line '{name}: ...' with 12 numbers",
-            )
-        values = np.array(_numbers(entries[name], f"{path}, {name}", "calibration file"))
+        values = np.array(_numbers(entries.get(name, ""), f"{path}, {name}", "calibration file"))
         if values.size != 12 or not np.isfinite(values).all():
+            counts = f"{values.size} numbers, {int(np.isfinite(values).sum())} of them finite"
             raise DataError(
-                f"calibration entry {name} is no projection",
+                f"calibration file lacks projection {name}",
                 where=path,
-                found=f"{values.size} numbers, {int(np.isfinite(values).sum())} of them finite",
-                expected="12 finite numbers",
+                found=counts if name in entries else ", ".join(entries),
+                expected=f"a line '{name}: ...' with 12 finite numbers",
             )
         out.append(values.reshape(3, 4))
     return out
