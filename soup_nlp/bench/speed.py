@@ -18,7 +18,6 @@ from soup_nlp.bench.processes import machine
 from soup_nlp.bench.reference_solver import levenberg_marquardt
 from soup_nlp.bench.study import Cell, Item, markdown, page_text, titled
 from soup_nlp.bench.suites import MOTORCYCLE, Options, list_suite
-from soup_nlp.config.problem import dump_problem
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline.case import prepare
@@ -150,7 +149,7 @@ def measure_speed(cell: Cell) -> Row:
     lap("evaluation")
     run = replace(run, seconds=dict(wall))
     with scratch() as folder:
-        write_folder(prepare_folder(folder / "result"), run, dump_problem(problem), "")
+        write_folder(prepare_folder(folder / "result"), run, "")
     lap("output")
     return {
         "n": len(case),

@@ -81,7 +81,7 @@ def _run(
         measure_rows, rows = partial(measure_all, say=say, **running), page.with_suffix(".jsonl")
         with options.resumable("the rows that were measured are kept", rows):
             frame = study.measured(rows, measure_rows)
-        with staged(out) as new:
+        with staged(out, overwrite=overwrite) as new:
             study.write(new / page.name, frame)
             written = [name for name in (page.name, *study.files) if (new / name).is_file()]
         print(page.read_text(encoding="utf-8"))

@@ -96,7 +96,7 @@ def compare(
     def keep(new_rows: list[Row]) -> None:
         """Write the page after every run: a run may take minutes, a command may be killed."""
         rows[:] = [*before, *new_rows]
-        with staged(folder, subject=subject) as new:
+        with staged(folder, overwrite=overwrite, subject=subject) as new:
             write_text(new / "README.md", page(frame_of_runs(rows)))
 
     kept = options.resumable("the runs that were finished are kept, with a page of them", folder)
@@ -108,17 +108,19 @@ def compare(
     finally:
         # write the page of the finished runs even after an error
         if rows:
-            _write(folder, frame_of_runs(rows), limits, subject)
+            _write(folder, frame_of_runs(rows), limits, overwrite, subject)
     print("\n".join(conclusion(frame_of_runs(rows))))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     verified = sum(bool(r["verified"]) for r in rows)
     options.finish(bool(verified), f"{verified} of {len(rows)} runs are verified")
 
 
-def _write(folder: Path, frame: pd.DataFrame, limits: Limits, subject: str) -> None:
+def _write(
+    folder: Path, frame: pd.DataFrame, limits: Limits, overwrite: bool, subject: str
+) -> None:
     """Write FILES from all runs, and OF_FAMILY from those of the family."""
     family = of_family(frame)
-    with staged(folder, subject=subject) as new:
+    with staged(folder, overwrite=overwrite, subject=subject) as new:
         write_text(new / "README.md", page(frame))
         draw_profiles(new / "profile.png", {"": frame}, ("seconds", "energy"))
         if len(family):

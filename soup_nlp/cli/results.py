@@ -13,7 +13,6 @@ import typer
 
 from soup_nlp.cli import options
 from soup_nlp.cli.options import in_output, option, out_option
-from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.errors import ConfigError, DataError, ExportError
 from soup_nlp.evaluate.metrics import Scale
@@ -125,7 +124,8 @@ def import_(
     target = out or folder / name
     prepare_folder(target, run.problem.input_paths(), overwrite, run.problem.subject)
     text = foreign_verdict(imported)
-    write_folder(target, run, dump_problem(run.problem), f"{imported.sol.message}\n{text}\n", text)
+    log = f"{imported.sol.message}\n{text}\n"
+    write_folder(target, run, log, text, overwrite=overwrite)
     print(text)
     print(f"files       {target}/")
     print(f"next        soup-nlp check {target}")

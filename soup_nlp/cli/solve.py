@@ -14,7 +14,7 @@ import typer
 
 from soup_nlp.cli import options
 from soup_nlp.cli.options import in_input, in_method, in_output, option
-from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem, title
+from soup_nlp.config.problem import Problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SoupError
@@ -223,7 +223,7 @@ def solve_problem(
             log.lines.append(verdicts[-1])
             return "\n".join(log.lines) + "\n"
 
-        write_folder(folder, run, dump_problem(chosen), log_text, ipopt_log=ipopt_log)
+        write_folder(folder, run, log_text, ipopt_log=ipopt_log, overwrite=overwrite)
     summary = folder / "summary.json"
     print(summary.read_text(encoding="utf-8") if as_json else verdicts[0])
     return code

@@ -140,7 +140,7 @@ def export_case(
     form = form.replace(hessian="exact", compiled=False)
     nlp, layout = case.nlp(form)
     target = claim(folder, EXPORT_FILES, overwrite, case.problem.subject)
-    with staged(target, whole=True, subject=case.problem.subject) as new:
+    with staged(target, True, overwrite, case.problem.subject) as new:
         names = readable_names(nlp, layout)
         duals = examine(nlp, nlp.x0, None) if presolved else None
         if duals is not None and not duals.residuals.dual <= STATIONARY:

@@ -100,22 +100,22 @@ def prepare_folder(
 def write_folder(
     folder: Path,
     run: Run,
-    config: str,
     log: str | Callable[[list[str]], str],
     verdict: str | None = None,
     ipopt_log: Path | None = None,
     formats: Sequence[str] = (),
+    overwrite: bool = False,
 ) -> list[str]:
     """Write every file of a run; an earlier result is replaced when the new one is complete.
 
     Args:
         folder: Prepared folder.
         run: The run.
-        config: Merged problem as YAML.
         log: Text of the log, or a function that makes it from the names of the other files.
         verdict: Verdict on the page; None for `facts`.
         ipopt_log: Log file of Ipopt.
         formats: Further formats, see `formats.FORMATS`.
+        overwrite: Overwrite files that the program did not make.
 
     Returns:
         Names of the files.
@@ -123,7 +123,8 @@ def write_folder(
     Raises:
         DataError: a file cannot be written.
     """
-    with staged(folder, whole=True, subject=run.problem.subject) as new:
+    config = dump_problem(run.problem)
+    with staged(folder, True, overwrite, run.problem.subject) as new:
         if ipopt_log is not None and ipopt_log.is_file():
             shutil.copy(ipopt_log, new / "ipopt.log")
         write_text(new / "config.yaml", config)
@@ -276,7 +277,7 @@ class WritableRun(Run):
         in_memory = self.problem.input.kind == "memory"
         inputs = [] if in_memory else self.problem.input_paths()
         target = prepare_folder(folder, inputs, overwrite, self.problem.subject)
-        return write_folder(target, self, dump_problem(self.problem), f"{self}\n", formats=names)
+        return write_folder(target, self, f"{self}\n", formats=names, overwrite=overwrite)
 
     def plot(self) -> Image:
         """The overview as a picture: notebooks show it, `.save` writes it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -34,43 +34,35 @@ UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
 """Unit of lengths in files."""
 FRAMES = ("ref", "next")
 """Names of the two frames in files."""
+INPUTS = ("image_ref", "image_next", "K_ref", "K_next", "confidence")
+"""Arrays of the pair without which there is no `Result`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """Images, cameras, dense 3D, components, arrays and texts of a solved pair.
+    """What is stored of a solved pair, with its dense 3D and components.
 
     Attributes:
-        name: Name for titles.
-        images: (H, W, 3) and (H', W', 3) uint8 RGB.
-        K: (3, 3) intrinsics of both frames, pixels.
-        reconstruction: Dense 3D of both frames.
-        components: Rigid components with their motions.
-        flow_confidence: (H, W) confidence of the flow, 0 to 1.
-        metre: Unit of length of the reconstruction in units of the truth; None without truth.
-        metre_unit: Name of the unit of the truth.
-        min_confidence: Smallest confidence of points in clouds.
-        metrics: Scores against the truth, as those of a `Run`.
         tree: Arrays as in result.h5.
         summary: Contents of summary.json.
+        reconstruction: Dense 3D of both frames.
+        components: Rigid components with their motions.
+        metrics: Scores against the truth, as those of a `Run`.
+        metre_unit: Name of the unit of the truth.
+        min_confidence: Smallest confidence of points in clouds.
         verdict: Verdict that was printed at the end of the solve.
         overview: The overview as PNG, for a stored result.
     """
 
-    name: str
-    images: tuple[Image, Image]
-    K: tuple[Float, Float]
+    tree: ReadTree
+    summary: Mapping[str, Any]
     reconstruction: Reconstruction
     components: Components
-    flow_confidence: NDArray[np.floating]
-    metre: float | None = None
+    metrics: Mapping[str, DepthMetrics]
     metre_unit: str = "m"
     min_confidence: float = MIN_CONFIDENCE
-    metrics: Mapping[str, DepthMetrics] = field(default_factory=dict, repr=False)
-    tree: ReadTree = field(default_factory=dict, repr=False)
-    summary: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    verdict: str = field(default="", repr=False)
-    overview: bytes = field(default=b"", repr=False)
+    verdict: str = ""
+    overview: bytes = b""
 
     def __str__(self) -> str:
         h, w = self.images[0].shape[:2]
@@ -81,6 +73,26 @@ class Result:
     def _repr_html_(self) -> str:
         """Text and overview, for notebooks."""
         return html(str(self), self.overview)
+
+    @property
+    def name(self) -> str:
+        """Name for titles."""
+        return str(self.summary.get("name", ""))
+
+    @property
+    def images(self) -> tuple[Image, Image]:
+        """(H, W, 3) and (H', W', 3) uint8 RGB."""
+        return self.tree["input"]["image_ref"], self.tree["input"]["image_next"]
+
+    @property
+    def K(self) -> tuple[Float, Float]:
+        """(3, 3) intrinsics of both frames, pixels."""
+        return self.tree["input"]["K_ref"], self.tree["input"]["K_next"]
+
+    @property
+    def flow_confidence(self) -> NDArray[np.floating]:
+        """(H, W) confidence of the flow, 0 to 1."""
+        return np.asarray(self.tree["input"]["confidence"])
 
     @property
     def camera(self) -> RigidMotion:
@@ -105,7 +117,7 @@ class Result:
     @property
     def unit(self) -> str:
         """Unit of length as a phrase for headers of files."""
-        if self.metre is None or not np.isfinite(self.metre):
+        if self.metre is None:
             return UNIT
         return f"{UNIT}; about {self.metre:.6g} {self.metre_unit} by the truth of this pair"
 
@@ -122,9 +134,15 @@ class Result:
         return np.maximum(1.0 - self.sigma / NO_CONFIDENCE, 0.0)
 
     @property
+    def metre(self) -> float | None:
+        """Units of the truth in one unit of length of the result; None where it is not known."""
+        scale = self.metrics["solution"].scale if "solution" in self.metrics else np.nan
+        return scale if np.isfinite(scale) else None
+
+    @property
     def scale(self) -> float:
-        """Units of the truth in one unit of length of the result; 1 without truth."""
-        return self.metre if self.metre is not None and np.isfinite(self.metre) else 1.0
+        """The same; 1 where it is not known."""
+        return 1.0 if self.metre is None else self.metre
 
     @property
     def length(self) -> str:
@@ -169,21 +187,14 @@ class Result:
 
 def result_of(run: Run, summary: Mapping[str, Any], verdict: str = "") -> Result:
     """The result of a run; `summary` has the contents of summary.json."""
-    pair, m = run.pair, run.metrics.get("solution")
-    assert pair.flow is not None
     return Result(
-        name=run.problem.name,
-        images=(pair.image_ref, pair.image_next),
-        K=(pair.K_ref, pair.K_next),
-        reconstruction=run.reconstruction,
-        components=run.components,
-        flow_confidence=pair.flow.confidence,
-        metre=None if m is None else m.scale,
-        metre_unit="m" if pair.truth is None else pair.truth.unit,
-        min_confidence=run.problem.output.min_confidence,
-        metrics=run.metrics,
         tree=_values(result_tree(run)),
         summary=plain(summary),
+        reconstruction=run.reconstruction,
+        components=run.components,
+        metrics=run.metrics,
+        metre_unit="m" if run.pair.truth is None else run.pair.truth.unit,
+        min_confidence=run.problem.output.min_confidence,
         verdict=verdict,
     )
 
@@ -216,20 +227,12 @@ def load(folder: str | Path) -> Result:
     """
     place = as_path(folder, "result folder")
     path = place / "result.h5"
-    tree, attrs = read_h5(path), read_attrs(path)
+    tree, unit = read_h5(path), read_attrs(path).get("truth_unit", "m")
     summary = read_json(place / "summary.json", "summary.json")
-    if "image_ref" not in tree.get("input", {}):
-        raise DataError(
-            "result holds no images",
-            where=path,
-            expected="input/image_ref and input/image_next",
-            hint="solve the pair again",
-        )
     require_layout(tree)
-    picture, metre = place / "overview.png", attrs.get("scale_to_truth")
+    picture = place / "overview.png"
     try:
-        before, after = (require(tree, f"input/image_{frame}") for frame in FRAMES)
-        K_ref, K_next = (require(tree, f"input/K_{frame}") for frame in FRAMES)
+        _, _, K_ref, K_next, _ = (require(tree, f"input/{name}") for name in INPUTS)
         soup = Soup(*(require(tree, f"solution/{key}") for key in ("lam", "n", "d", "R", "t")))
         planes = np.isfinite(soup.lam * soup.d).all()
         if not planes or not (np.abs(np.linalg.det(soup.R) - 1) < 1e-3).all():
@@ -239,17 +242,12 @@ def load(folder: str | Path) -> Result:
         rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
         part, borrowed = tree["start"]["part"], tree["start"]["borrowed"].astype(bool)
         return Result(
-            name=str(attrs["name"]),
-            images=(before, after),
-            K=(K_ref, K_next),
-            reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
-            components=find_components(soup, seg, part, K_ref, K_next, borrowed),
-            flow_confidence=tree["input"]["confidence"],
-            metre=None if metre is None else float(metre),
-            metre_unit=str(attrs.get("truth_unit", "m")),
-            metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
             tree=tree,
             summary=summary,
+            reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
+            components=find_components(soup, seg, part, K_ref, K_next, borrowed),
+            metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
+            metre_unit=str(unit),
             verdict=_ending(place / "log.txt"),
             overview=picture.read_bytes() if picture.is_file() else b"",
         )

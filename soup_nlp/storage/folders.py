@@ -22,49 +22,39 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import PathLike, as_path, write_text
+from soup_nlp.storage.files import PathLike, as_path
 from soup_nlp.storage.system import deferred_signals, sweep, temporary_folder
 
 MARK = ".soup_nlp"
-"""Hidden file of a folder with results: JSON, SHA-256 by name of every file that was made."""
-SUBJECT = "of"
-"""Key of the mark for the subject of the result."""
+"""Hidden file of a folder with results: `Mark` as JSON, its subject under "of"."""
 _STAGE = f"{MARK}-"
 """First part of the names of temporary folders; the number of their process follows."""
 _COMPLETE = f"{_STAGE}complete-"
 """The same of those whose files are being moved to their places."""
 
 
-def made_files(folder: Path) -> dict[str, str]:
-    """SHA-256 by name of the files that the program made in a folder; {} without a valid mark."""
-    return _read(folder)[0]
+class Mark(NamedTuple):
+    """SHA-256 by name of the files that the program made in a folder, and subject of the result."""
+
+    files: dict[str, str]
+    subject: str = ""
 
 
-def subject_of(folder: Path) -> str:
-    """Subject of the result in a folder; empty if its mark has none."""
-    return _read(folder)[1]
-
-
-def _read(folder: Path) -> tuple[dict[str, str], str]:
-    """Files and subject of the mark of a folder."""
+def mark_of(folder: Path) -> Mark:
+    """The mark of a folder; empty if there is no valid one."""
     path = folder / MARK
     try:
         if path.is_symlink() or not path.is_file():
-            return {}, ""
+            return Mark({})
         mark = json.loads(path.read_text(encoding="utf-8"))
         # a damaged mark must not name files outside the folder
         inside = [n for n in mark["files"] if not PurePosixPath(n).is_absolute() and ".." not in n]
-        return {str(n): str(mark["files"][n]) for n in inside}, str(mark.get(SUBJECT, ""))
+        return Mark({str(n): str(mark["files"][n]) for n in inside}, str(mark.get("of", "")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return {}, ""
-
-
-def _mark(files: dict[str, str], subject: str) -> str:
-    """Text of a mark."""
-    contents = ({SUBJECT: subject} if subject else {}) | {"files": dict(sorted(files.items()))}
-    return json.dumps(contents, indent=1) + "\n"
+        return Mark({})
 
 
 def files_in(folder: Path) -> list[str]:
@@ -79,7 +69,7 @@ def digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def is_foreign(folder: Path, name: str) -> bool:
+def _is_foreign(folder: Path, name: str) -> bool:
     """Whether a folder holds something under this name that the program did not make."""
     path = folder / name
     above = [folder / parent for parent in PurePosixPath(name).parents][:-1]
@@ -87,13 +77,13 @@ def is_foreign(folder: Path, name: str) -> bool:
         return True
     if path.is_symlink() or not path.is_file():
         return os.path.lexists(path)
-    return made_files(folder).get(name) != digest_of(path)
+    return mark_of(folder).files.get(name) != digest_of(path)
 
 
 def default_folder(name: str, subject: str) -> Path:
     """`out/NAME`, or the first of `out/NAME-2`, ... that holds no result of another subject."""
     names = chain([name], (f"{name}-{k}" for k in count(2)))
-    return next(p for n in names if subject_of(p := Path("out") / n) in ("", subject))
+    return next(p for n in names if mark_of(p := Path("out") / n).subject in ("", subject))
 
 
 def claim(
@@ -107,9 +97,8 @@ def claim(
     Args:
         folder: The output folder.
         names: Files that will be written.
-        overwrite: Treat existing files of these names as files of the program (the mark then lists
-            them), and replace the result of another subject.
-        subject: Subject of the new result, see `subject_of`.
+        overwrite: Allow files of the user with these names, and the result of another subject.
+        subject: Subject of the new result, see `Mark`.
 
     Raises:
         DataError: the folder cannot be written, holds a file of the user or a folder with one of
@@ -121,7 +110,7 @@ def claim(
         # fails where nothing can be written
         with tempfile.TemporaryFile(dir=existing):
             _finish(target)
-        before = subject_of(target)
+        before = mark_of(target).subject
         if subject and before not in ("", subject) and not overwrite:
             raise DataError(
                 "output folder holds the result of something else",
@@ -130,7 +119,7 @@ def claim(
                 expected=subject,
                 hint="choose another --out, or --overwrite",
             )
-        foreign = [name for name in names if is_foreign(target, name)]
+        foreign = [name for name in names if _is_foreign(target, name)]
         if foreign and not overwrite:
             raise DataError(
                 "output folder holds files that would be overwritten and that this program did not"
@@ -141,14 +130,8 @@ def claim(
                 hint="choose another --out, or --overwrite",
             )
         for path in (target / name for name in foreign):
-            if path.is_symlink():
-                # remove the link but not its target
-                path.unlink()
-            elif path.is_dir():
+            if path.is_dir() and not path.is_symlink():
                 raise DataError("cannot write a file over a folder", where=path)
-        taken = {name: digest_of(target / name) for name in foreign if (target / name).is_file()}
-        if taken:
-            write_text(target / MARK, _mark(made_files(target) | taken, before))
     return Path(folder)
 
 
@@ -180,7 +163,7 @@ def staged(
                 claim(target, files_in(stage), overwrite)
                 with _locked(target), deferred_signals():
                     _finish(target)
-                    _commit(stage, target, whole, subject or subject_of(target))
+                    _commit(stage, target, whole, subject)
         except DataError as error:
             # name the final path instead of the temporary one
             if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
@@ -196,13 +179,16 @@ def staged(
 
 def _commit(stage: Path, target: Path, whole: bool, subject: str) -> None:
     """Mark a temporary folder as complete and move its files to their places."""
-    new = {name: digest_of(stage / name) for name in files_in(stage)}
-    old = {k: v for k, v in made_files(target).items() if not is_foreign(target, k)}
+    new, before = {name: digest_of(stage / name) for name in files_in(stage)}, mark_of(target)
+    old = {k: v for k, v in before.files.items() if not _is_foreign(target, k)}
     for name in old.keys() & new.keys():
         # a file of the program may have been removed
         with suppress(FileNotFoundError):
             shutil.copymode(target / name, stage / name)
-    (stage / MARK).write_text(_mark(new if whole else old | new, subject), encoding="utf-8")
+    files = new if whole else old | new
+    of = {"of": subject or before.subject} if subject or before.subject else {}
+    mark = json.dumps({**of, "files": dict(sorted(files.items()))}, indent=1)
+    (stage / MARK).write_text(mark + "\n", encoding="utf-8")
     for name in (*new, MARK):
         # wait until the file is on disk: some systems report a full disk only here
         with (stage / name).open("rb") as file:
@@ -229,11 +215,10 @@ def _finish(folder: Path) -> None:
     for stage in folder.glob(f"{_COMPLETE}*"):
         if stage.is_symlink():
             continue
-        new = made_files(stage)
         # the mark is moved last: without it, every file was moved
         if (stage / MARK).is_file():
-            for name in made_files(folder).keys() - new.keys():
-                if not is_foreign(folder, name):
+            for name in mark_of(folder).files.keys() - mark_of(stage).files.keys():
+                if not _is_foreign(folder, name):
                     (folder / name).unlink(missing_ok=True)
                     with suppress(OSError):
                         # removes empty folders only

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from soup_nlp.evaluate.metrics import depth_metrics
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.geometry.components import find_components
 from soup_nlp.geometry.graph import build_segmentation
@@ -36,12 +37,11 @@ def small_result() -> Result:
     motions = [BOARD if m else CAMERA for m in mine]
     R, t = (np.array([getattr(m, name) for m in motions]) for name in ("R", "t"))
     soup = Soup(np.ones(12), np.tile([0.0, 0.0, -1.0], (12, 1)), np.where(mine, 2.0, 4.0), R, t)
+    pair = {"image_ref": image, "image_next": image[::-1].copy(), "K_ref": K, "K_next": K}
     return Result(
-        name="board",
-        images=(image, image[::-1].copy()),
-        K=(K, K),
+        tree={"input": {**pair, "confidence": (u / 100).astype(np.float32)}},
+        summary={"name": "board"},
         reconstruction=reconstruct(soup, labels, K, K),
         components=find_components(soup, seg, mine.astype(int), K, K),
-        flow_confidence=(u / 100).astype(np.float32),
-        metre=10.0,
+        metrics={"solution": depth_metrics(1.0, 10.0)},
     )

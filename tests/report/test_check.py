@@ -12,7 +12,6 @@ import h5py
 import numpy as np
 import pytest
 
-from soup_nlp.config.problem import dump_problem
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
@@ -44,7 +43,7 @@ def solved(pair, tmp_path_factory) -> Path:
         solver={"presolve_eps": [0.3, 0.03]},
         refine={"rounds": 1, "particles": 8},
     )
-    write_folder(prepare_folder(out), run, dump_problem(run.problem), "a log\n", formats=["npy"])
+    write_folder(prepare_folder(out), run, "a log\n", formats=["npy"])
     return out
 
 
@@ -176,7 +175,7 @@ def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
         refine={"enabled": False},
     )
     folder = tmp_path / "out"
-    write_folder(prepare_folder(folder), run, dump_problem(run.problem), "a log\n")
+    write_folder(prepare_folder(folder), run, "a log\n")
     assert "nlp is Ipopt's answer" not in bad(check_folder(folder))
     with h5py.File(folder / "result.h5", "a") as file:
         assert file.attrs["delivered"] == b"constrained NLP"
@@ -229,7 +228,7 @@ def one_plane() -> Pair:
 def test_an_energy_of_rounding_size_passes_the_check(tmp_path):
     # a slanted plane has relief, which E_prior charges
     run = solve_pair(one_plane(), energy={"weights": {"prior": 0.0}}, **EXACT)
-    write_folder(prepare_folder(tmp_path), run, dump_problem(run.problem), "")
+    write_folder(prepare_folder(tmp_path), run, "")
     assert run.energy["total"] < 1e-9
     assert bad(check_folder(tmp_path)) == []
     path = tmp_path / "summary.json"

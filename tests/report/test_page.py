@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import dump_problem
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report import scene3d
@@ -36,6 +35,12 @@ def text(shown):
     return page(shown, pictures(shown))
 
 
+def with_array(shown, place, values):
+    """The tree of a result with another array."""
+    group, name = place.split("/")
+    return {**shown.tree, group: {**shown.tree[group], name: values}}
+
+
 def data_of(text):
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
     return json.loads(found[1])
@@ -49,7 +54,7 @@ def unpack(packed, kind, shape):
 def written(small_run, tmp_path_factory):
     """A result folder."""
     out = tmp_path_factory.mktemp("written")
-    write_folder(out, small_run, dump_problem(small_run.problem), "log\n")
+    write_folder(out, small_run, "log\n")
     return out
 
 
@@ -166,7 +171,7 @@ def test_a_folder_makes_the_same_page_again(folder, capsys):
 def test_the_page_can_be_left_out(small_run, folder):
     problem = small_run.problem.replace(output={"page": False})
     assert problem.digest() == small_run.problem.digest()
-    files = write_folder(folder, replace(small_run, problem=problem), dump_problem(problem), "")
+    files = write_folder(folder, replace(small_run, problem=problem), "")
     assert "report.html" not in files
     assert not (folder / "report.html").exists()
     assert "overview.png" in files
@@ -174,7 +179,7 @@ def test_the_page_can_be_left_out(small_run, folder):
 
 def test_a_component_whose_depth_is_a_guess_is_striped(shown):
     def stripes(sigma):
-        tree = {**shown.tree, "depth": {**shown.tree["depth"], "sigma_ref": sigma}}
+        tree = with_array(shown, "depth/sigma_ref", sigma)
         own = pictures(replace(shown, tree=tree))["components"]
         return (own.image == 255).all(axis=2), own.title
 
@@ -196,12 +201,12 @@ def test_view_of_no_result(tmp_path, capsys):
 def test_limits_name_what_is_wrong(shown):
     good = " ".join(limits(shown))
     assert "did not converge" not in good
-    unusable = np.zeros_like(shown.flow_confidence)
+    tree = with_array(shown, "input/confidence", np.zeros_like(shown.flow_confidence))
     shares = {"guess": 0.3, "unseen": 0.2, "rest": 0.004, "flat": 0.06, "weak": 0.036}
     told = {
         **shown.summary, "status": "Time_Limit", "converged": False, "certainty": shares
     }  # fmt: skip
-    found = limits(replace(shown, flow_confidence=unusable, summary=told))
+    found = limits(replace(shown, tree=tree, summary=told))
     assert found == [
         "The NLP did not converge (Time_Limit): try a larger solver.max_iter.",
         "30% of the image is a guess (sigma above 25%): 20% no usable flow, 6% a turn alone or a"

@@ -154,8 +154,9 @@ def test_colmap_models_are_read_by_pycolmap(tmp_path, result):
 def test_cameras_with_skew_have_no_colmap_model(tmp_path, result):
     skewed = K.copy()
     skewed[0, 1] = 2
+    tree = {"input": {**result.tree["input"], "K_next": skewed}}
     with pytest.raises(DataError, match="skew"):
-        write_formats(tmp_path, replace(result, K=(K, skewed)), ["colmap"])
+        write_formats(tmp_path, replace(result, tree=tree), ["colmap"])
 
 
 def test_depth_is_read_by_numpy_opencv_and_pillow(tmp_path, result):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.folders import digest_of, made_files, staged
+from soup_nlp.storage.folders import digest_of, mark_of, staged
 from soup_nlp.storage.store import Array, write_h5, write_json
 
 
@@ -44,7 +44,7 @@ def write(folder: Path, size: int) -> None:
 
 
 def whole(folder: Path) -> bool:
-    listed = made_files(folder)
+    listed = mark_of(folder).files
     return bool(listed) and all(digest_of(folder / n) == d for n, d in listed.items())
 
 
@@ -55,7 +55,7 @@ def test_an_earlier_result_outlives_a_full_disk(below, small_disk):
     for size, fits in ((300_000, True), (900_000, False), (400_000, True), (5_000_000, False)):
         before = (
             (target / "summary.json").read_bytes()
-            if target.is_dir() and made_files(target)
+            if target.is_dir() and mark_of(target).files
             else b""
         )
         if fits:

@@ -15,12 +15,12 @@ import pytest
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage import folders
-from soup_nlp.storage.folders import MARK, claim, digest_of, files_in, made_files, recover, staged
+from soup_nlp.storage.folders import MARK, claim, digest_of, files_in, mark_of, recover, staged
 from soup_nlp.storage.system import deferred_signals, scratch
 
 
-def write(folder: Path, whole: bool = True, **files: str) -> None:
-    with staged(folder, whole) as new:
+def write(folder: Path, whole: bool = True, overwrite: bool = False, **files: str) -> None:
+    with staged(folder, whole, overwrite) as new:
         for name, text in files.items():
             (new / name).write_text(text)
 
@@ -38,7 +38,7 @@ def test_a_new_result_replaces_the_old_one_whole(tmp_path):
     write(target, a="1", b="1")
     write(target, a="2", c="2")
     assert content(target) == {"a": "2", "c": "2"}
-    assert made_files(target).keys() == {"a", "c"}
+    assert mark_of(target).files.keys() == {"a", "c"}
     assert os.listdir(tmp_path) == ["out"]
 
 
@@ -60,7 +60,7 @@ def test_pages_of_several_commands_share_a_folder(tmp_path):
     for name in ("x", "y", "x"):
         write(tmp_path, False, **{f"{name}.md": name})
     assert content(tmp_path) == {"x.md": "x", "y.md": "y"}
-    assert made_files(tmp_path).keys() == {"x.md", "y.md"}
+    assert mark_of(tmp_path).files.keys() == {"x.md", "y.md"}
 
 
 def test_a_failure_leaves_the_old_result(tmp_path):
@@ -168,7 +168,11 @@ def test_foreign_files_are_not_overwritten(kind, tmp_path):
             claim(target, ["a"], overwrite=True)
         return
     claim(target, ["a"], overwrite=True)
-    write(target, a="2")
+    # a command that fails afterwards has not made the file its own
+    assert identity(path) == before
+    with pytest.raises(DataError, match="would be overwritten"):
+        write(target, a="2")
+    write(target, overwrite=True, a="2")
     assert content(target) == {"a": "2"}
     assert not path.is_symlink()
     if kind == "link":
@@ -184,7 +188,7 @@ def test_a_symbolic_mark_is_not_followed(tmp_path):
     write(target, a="1")
     assert victim.read_text() == "{}"
     assert not (target / MARK).is_symlink()
-    assert made_files(target).keys() == {"a"}
+    assert mark_of(target).files.keys() == {"a"}
     (target / MARK).unlink()
     (target / MARK).symlink_to("nowhere")
     write(target, False, b="1")
@@ -309,7 +313,7 @@ def test_a_move_that_was_killed_is_finished(moves, tmp_path):
     killed(target, moves)
     recover(target)
     assert content(target) == {"a": "2", "c": "2", "d": "2"}
-    assert made_files(target).keys() == {"a", "c", "d"}
+    assert mark_of(target).files.keys() == {"a", "c", "d"}
     write(target, a="3")
     assert content(target) == {"a": "3"}
 
@@ -361,7 +365,7 @@ def test_processes_that_write_into_one_folder_lose_no_files(tmp_path):
     assert [writer.wait() for writer in writers] == [0, 0, 0]
     expected = {f"{name}{k}": "1" for name in "abc" for k in range(20)} | dict.fromkeys("abc", "19")
     assert content(tmp_path) == expected
-    assert made_files(tmp_path) == {name: digest_of(tmp_path / name) for name in expected}
+    assert mark_of(tmp_path).files == {name: digest_of(tmp_path / name) for name in expected}
 
 
 def test_scratch_folders_are_removed(tmp_path, monkeypatch):

@@ -34,7 +34,7 @@ from soup_nlp.config.problem import load_problem
 from soup_nlp.export.foreign import file_orders
 from soup_nlp.export.sol import write_sol
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.storage.folders import digest_of, made_files, recover
+from soup_nlp.storage.folders import digest_of, mark_of, recover
 
 TINY = [
     "input.width=64", "input.height=48", "flow.source=truth", "segmentation.superpixels=12",
@@ -165,7 +165,7 @@ def broken(folder: Path) -> list[str]:
     if not folder.is_dir():
         return []
     recover(folder)
-    listed = made_files(folder) or {}
+    listed = mark_of(folder).files
     wrong = [
         n for n, d in listed.items() if not (folder / n).is_file() or digest_of(folder / n) != d
     ]
@@ -240,7 +240,7 @@ def disk(place: Path, size: int) -> Iterator[None]:
 def listed(folder: Path) -> dict[str, dict[str, str]]:
     """The list of files of a folder and of the results in it."""
     places = [folder, *(folder / "pairs").glob("*")]
-    return {str(p): dict(made_files(p) or {}) for p in places if p.is_dir()}
+    return {str(p): dict(mark_of(p).files) for p in places if p.is_dir()}
 
 
 def fill(folder: Path) -> None:
