@@ -24,7 +24,7 @@ from soup_nlp.model.norms import NormForm
 from soup_nlp.pipeline.record import Case
 from soup_nlp.storage.files import read_json, write_text
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.store import Array, Tree, write_h5, write_json
+from soup_nlp.storage.store import parse_table, write_h5, write_json
 from soup_nlp.storage.versions import versions
 
 STUB = "soup"
@@ -42,10 +42,27 @@ EXPORT_FILES = (
 FORMATS = ("nl", "casadi", "h5")
 STATIONARY = 1e-3
 """Largest dual infeasibility of a start whose multipliers are written."""
-INFORMATION = (
-    "triu Gauss-Newton information of E at the start in nine coordinates a superpixel: relative"
-    " inverse depth at the anchor, its slopes (2), rotation (3), shift of the anchor (3)"
-)
+START = """
+x0                          1  X  start
+lbx                         1  X  lower bounds
+ubx                         1  X  upper bounds
+lbg                         1  G  lower bounds of g
+ubg                         1  G  upper bounds of g
+p                           1  P  parameters of the functions
+x_names                     1  X  variables
+g_names                     1  G  constraints
+at_start/f                  1  -  objective
+at_start/g                  1  G  constraints
+at_start/grad_f             1  X  gradient of the objective
+at_start/*/row              1  Z  row of every entry
+at_start/*/column           1  Z  column of every entry
+at_start/*/shape            1  2  rows, columns
+at_start/jac_g/value        1  Z  Jacobian of g
+at_start/information/value  1  Z  triu Gauss-Newton information of E at the start in nine \
+coordinates a superpixel: relative inverse depth at the anchor, its slopes (2), rotation (3), \
+shift of the anchor (3)
+at_start/hess_lag/value     1  Z  triu Hessian, lam_f = lam_g = 1"""
+"""Arrays of the HDF5 file, see `parse_table`; the last line ends with the kind of the Hessian."""
 TANGENT = "tangent"
 """Stands in the place of a gauge for tangent coordinates, which have none."""
 CHOICES = {"gauge": (*GAUGES, TANGENT), "norm": NORMS}
@@ -222,37 +239,27 @@ def _write_start_h5(
     x = nlp.x0
     upper = sparse.triu(nlp.hessian(x, np.ones(nlp.ng)))
 
-    def vector(value: object, text: str, letter: str) -> Array:
-        return Array(np.asarray(value, float).ravel(), "1", text, letter)
-
-    def matrix(value: sparse.spmatrix, text: str) -> dict[str, Array]:
+    def matrix(value: sparse.spmatrix) -> dict[str, Any]:
         m = value.tocoo()
-        return {
-            "row": Array(m.row.astype(np.int64), "1", "row of every entry", "Z"),
-            "column": Array(m.col.astype(np.int64), "1", "column of every entry", "Z"),
-            "value": Array(m.data, "1", text, "Z"),
-            "shape": Array(np.array(m.shape), "1", "rows, columns", "2"),
-        }
+        row, column = m.row.astype(np.int64), m.col.astype(np.int64)
+        return {"row": row, "column": column, "value": m.data, "shape": np.array(m.shape)}
 
-    tree: Tree = {
-        "x0": vector(nlp.x0, "start", "X"),
-        "lbx": vector(nlp.lbx, "lower bounds", "X"),
-        "ubx": vector(nlp.ubx, "upper bounds", "X"),
-        "lbg": vector(nlp.lbg, "lower bounds of g", "G"),
-        "ubg": vector(nlp.ubg, "upper bounds of g", "G"),
-        "p": vector(nlp.p, "parameters of the functions", "P"),
-        "x_names": Array(np.array(names[0]), "1", "variables", "X"),
-        "g_names": Array(np.array(names[1]), "1", "constraints", "G"),
+    vectors = {key: getattr(nlp, key) for key in ("x0", "lbx", "ubx", "lbg", "ubg", "p")}
+    tree = {
+        **{key: np.asarray(value, float).ravel() for key, value in vectors.items()},
+        "x_names": names[0],
+        "g_names": names[1],
         "at_start": {
-            "f": Array(np.float64(nlp.value(x)), "1", "objective"),
-            "g": vector(nlp.constraints(x), "constraints", "G"),
-            "grad_f": vector(nlp.gradient(x), "gradient of the objective", "X"),
-            "jac_g": matrix(nlp.jacobian(x), "Jacobian of g"),
-            "hess_lag": matrix(upper, f"triu Hessian, lam_f = lam_g = 1 ({nlp.hessian_kind})"),
-            "information": matrix(sparse.triu(info.matrix), INFORMATION),
+            "f": nlp.value(x),
+            "g": nlp.constraints(x),
+            "grad_f": nlp.gradient(x),
+            "jac_g": matrix(nlp.jacobian(x)),
+            "hess_lag": matrix(upper),
+            "information": matrix(sparse.triu(info.matrix)),
         },
     }
-    write_h5(path, tree, attrs)
+    rows = parse_table(START + f" ({nlp.hessian_kind})")
+    write_h5(path, tree, attrs, rows)
 
 
 # --- the manifest --------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture, write_png
 from soup_nlp.report.findings import summary
 from soup_nlp.report.formats import check_formats, write_formats
-from soup_nlp.report.layout import record_of, recorded_files, result_tree
+from soup_nlp.report.layout import record_of, recorded_files, rows_in_file
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import PAGE, html, load, result_of
@@ -152,7 +152,9 @@ def write_folder(
         # written last, since it holds the hashes of the others
         digests = {name: digest_of(new / name) for name in files_in(new)}
         record = record_of(digests, (new / "summary.json").read_text(encoding="utf-8"))
-        write_h5(new / "result.h5", {**result_tree(run), RECORD: record}, _attributes(run, config))
+        attributes, unit = _attributes(run, config), result.metre_unit
+        tree = {**result.tree, RECORD: record}
+        write_h5(new / "result.h5", tree, attributes, rows_in_file(unit))
     return files
 
 
@@ -218,7 +220,7 @@ def extended(folder: Path, overwrite: bool = False) -> Iterator[Path]:
         if files:
             files |= {name: digest_of(new / name) for name in files_in(new)}
             record = record_of(files, str(tree[RECORD]["summary"]))
-            replace_group(result, new / "result.h5", RECORD, record)
+            replace_group(result, new / "result.h5", RECORD, record, rows_in_file())
 
 
 def convert(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,16 +11,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.pipeline.record import Run
 from soup_nlp.refine.records import Round
 from soup_nlp.storage.h5_files import RECORD, ReadTree
-from soup_nlp.storage.store import Array, Tree
-
-
-class Row(NamedTuple):
-    """Unit, axes ("N,3"; "" for a number) and description of an array."""
-
-    unit: str
-    axes: str
-    text: str
-
+from soup_nlp.storage.store import Row, Tree, parse_table, row_of
 
 TABLE = """
 input/image_ref           1     H,W,3   reference image, 8-bit RGB
@@ -156,26 +146,12 @@ record/files              text  F       names of the other files
 record/sha256             text  F       their SHA-256
 record/summary            text  -       summary.json
 """
-"""Place, unit, axes and description of every array.
+"""Place, unit, axes and description of every array, see `parse_table`.
 
-"|" separates groups with the same arrays, "*" stands for any name. "soup" and "truth" are the units
-of length of the reconstruction and of the truth; "text" is text.
+"soup" and "truth" are the units of length of the reconstruction and of the truth; "text" is text.
 """
-
-
-def _parsed() -> dict[str, Row]:
-    out = {}
-    for line in TABLE.strip().splitlines():
-        if line:
-            places, unit, axes, text = line.split(maxsplit=3)
-            groups, _, name = places.rpartition("/")
-            for group in groups.split("|"):
-                out[f"{group}/{name}"] = Row(unit, axes.strip("-"), text)
-    return out
-
-
-LAYOUT: Mapping[str, Row] = _parsed()
-"""`TABLE` by place, "group/name"."""
+LAYOUT = parse_table(TABLE)
+"""Rows of `TABLE` by place."""
 
 INDICES = ("segmentation/labels", "segmentation/knn", "energy/edges", "energy/pairs")
 """Arrays of superpixels, 0 to N - 1."""
@@ -185,39 +161,27 @@ FREE = ("depth/next", "depth/sigma_next", "input/image_next", "truth/depth_next"
 """Maps of the next frame, whose size may differ."""
 
 
-def described(values: Mapping[str, Any], truth_unit: str = "", place: str = "") -> Tree:
-    """Values of nested mappings with their rows of `TABLE`; what it does not name is left out.
+def rows_in_file(truth_unit: str = "") -> dict[str, Row]:
+    """The rows of `TABLE` as a file has them, with the unit of length of the truth."""
+    units = {"truth": truth_unit, "text": "1"}
+    return {k: row._replace(unit=units.get(row.unit, row.unit)) for k, row in LAYOUT.items()}
 
-    Args:
-        values: Arrays, numbers or None (left out) by group and name.
-        truth_unit: Unit of length of the truth.
-        place: Group of the values.
-    """
-    out: dict[str, Any] = {}
+
+def _listed(values: Mapping[str, Any], place: str = "") -> ReadTree:
+    """The arrays and numbers of nested mappings that `TABLE` names; None is left out."""
+    out: ReadTree = {}
     for name, value in values.items():
         here = f"{place}{name}"
         if isinstance(value, Mapping):
-            out[name] = described(value, truth_unit, f"{here}/")
-        elif value is not None and (row := _row(here)) is not None:
-            number = np.float64(value) if isinstance(value, bool | int | float) else value
-            unit = {"truth": truth_unit, "text": "1"}.get(row.unit, row.unit)
-            out[name] = Array(number, unit, row.text, row.axes)
+            out[name] = _listed(value, f"{here}/")
+        elif value is not None and row_of(LAYOUT, here) is not None:
+            number = isinstance(value, bool | int | float)
+            out[name] = np.asarray(np.float64(value) if number else value)
     return out
 
 
-def _row(place: str) -> Row | None:
-    """The row of a place; None if there is none. In a description "*" becomes the name."""
-    if place in LAYOUT:
-        return LAYOUT[place]
-    for pattern, row in LAYOUT.items():
-        if fnmatchcase(place, pattern):
-            start = pattern.partition("*")[0]
-            return row._replace(text=row.text.replace("*", place.removeprefix(start)))
-    return None
-
-
-def result_tree(run: Run) -> Tree:
-    """Every array of a run with its description; records hold more than `TABLE` names."""
+def result_tree(run: Run) -> ReadTree:
+    """Every array of a run that `TABLE` names."""
     pair, rec, nlp, sure = run.pair, run.reconstruction, run.nlp_reconstruction, run.confidence
     form, parts = run.problem.formulation, run.components
     assert pair.flow is not None
@@ -258,7 +222,7 @@ def result_tree(run: Run) -> Tree:
         },
         "truth": {} if pair.truth is None else vars(pair.truth),
     }
-    return described(arrays, "" if pair.truth is None else pair.truth.unit)
+    return _listed(arrays)
 
 
 def _by_round(rounds: Sequence[Round]) -> dict[str, Any]:
@@ -325,8 +289,7 @@ def _wrong(place: str, found: object, expected: str) -> DataError:
 
 def record_of(digests: Mapping[str, str], summary: str) -> Tree:
     """The record of the other files: their SHA-256 by name, and the text of summary.json."""
-    files = {"files": np.array(list(digests)), "sha256": np.array(list(digests.values()))}
-    return described({**files, "summary": summary}, place=f"{RECORD}/")
+    return {"files": [*digests], "sha256": [*digests.values()], "summary": summary}
 
 
 def recorded_files(tree: Mapping[str, Any]) -> dict[str, str]:

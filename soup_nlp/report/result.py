@@ -26,7 +26,7 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.report.layout import require_layout, result_tree
 from soup_nlp.storage.files import as_path, is_file, read_json, read_text
 from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
-from soup_nlp.storage.store import Array, Tree, plain, require
+from soup_nlp.storage.store import plain, require
 
 PAGE = "report.html"
 """Name of the page in a result folder."""
@@ -188,7 +188,7 @@ class Result:
 def result_of(run: Run, summary: Mapping[str, Any], verdict: str = "") -> Result:
     """The result of a run; `summary` has the contents of summary.json."""
     return Result(
-        tree=_values(result_tree(run)),
+        tree=result_tree(run),
         summary=plain(summary),
         reconstruction=run.reconstruction,
         components=run.components,
@@ -197,14 +197,6 @@ def result_of(run: Run, summary: Mapping[str, Any], verdict: str = "") -> Result
         min_confidence=run.problem.output.min_confidence,
         verdict=verdict,
     )
-
-
-def _values(tree: Tree) -> ReadTree:
-    """The arrays of a tree without their descriptions, as `read_h5` returns them."""
-    return {
-        key: np.asarray(item.value) if isinstance(item, Array) else _values(item)
-        for key, item in tree.items()
-    }
 
 
 def html(text: str, png: bytes) -> str:

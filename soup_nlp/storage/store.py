@@ -9,14 +9,16 @@ import json
 import math
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, is_dataclass
+from fnmatch import fnmatchcase
 from io import BytesIO
 from os import PathLike as _PathLike
-from typing import Any, TypeAlias, Union
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeAlias
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import PathLike, read_bytes, write_bytes, write_text
@@ -29,31 +31,53 @@ SCHEMA = 1
 FORMAT = ("v110", "v110")
 """Version of the HDF5 format: the oldest one with checksums of all parts."""
 
+Tree: TypeAlias = Mapping[str, Any]
+"""Numbers, texts and arrays of them by name, in nested mappings."""
+
 COMPRESS_ABOVE = 64 * 1024
 """Arrays with more bytes are compressed (gzip level 1 after a byte shuffle)."""
 
 
-@dataclass(frozen=True)
-class Array:
-    """One array of a result file with its description.
+class Row(NamedTuple):
+    """Unit ("1" for none), axes ("N,3"; "" for a number) and description of an array."""
 
-    Attributes:
-        value: The numbers (or text, as a string or an array of strings).
-        units: "px", "m", "rad", "1" for none, ...
-        description: One sentence.
-        shape_letters: Names of the axes, such as "N,3,3" or "H,W".
+    unit: str = "1"
+    axes: str = ""
+    text: str = ""
+
+
+def parse_table(table: str) -> dict[str, Row]:
+    """Rows by the place of an array, "group/name".
+
+    Every line of a table has places, unit, axes ("-" for a number) and description. "|" separates
+    groups with the same arrays, "*" stands for any name.
     """
+    out = {}
+    for line in filter(None, table.strip().splitlines()):
+        places, unit, axes, text = line.split(maxsplit=3)
+        groups, slash, name = places.rpartition("/")
+        for group in groups.split("|"):
+            out[f"{group}{slash}{name}"] = Row(unit, axes.strip("-"), text)
+    return out
 
-    value: ArrayLike
-    units: str
-    description: str
-    shape_letters: str = ""
+
+def row_of(rows: Mapping[str, Row], place: str) -> Row | None:
+    """The row of a place; None if there is none. In a description "*" becomes the name."""
+    if place in rows:
+        return rows[place]
+    for pattern, row in rows.items():
+        if fnmatchcase(place, pattern):
+            start = pattern.partition("*")[0]
+            return row._replace(text=row.text.replace("*", place.removeprefix(start)))
+    return None
 
 
-Tree: TypeAlias = Mapping[str, Union[Array, "Tree"]]
-
-
-def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
+def write_h5(
+    path: PathLike,
+    tree: Tree,
+    attrs: Mapping[str, object],
+    rows: Mapping[str, Row] = MappingProxyType({}),
+) -> None:
     """Write a result file, whole or not at all.
 
     Each array becomes a dataset with the attributes `units`, `description` and `shape_letters`;
@@ -62,8 +86,9 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
 
     Args:
         path: File to write; its folder must exist.
-        tree: Arrays by name, in nested mappings.
+        tree: The arrays.
         attrs: Root attributes.
+        rows: Descriptions of the arrays, see `parse_table`.
 
     Raises:
         DataError: an array cannot be stored, or the file cannot be written.
@@ -76,14 +101,16 @@ def write_h5(path: PathLike, tree: Tree, attrs: Mapping[str, object]) -> None:
             for key, value in (dict(attrs) | about).items():
                 if value is not None:
                     _write_attribute(file, key, value)
-            _write_group(file, tree)
+            _write_group(file, tree, rows)
             _write_attribute(file, DIGEST, contents_digest(file))
     except (OSError, TypeError, ValueError, RuntimeError) as error:
         raise DataError("cannot write the HDF5 file", where=path, found=error) from error
     write_bytes(path, image.getvalue())
 
 
-def replace_group(source: PathLike, target: PathLike, name: str, tree: Tree) -> None:
+def replace_group(
+    source: PathLike, target: PathLike, name: str, tree: Tree, rows: Mapping[str, Row]
+) -> None:
     """Write a copy of a result file with one group replaced.
 
     Raises:
@@ -93,25 +120,25 @@ def replace_group(source: PathLike, target: PathLike, name: str, tree: Tree) -> 
     try:
         with h5py.File(image, "r+", libver=FORMAT) as file:
             del file[name]
-            _write_group(file, {name: tree})
+            _write_group(file, {name: tree}, rows)
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError("result file cannot be changed", where=source, found=error) from error
     write_bytes(target, image.getvalue())
 
 
-def _write_group(group: h5py.Group, tree: Tree) -> None:
+def _write_group(group: h5py.Group, tree: Tree, rows: Mapping[str, Row]) -> None:
     for name, item in tree.items():
-        if not isinstance(item, Array):
-            _write_group(group.require_group(name), item)
+        if isinstance(item, Mapping):
+            _write_group(group.require_group(name), item, rows)
             continue
-        data = np.asarray(item.value)
+        data = np.asarray(item)
         if data.dtype.kind == "U":
             data = np.char.encode(data, "utf-8")
             data = data.astype(h5py.string_dtype(length=max(1, data.dtype.itemsize)))
         _write_array(group, name, data)
-        attributes = group[name].attrs
-        for key in ("units", "description", "shape_letters"):
-            attributes[key] = getattr(item, key)
+        row = row_of(rows, group[name].name.removeprefix("/")) or Row()
+        described = {"units": row.unit, "description": row.text, "shape_letters": row.axes}
+        group[name].attrs.update(described)
 
 
 def _write_attribute(file: h5py.File, key: str, value: object) -> None:

@@ -14,7 +14,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import read_json
 from soup_nlp.storage.h5_files import read_attrs, read_h5
-from soup_nlp.storage.store import Array, write_h5
+from soup_nlp.storage.store import write_h5
 
 
 @pytest.fixture(scope="module")
@@ -22,11 +22,11 @@ def image(tmp_path_factory) -> bytes:
     path = tmp_path_factory.mktemp("h5") / "r.h5"
     rng = np.random.default_rng(0)
     tree = {
-        "a": {"x": Array(rng.random((20, 3)), "1", "", "N,3"), "s": Array(2.5, "1", "")},
-        "big": Array(rng.random((60, 200)), "1", ""),
-        "text": Array(["ab", "cdé"], "1", ""),
-        "none": Array(np.zeros((0, 3)), "1", ""),
-        "many": {str(k): Array(rng.random(k + 1), "1", "") for k in range(12)},
+        "a": {"x": rng.random((20, 3)), "s": 2.5},
+        "big": rng.random((60, 200)),
+        "text": ["ab", "cdé"],
+        "none": np.zeros((0, 3)),
+        "many": {str(k): rng.random(k + 1) for k in range(12)},
     }
     write_h5(path, tree, {"name": "x", "config": "a: 1\n" * 300, "seed": 3})
     return path.read_bytes()
@@ -81,7 +81,7 @@ REFUSED: dict[str, Callable[[h5py.File], object]] = {
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_no_result_holds_is_refused(name, tmp_path):
-    write_h5(tmp_path / "result.h5", {"depth": {"ref": Array(np.ones((4, 4)), "1", "")}}, {})
+    write_h5(tmp_path / "result.h5", {"depth": {"ref": np.ones((4, 4))}}, {})
     with h5py.File(tmp_path / "result.h5", "a") as file:
         REFUSED[name](file)
     with pytest.raises(DataError, match=r"no result has|more memory"):
@@ -102,7 +102,7 @@ def test_json_that_is_none_is_an_error_of_the_file(text, tmp_path):
 
 
 def test_versions_that_are_no_json_are_an_error_of_the_file(tmp_path):
-    write_h5(tmp_path / "result.h5", {"a": {"x": Array(1.0, "1", "")}}, {"versions": 1})
+    write_h5(tmp_path / "result.h5", {"a": {"x": 1.0}}, {"versions": 1})
     with h5py.File(tmp_path / "result.h5", "a") as file:
         file.attrs["versions"] = "{"
     with pytest.raises(DataError, match="HDF5"):
@@ -112,7 +112,7 @@ def test_versions_that_are_no_json_are_an_error_of_the_file(tmp_path):
 @pytest.mark.parametrize("name", ["result.h5", "summary.json"])
 @pytest.mark.parametrize("kind", ["missing", "folder", "dangling link"])
 def test_files_that_are_not_there(kind, name, tmp_path, capsys):
-    write_h5(tmp_path / "result.h5", {"weights": {"arap": Array(1.0, "1", "")}}, {})
+    write_h5(tmp_path / "result.h5", {"weights": {"arap": 1.0}}, {})
     (tmp_path / "summary.json").write_text("{}")
     (tmp_path / name).unlink()
     if kind == "folder":

@@ -14,7 +14,7 @@ import pytest
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.folders import digest_of, mark_of, staged
-from soup_nlp.storage.store import Array, write_h5, write_json
+from soup_nlp.storage.store import write_h5, write_json
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def write(folder: Path, size: int) -> None:
     with staged(folder, whole=True) as new:
         write_json(new / "summary.json", {"size": size})
         values = np.random.default_rng(0).integers(0, 255, size, np.uint8)
-        write_h5(new / "result.h5", {"x": Array(values, "1", "")}, {})
+        write_h5(new / "result.h5", {"x": values}, {})
 
 
 def whole(folder: Path) -> bool:

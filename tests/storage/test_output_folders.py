@@ -401,13 +401,13 @@ import resource, sys
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage.folders import staged
-from soup_nlp.storage.store import Array, write_h5, write_json
+from soup_nlp.storage.store import write_h5, write_json
 import numpy as np
 resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
 try:
     with staged(sys.argv[1], True) as new:
         write_json(new / "small.json", {})
-        write_h5(new / "r.h5", {"x": Array(np.random.default_rng(0).random(20_000), "1", "")}, {})
+        write_h5(new / "r.h5", {"x": np.random.default_rng(0).random(20_000)}, {})
 except DataError as error:
     print(error)
     sys.exit(2)

@@ -12,7 +12,7 @@ import pytest
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import atomic_path, write_text
 from soup_nlp.storage.h5_files import read_attrs, read_h5
-from soup_nlp.storage.store import Array, plain, require, write_h5, write_json
+from soup_nlp.storage.store import parse_table, plain, require, write_h5, write_json
 from soup_nlp.storage.versions import versions
 
 
@@ -20,14 +20,14 @@ def tree():
     rng = np.random.default_rng(0)
     return {
         "soup": {
-            "R": Array(rng.normal(size=(5, 3, 3)), "1", "rotations", "N,3,3"),
-            "inner": {"ok": Array(np.array([True, False]), "1", "flags", "N")},
+            "R": rng.normal(size=(5, 3, 3)),
+            "inner": {"ok": np.array([True, False])},
         },
-        "depth": Array(rng.normal(size=(100, 200)).astype(np.float32), "scene", "z", "H,W"),
-        "labels": Array(np.arange(4, dtype=np.int32), "1", "labels"),
-        "energy": Array(1.5, "px", "a scalar"),
-        "names": Array(["ä", "b"], "1", "text"),
-        "none": Array(np.zeros((0, 3)), "m", "no rows", "M,3"),
+        "depth": rng.normal(size=(100, 200)).astype(np.float32),
+        "labels": np.arange(4, dtype=np.int32),
+        "energy": 1.5,
+        "names": ["ä", "b"],
+        "none": np.zeros((0, 3)),
         "group": {},
     }
 
@@ -96,7 +96,8 @@ def test_atomic_bad_targets(name, tmp_path):
 def test_h5_round_trip(tmp_path):
     path = tmp_path / "r.h5"
     source = tree()
-    write_h5(path, source, {"name": "pair", "seed": 3, "size": (2, 3), "none": None, "m": {"a": 1}})
+    attrs = {"name": "pair", "seed": 3, "size": (2, 3), "none": None, "m": {"a": 1}}
+    write_h5(path, source, attrs, parse_table("depth scene H,W z\n\na|soup/* m - length of *"))
     back = read_h5(path)
     assert set(back) == set(source)
     for name in ("soup/R", "soup/inner/ok", "depth", "labels", "none"):
@@ -104,8 +105,8 @@ def test_h5_round_trip(tmp_path):
         for key in name.split("/"):
             want = want[key]
         got = require(back, name)
-        np.testing.assert_array_equal(got, want.value)
-        assert got.dtype == want.value.dtype
+        np.testing.assert_array_equal(got, want)
+        assert got.dtype == want.dtype
     assert float(require(back, "energy")) == 1.5
     assert list(require(back, "names")) == ["ä", "b"]
     assert back["group"] == {}
@@ -118,8 +119,10 @@ def test_h5_round_trip(tmp_path):
     assert attrs["versions"] == versions()
     assert os.uname().nodename not in attrs["machine"]
     with h5py.File(path) as file:
-        said = dict(file["depth"].attrs)
-    assert said == {"units": "scene", "description": "z", "shape_letters": "H,W"}
+        depth, R, labels = (dict(file[name].attrs) for name in ("depth", "soup/R", "labels"))
+    assert depth == {"units": "scene", "description": "z", "shape_letters": "H,W"}
+    assert R == {"units": "m", "description": "length of R", "shape_letters": ""}
+    assert labels == {"units": "1", "description": "", "shape_letters": ""}
 
 
 def test_h5_compresses_only_large_arrays(tmp_path):
@@ -135,7 +138,7 @@ def test_h5_bad_array_leaves_the_old_file(tmp_path, value):
     path = tmp_path / "r.h5"
     path.write_bytes(b"old")
     with pytest.raises(DataError, match="cannot write"):
-        write_h5(path, {"good": Array(np.zeros(3), "1", ""), "bad": Array(value, "1", "")}, {})
+        write_h5(path, {"good": np.zeros(3), "bad": value}, {})
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["r.h5"]
 
