@@ -18,12 +18,14 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.baselines import fill_nearest
 from soup_nlp.evaluate.metrics import (
     ERRORS,
+    MEDIAN,
+    PRESETS,
+    UNSCALED,
+    Convention,
     depth_metrics,
     scene_flow_epe,
     skill,
-    true_pixels,
 )
-from soup_nlp.evaluate.protocols import Preset, preset
 from soup_nlp.evaluate.scoring import at_truth, coverage, sparsification, surest
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.pipeline.record import Run
@@ -72,7 +74,7 @@ def solved(cell: Cell) -> Run:
     pair = problem.load_pair()
     loaded = time.perf_counter() - begin
     # do not solve a pair that cannot be scored
-    if not any(_applies(pair.truth, preset(name)) for name in item.presets):
+    if not any(_applies(pair.truth, PRESETS[name]) for name in item.presets):
         suite = SUITES[item.suite]
         raise DataError(
             "pair has no true depth",
@@ -102,8 +104,8 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
             kept = surest(gt, at_truth(truth, sigma)[0])
             scored |= {name: (estimate, values) for name, values in kept.items()}
         for name in presets:
-            if _applies(truth, preset(name)):
-                metrics[name] = _metrics(scored, preset(name))
+            if _applies(truth, PRESETS[name]):
+                metrics[name] = _metrics(scored, PRESETS[name])
     main = next(iter(metrics), "")
     return {
         "status": solution.status,
@@ -116,7 +118,7 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
         "flow_error": flow_error(result.pair),
         "metrics": metrics,
         "scene_flow": _scene_flow(result, metrics[main]["solution"]["scale"]) if main else None,
-        "moving": moving(result.pair, maps["solution"], preset(main)) if main else None,
+        "moving": moving(result.pair, maps["solution"], PRESETS[main]) if main else None,
     }
 
 
@@ -129,7 +131,7 @@ def _sigma(result: Run) -> Row:
     if truth is None or not has_depth(truth) or sigma is None:
         return {}
     z, gt = at_truth(truth, result.reconstruction.depth_ref)
-    true = true_pixels(gt, None) & np.isfinite(z)
+    true = MEDIAN.mask(gt) & np.isfinite(z)
     if not true.any():
         return {}
     z, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
@@ -147,7 +149,7 @@ def has_depth(truth: Truth | None) -> bool:
     return truth is not None and (truth.depth_ref is not None or truth.points is not None)
 
 
-def _applies(truth: Truth | None, convention: Preset) -> bool:
+def _applies(truth: Truth | None, convention: Convention) -> bool:
     """Whether a true pixel counts under a convention; a crop needs a depth map."""
     if truth is None:
         return False
@@ -159,11 +161,11 @@ def _applies(truth: Truth | None, convention: Preset) -> bool:
 
 
 def _metrics(
-    scored: Mapping[str, tuple[Float, Float]], convention: Preset
+    scored: Mapping[str, tuple[Float, Float]], convention: Convention
 ) -> dict[str, dict[str, float]]:
     """Metrics under one convention of estimate and truth by method, and their skill."""
     out = {
-        method: {k: convention.score(*pair).as_dict()[k] for k in KEPT_METRICS}
+        method: {k: getattr(depth_metrics(*pair, convention), k) for k in KEPT_METRICS}
         for method, pair in scored.items()
         if convention.counts(pair[1])
     }
@@ -172,7 +174,7 @@ def _metrics(
     return out
 
 
-def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
+def moving(pair: Pair, depth: Float, convention: Convention) -> Row | None:
     """Errors of independently moving pixels and of all other pixels, under one common scale.
 
     Args:
@@ -189,13 +191,13 @@ def moving(pair: Pair, depth: Float, convention: Preset) -> Row | None:
         return None
     gt, label = truth.depth_ref, truth.components
     moving_part = (label > 0) & moves_by_itself(truth)[label]
-    counts = convention.mask(gt) & np.isfinite(gt) & (gt > 0)
+    counts = convention.mask(gt)
     moves, static = counts & moving_part, counts & (label >= 0) & ~moving_part
     if not moves.any() or not static.any():
         return None
-    z = depth * convention.score(depth, gt).scale
+    z = depth * depth_metrics(depth, gt, convention).scale
     masks = {"mre": moves, "rest": static}
-    return {k: depth_metrics(z, gt, scale="none", mask=m).mre for k, m in masks.items()}
+    return {k: depth_metrics(z, gt, UNSCALED, m).mre for k, m in masks.items()}
 
 
 def moves_by_itself(truth: Truth) -> Mask:

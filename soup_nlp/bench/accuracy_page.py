@@ -9,8 +9,7 @@ import pandas as pd
 
 from soup_nlp.bench.accuracy import BASELINES, METHODS
 from soup_nlp.bench.study import main_metric, markdown, page_text, panels, provenance, save, titled
-from soup_nlp.evaluate.metrics import ERRORS
-from soup_nlp.evaluate.protocols import preset
+from soup_nlp.evaluate.metrics import ERRORS, PRESETS
 
 SURENESS = ["AUSE", "guess", "within 1", "within 2"]
 """Columns on sigma."""
@@ -65,7 +64,7 @@ def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = F
         blocks += _convention(convention, scored)
     blocks += [*_families(scored), *_better_baselines(scored)]
     for convention, group in scored.groupby("main", sort=False):
-        blocks += [f"## The solution, {preset(str(convention))}", _details(group)]
+        blocks += [f"## The solution, {PRESETS[str(convention)]}", _details(group)]
     if picture:
         blocks += ["## Sigma", f"![Sparsification by sigma, by family]({name}.png)"]
     return page_text(blocks, frame)
@@ -108,8 +107,8 @@ def _convention(name: str, frame: pd.DataFrame) -> list[str]:
     scored = frame[frame[f"metrics.{name}.solution.mre"].notna()]
     numbers = scored[[c for c in columns if c in scored]].astype(float).rename(columns=columns)
     numbers = numbers.dropna(axis=1, how="all")
-    text = preset(name).text
-    blocks = [f"## MRE, {preset(name)}", f"{text[0].upper()}{text[1:]}."]
+    text = PRESETS[name].text
+    blocks = [f"## MRE, {PRESETS[name]}", f"{text[0].upper()}{text[1:]}."]
     blocks.append(markdown(numbers.set_axis(_pairs(scored))))
     for level, by in (("sequence", ["suite", "sequence", "flow"]), ("dataset", ["suite", "flow"])):
         groups = pd.concat([scored[by], numbers], axis=1).groupby(by, sort=False)

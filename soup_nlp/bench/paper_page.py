@@ -15,7 +15,7 @@ from soup_nlp.bench.processes import processor
 from soup_nlp.bench.studies import ABLATION, COMPARISON, DATA, DEPARTURES, SOURCE, STUDIES
 from soup_nlp.bench.study import markdown, page_text, panels, pivot, provenance, save, titled
 from soup_nlp.bench.suites import SUITES
-from soup_nlp.evaluate.protocols import preset
+from soup_nlp.evaluate.metrics import PRESETS
 
 PICTURES = ("comparison", "depth_maps", "convergence", "departures", *STUDIES)
 FILES = ("README.md", *(f"{name}.png" for name in PICTURES))
@@ -110,7 +110,7 @@ def _comparison(folder: Path, rows: pd.DataFrame) -> list[str]:
     return [
         "## Mean relative error per dataset",
         markdown(pd.DataFrame.from_dict(entries, orient="index").rename_axis("dataset")),
-        "Columns: " + "; ".join(str(preset(n)) for n in ("paper", "best", *caps)) + ".",
+        "Columns: " + "; ".join(str(PRESETS[n]) for n in ("paper", "best", *caps)) + ".",
         "On which pairs: " + "; ".join(f"{n}: {t}" for n, t in DATA.items()) + ".",
         "Every pair, MRE after median scale, no cap; the constrained NLP's status:",
         markdown(by_pair.set_index(["name", "method"])),

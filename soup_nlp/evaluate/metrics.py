@@ -8,8 +8,8 @@ relative error, the same number as AbsRel).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,124 @@ from soup_nlp.errors import DataError, repr_of
 Scale = Literal["median", "mre", "lsq", "none"]
 ERRORS = "mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3"
 """Names of the errors of a depth map."""
+
+
+Crop = tuple[float, float, float, float]
+
+GARG_CROP: Crop = (0.40810811, 0.99189189, 0.03594771, 0.96405229)
+"""Rows from and to, columns from and to, as shares of the image (Garg et al., ECCV 2016)."""
+
+
+@dataclass(frozen=True)
+class Convention:
+    """A convention of depth evaluation: the pixels that count, and one global scale s.
+
+    Scale rules, over the pixels that are compared:
+        "median": median of z_gt / z.
+        "mre": the s that minimises the MRE itself. sum |z_gt - s z| / z_gt is
+            sum (z / z_gt) |z_gt / z - s|, so s is the weighted median of z_gt / z with weights
+            z / z_gt.
+        "lsq": the s that minimises the RMSE, sum z z_gt / sum z^2.
+        "none": s = 1.
+
+    Attributes:
+        name: As in tables.
+        scale: Rule of the scale.
+        cap: Truth beyond this depth is left out, in the unit of the truth; None for no cap.
+        low: Truth at or below this depth is left out.
+        crop: Part of the image that counts, as shares; None for all of it.
+        clamp: Range that scaled estimates are moved into, as Eigen's protocol does; None for none.
+        text: The convention in a few words.
+
+    Raises:
+        DataError: the rule is unknown, or the cap is 0, negative, NaN or no number.
+    """
+
+    name: str = ""
+    scale: Scale = "median"
+    cap: float | None = None
+    low: float = 0.0
+    crop: Crop | None = None
+    clamp: tuple[float, float] | None = None
+    text: str = ""
+
+    def __post_init__(self) -> None:
+        rules = get_args(Scale)
+        if not (isinstance(self.scale, str) and self.scale in rules):
+            raise DataError(
+                "unknown scale rule", found=repr_of(self.scale), expected=", ".join(rules)
+            )
+        try:
+            positive = self.cap is None or float(self.cap) > 0
+        except (TypeError, ValueError, OverflowError):
+            positive = False
+        if not positive:
+            raise DataError(
+                "depth cap must be positive",
+                where="cap",
+                found=repr_of(self.cap),
+                expected="a depth in the unit of the truth, such as 70",
+            )
+
+    def __str__(self) -> str:
+        rule = "no scale" if self.scale == "none" else f"one {self.scale} scale"
+        cap = "no cap" if self.cap is None else f"{self.low:g} < z <= {self.cap:g}"
+        details = ", Garg crop" if self.crop == GARG_CROP else ", cropped" if self.crop else ""
+        if self.clamp:
+            details += f", estimates clamped to [{self.clamp[0]:g}, {self.clamp[1]:g}]"
+        return f"{self.name}: {rule} per image, {cap}{details}"
+
+    def mask(self, truth: ArrayLike) -> Mask:
+        """Pixels of a truth (H, W) or (M,) that count.
+
+        Raises:
+            DataError: a crop needs (H, W).
+        """
+        gt = np.asarray(truth, np.float64)
+        cap = np.inf if self.cap is None else self.cap
+        keep = np.asarray(np.isfinite(gt) & (gt > self.low) & (gt <= cap))
+        if self.crop is not None:
+            if gt.ndim != 2:
+                raise DataError("a crop needs a depth map (H, W)", where=self.name, found=gt.shape)
+            top, bottom, left, right = (
+                int(share * side)
+                for share, side in zip(self.crop, np.repeat(gt.shape, 2), strict=True)
+            )
+            inside = np.zeros(gt.shape, bool)
+            inside[top:bottom, left:right] = True
+            keep &= inside
+        return keep
+
+    def counts(self, truth: ArrayLike) -> bool:
+        """Whether any true pixel is left."""
+        return bool(self.mask(truth).any())
+
+
+MEDIAN, UNSCALED = Convention("median"), Convention("unscaled", "none")
+"""Every true pixel, with one median scale or as it is."""
+
+_IN_USE = (
+    Convention("paper", text="the paper's MRE: every true pixel, one global scale"),
+    Convention("best", "mre", text="the scale that minimises the MRE itself, no cap"),
+    Convention(
+        "sintel70",
+        cap=70.0,
+        text="as two-view work on Sintel, 0 < z <= 70, but the scale is the median of z_gt / z, not"
+        " median z_gt over median z",
+    ),
+    Convention("kitti", text="KITTI uncapped: median scale over every true pixel"),
+    Convention(
+        "eigen80",
+        cap=80.0,
+        low=1e-3,
+        crop=GARG_CROP,
+        clamp=(1e-3, 80.0),
+        text="after Eigen's protocol on KITTI at 80 m, Garg crop, clamped estimates, but the scale"
+        " is the median of z_gt / z, not median z_gt over median z",
+    ),
+)
+PRESETS = {convention.name: convention for convention in _IN_USE}
+"""Conventions in use by name."""
 
 
 @dataclass(frozen=True)
@@ -66,57 +184,49 @@ class DepthMetrics:
 
     __repr__ = __str__
 
-    def as_dict(self) -> dict[str, Any]:
-        """All attributes by name, in the order above: plain numbers, strings and None."""
-        return asdict(self)
-
 
 def depth_metrics(
     estimate: ArrayLike,
     truth: ArrayLike,
-    *,
-    scale: Scale = "median",
-    cap: float | None = None,
+    convention: Convention = MEDIAN,
     mask: ArrayLike | None = None,
-    clamp: tuple[float, float] | None = None,
 ) -> DepthMetrics:
     """Errors of an estimated depth, after one global scale s on the estimate.
 
-    Scale rules, over the pixels that are compared:
-        "median": median of z_gt / z.
-        "mre": the s that minimises the MRE itself. sum |z_gt - s z| / z_gt is
-            sum (z / z_gt) |z_gt / z - s|, so s is the weighted median of z_gt / z with weights
-            z / z_gt.
-        "lsq": the s that minimises the RMSE, sum z z_gt / sum z^2.
-        "none": s = 1.
-
-    A pixel is true where the truth is finite, positive, within the cap and in the mask; it is
-    compared where the estimate is also finite and positive. Everything else about the estimate
-    (a hole, a negative depth) costs coverage, not error.
+    A true pixel is compared where the estimate is finite and positive. Everything else about the
+    estimate (a hole, a negative depth) costs coverage, not error.
 
     Args:
         estimate: z in any unit, any shape ((H, W) map or (M,) vector); NaN where unknown.
         truth: True z, same shape; NaN where unknown.
-        scale: Scale rule.
-        cap: Leave out truth deeper than this, unit of the truth; None keeps all.
+        convention: Which pixels are true, and how s is chosen.
         mask: Bool, same shape; False leaves a pixel out. None keeps all.
-        clamp: After scaling, estimates are moved into [low, high], unit of the truth, as Eigen's
-            protocol does; None leaves them as they are.
 
     Raises:
-        DataError: shapes differ, the rule is unknown, the cap is not positive, or no pixel has a
-            truth to compare with.
+        DataError: shapes differ, or no pixel has a truth to compare with.
     """
-    check_rule(scale)
-    z, gt, coverage = _compared(estimate, truth, cap, mask)
-    s = _scale(z, gt, scale) if z.size else float("nan")
-    z = s * z if clamp is None else np.clip(s * z, *clamp)
+    z, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
+    keep = np.ones(gt.shape, bool) if mask is None else np.asarray(mask, bool)
+    if not z.shape == gt.shape == keep.shape:
+        raise DataError(
+            "estimate, truth and mask of a depth differ in shape",
+            found=f"estimate {z.shape}, truth {gt.shape}, mask {keep.shape}",
+            hint="sample a dense estimate at sparse points with sample_at_points",
+        )
+    true = convention.mask(gt) & keep
+    if not true.any():
+        raise DataError("no pixel has a true depth to compare with, within cap and mask")
+    compared = true & np.isfinite(z) & (z > 0)
+    coverage = np.count_nonzero(compared) / np.count_nonzero(true)
+    z, gt = z[compared], gt[compared]
+    s = _scale(z, gt, convention.scale) if z.size else float("nan")
+    z = s * z if convention.clamp is None else np.clip(s * z, *convention.clamp)
     return DepthMetrics(
         **_errors(z, gt),
-        scale_rule=scale,
+        scale_rule=convention.scale,
         scale=float(s),
-        cap=None if cap is None else float(cap),
-        coverage=coverage,
+        cap=None if convention.cap is None else float(convention.cap),
+        coverage=float(coverage),
         n_pixels=int(z.size),
     )
 
@@ -137,64 +247,6 @@ def _errors(z: Float, gt: Float) -> dict[str, float]:
         "log_rmse": float(np.sqrt(np.mean(log * log))),
         **{f"delta{k}": float(np.mean(fold < 1.25**k)) for k in (1, 2, 3)},
     }
-
-
-def true_pixels(truth: Float, cap: float | None) -> Mask:
-    """Where a true depth is known, positive and within the cap."""
-    check_cap(cap)
-    return np.isfinite(truth) & (truth > 0) & (truth <= (np.inf if cap is None else cap))
-
-
-def check_rule(scale: object) -> None:
-    """Check that there is a scale rule of this name.
-
-    Raises:
-        DataError: the rule is unknown.
-    """
-    if not (isinstance(scale, str) and scale in get_args(Scale)):
-        raise DataError(
-            "unknown scale rule", found=repr_of(scale), expected=", ".join(get_args(Scale))
-        )
-
-
-def check_cap(cap: float | None) -> None:
-    """Check that a depth cap is positive or None.
-
-    Raises:
-        DataError: the cap is 0, negative, NaN or no number.
-    """
-    if cap is None:
-        return
-    try:
-        positive = float(cap) > 0
-    except (TypeError, ValueError, OverflowError):
-        positive = False
-    if not positive:
-        raise DataError(
-            "depth cap must be positive",
-            where="cap",
-            found=repr_of(cap),
-            expected="a depth in the unit of the truth, such as 70",
-        )
-
-
-def _compared(
-    estimate: ArrayLike, truth: ArrayLike, cap: float | None, mask: ArrayLike | None
-) -> tuple[Float, Float, float]:
-    """Vectors of estimate and truth where both count, and the share of the truth they cover."""
-    z, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
-    keep = np.ones(gt.shape, bool) if mask is None else np.asarray(mask, bool)
-    if not z.shape == gt.shape == keep.shape:
-        raise DataError(
-            "estimate, truth and mask of a depth differ in shape",
-            found=f"estimate {z.shape}, truth {gt.shape}, mask {keep.shape}",
-            hint="sample a dense estimate at sparse points with sample_at_points",
-        )
-    true = true_pixels(gt, cap) & keep
-    if not true.any():
-        raise DataError("no pixel has a true depth to compare with, within cap and mask")
-    compared = true & np.isfinite(z) & (z > 0)
-    return z[compared], gt[compared], float(np.count_nonzero(compared) / np.count_nonzero(true))
 
 
 def _scale(z: Float, gt: Float, rule: Scale) -> float:

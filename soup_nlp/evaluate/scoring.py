@@ -15,13 +15,12 @@ from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Truth
 from soup_nlp.errors import DataError, repr_of
 from soup_nlp.evaluate.metrics import (
+    MEDIAN,
+    Convention,
     DepthMetrics,
     Scale,
-    check_cap,
-    check_rule,
     depth_metrics,
     sample_at_points,
-    true_pixels,
 )
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.h5_files import read_h5
@@ -38,8 +37,7 @@ SURE = {"solution_90": 0.9, "solution_70": 0.7}
 def score_depths(
     truth: Truth | None,
     depths: Mapping[str, Float],
-    scale: Scale = "median",
-    cap: float | None = None,
+    convention: Convention = MEDIAN,
     depth_next: Float | None = None,
     sigma: Float | None = None,
 ) -> dict[str, DepthMetrics]:
@@ -48,8 +46,7 @@ def score_depths(
     Args:
         truth: Dense `depth_ref`, or else sparse `points`; `depth_next` where it is known.
         depths: (H, W) z of the reference frame by name.
-        scale: Rule of the one global scale of each depth map.
-        cap: Truth beyond this depth is left out.
+        convention: Rule of the one global scale of each depth map, and the pixels that count.
         depth_next: (H', W') z of the next frame.
         sigma: (H, W) uncertainty of the depth "solution".
 
@@ -64,18 +61,18 @@ def score_depths(
         if truth.depth_ref is None and truth.points is None:
             break
         estimate, gt = at_truth(truth, depth)
-        if not true_pixels(gt, cap).any():
+        if not convention.counts(gt):
             break
-        out[name] = depth_metrics(estimate, gt, scale=scale, cap=cap)
+        out[name] = depth_metrics(estimate, gt, convention)
         if "constant" not in out:
-            out["constant"] = depth_metrics(np.ones(gt.shape), gt, scale=scale, cap=cap)
+            out["constant"] = depth_metrics(np.ones(gt.shape), gt, convention)
     if sigma is not None and "solution" in out:
         estimate, gt = at_truth(truth, depths["solution"])
         for name, sure_gt in surest(gt, at_truth(truth, sigma)[0]).items():
-            out[name] = depth_metrics(estimate, sure_gt, scale=scale, cap=cap)
+            out[name] = depth_metrics(estimate, sure_gt, convention)
     gt_next = truth.depth_next
-    if depth_next is not None and gt_next is not None and true_pixels(gt_next, cap).any():
-        out["solution_next"] = depth_metrics(depth_next, gt_next, scale=scale, cap=cap)
+    if depth_next is not None and gt_next is not None and convention.counts(gt_next):
+        out["solution_next"] = depth_metrics(depth_next, gt_next, convention)
     return out
 
 
@@ -89,7 +86,7 @@ def at_truth(truth: Truth, image: Float) -> tuple[Float, Float]:
 
 def surest(gt: Float, sigma: Float) -> dict[str, Float]:
     """True depths by the names of `SURE`: NaN except for the share with the least sigma."""
-    true = true_pixels(gt, None) & np.isfinite(sigma)
+    true = MEDIAN.mask(gt) & np.isfinite(sigma)
     limits = {k: np.quantile(sigma[true], v) if true.any() else 0.0 for k, v in SURE.items()}
     return {k: np.where(true & (sigma <= limit), gt, np.nan) for k, limit in limits.items()}
 
@@ -118,8 +115,7 @@ def evaluate(
         DataError: the cap is not positive, a file is missing, sizes differ, or the truth has no
             pixel.
     """
-    check_cap(cap)
-    check_rule(scale)
+    convention = Convention(scale=scale, cap=cap)
     depths = _depths(result)
     where = depth if isinstance(depth, str | Path) else "truth"
     gt = _map(depth, "truth") if where == "truth" else read_depth(where, depth_scale)
@@ -128,13 +124,13 @@ def evaluate(
         raise DataError(
             "truth and result differ in size", where=where, found=gt.shape, expected=expected
         )
-    if not true_pixels(gt, cap).any():
+    if not convention.counts(gt):
         raise DataError(
             "truth has no pixel to compare with",
             where=where,
             found="no finite, positive depth" + ("" if cap is None else f" up to the cap {cap:g}"),
         )
-    return score_depths(Truth(depth_ref=gt), depths, scale, cap)
+    return score_depths(Truth(depth_ref=gt), depths, convention)
 
 
 def _depths(result: object) -> dict[str, Float]:

@@ -254,7 +254,7 @@ def summary(run: Run) -> dict[str, Any]:
         },
         "metrics": {
             # the constant depth is scored on the reference frame only
-            k: m.as_dict() | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
+            k: vars(m) | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
             for k, m in run.metrics.items()
         },
         "components": components,
@@ -274,7 +274,7 @@ def summary(run: Run) -> dict[str, Any]:
         else {
             "width": full.depth_ref.shape[1],
             "height": full.depth_ref.shape[0],
-            "metrics": full.metrics and full.metrics.as_dict(),
+            "metrics": full.metrics and vars(full.metrics),
         },
         "start": {
             "motions": len(run.start.motions),

@@ -9,7 +9,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import depth_metrics, true_pixels
+from soup_nlp.evaluate.metrics import MEDIAN, UNSCALED, depth_metrics
 from soup_nlp.sequence.chain import Chain
 
 LINK_HEADS = ["pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", ""]
@@ -32,7 +32,7 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     stored = [*(pair.truth.get("depth_ref") for pair in chain.pairs)]
     stored.append(chain.pairs[-1].truth.get("depth_next"))
     given = enumerate(stored if truths is None else truths)
-    true = {k: z for k, z in given if z is not None and true_pixels(z, None).any()}
+    true = {k: z for k, z in given if z is not None and MEDIAN.counts(z)}
     if not true:
         return None
     depths, ratios = {k: chain.depth(k) for k in true}, []
@@ -44,13 +44,13 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
                 found=true[k].shape,
                 expected=z.shape,
             )
-        compared = true_pixels(true[k], None) & (z > 0)
+        compared = MEDIAN.mask(true[k]) & (z > 0)
         ratios.append(true[k][compared] / z[compared])
     scale = float(np.median(np.concatenate(ratios)))
     frames = []
     for k, z in depths.items():
         separate = depth_metrics(z, true[k])
-        common = depth_metrics(scale * z, true[k], scale="none")
+        common = depth_metrics(scale * z, true[k], UNSCALED)
         frames.append(
             {
                 "frame": k,

@@ -17,7 +17,7 @@ from soup_nlp.cli import bench
 from soup_nlp.cli.main import main
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.evaluate.protocols import preset
+from soup_nlp.evaluate.metrics import PRESETS
 from soup_nlp.storage.rows import Row
 
 pytestmark = pytest.mark.slow
@@ -127,10 +127,10 @@ def test_moving_pixels_are_told_apart_under_one_scale():
         *(np.array([[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]]) for _ in range(2)),
         truth=Truth(depth_ref=depth, components=label),
     )
-    errors = moving(pair, estimate, preset("paper"))
+    errors = moving(pair, estimate, PRESETS["paper"])
     assert errors == pytest.approx({"mre": 0.5 * 200 / 300, "rest": 0.0}, abs=1e-12)
     still = replace(pair, truth=Truth(depth_ref=depth, components=0 * label))
-    assert moving(still, estimate, preset("paper")) is None
+    assert moving(still, estimate, PRESETS["paper"]) is None
 
 
 def broken(cell: Cell) -> Row:

@@ -13,13 +13,15 @@ from hypothesis.extra.numpy import arrays
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute
 from soup_nlp.evaluate.metrics import (
+    PRESETS,
+    UNSCALED,
+    Convention,
     component_overlaps,
     depth_metrics,
     sample_at_points,
     scene_flow_epe,
     skill,
 )
-from soup_nlp.evaluate.protocols import PRESETS, preset
 from soup_nlp.evaluate.scoring import LAST, STEPS, coverage, sparsification
 
 depths = arrays(np.float64, 12, elements=st.floats(0.1, 100.0))
@@ -28,7 +30,7 @@ quick = settings(max_examples=60, deadline=None)
 
 
 def test_hand_values():
-    m = depth_metrics([1.0, 3.0], [2.0, 2.0], scale="none")
+    m = depth_metrics([1.0, 3.0], [2.0, 2.0], UNSCALED)
     assert m.mre == pytest.approx(0.5)
     assert m.median_relative == pytest.approx(0.5)
     assert m.sq_rel == pytest.approx(0.5)
@@ -48,7 +50,7 @@ def test_hand_values():
     ],
 )
 def test_scale_rules(rule, scale):
-    m = depth_metrics([1.0, 4.0, 16.0], [4.0, 8.0, 16.0], scale=rule)
+    m = depth_metrics([1.0, 4.0, 16.0], [4.0, 8.0, 16.0], Convention(scale=rule))
     assert m.scale == pytest.approx(scale)
 
 
@@ -57,7 +59,7 @@ def test_coverage_cap_and_mask():
     estimate = np.array([[1.0, np.nan, 5.0], [4.0, 100.0, 1.0]])
     m = depth_metrics(estimate, truth)
     assert (m.n_pixels, m.coverage) == (3, 0.75)
-    m = depth_metrics(estimate, truth, cap=4.0)
+    m = depth_metrics(estimate, truth, Convention(cap=4.0))
     assert (m.n_pixels, m.coverage, m.cap) == (2, pytest.approx(2 / 3), 4.0)
     m = depth_metrics(estimate, truth, mask=truth == 2.0)
     assert (m.n_pixels, m.coverage) == (0, 0.0)
@@ -69,13 +71,13 @@ def test_negative_and_infinite_estimates_cost_coverage_not_error():
     assert (m.mre, m.coverage) == (0.0, 0.25)
 
 
-def test_as_dict_keys_are_stable():
+def test_names_of_scores_are_stable():
     keys = (
         "mre median_relative sq_rel rmse log_rmse delta1 delta2 delta3 scale_rule scale cap "
         "coverage n_pixels"
     )
     m = depth_metrics([1.0], [2.0])
-    assert list(m.as_dict()) == keys.split()
+    assert list(vars(m)) == keys.split()
     with pytest.raises(dataclasses.FrozenInstanceError):
         m.mre = 0.0  # type: ignore[misc]
 
@@ -87,7 +89,7 @@ def test_a_preset_finds_no_error_in_a_scaled_truth():
     for name in ("sintel70", "eigen80"):
         assert "median of z_gt / z, not median z_gt over median z" in PRESETS[name].text
     for name, convention in PRESETS.items():
-        m = convention.score(truth / 2.0, truth)
+        m = depth_metrics(truth / 2.0, truth, convention)
         assert m.mre == pytest.approx(0.0, abs=1e-12), name
         assert m.scale == pytest.approx(2.0), name
 
@@ -98,19 +100,22 @@ def test_metrics_and_check_agree_at_the_delta_thresholds():
     for k in (1, 2, 3):
         for z in (truth * 1.25**k, truth / 1.25**k):
             m, recomputed = (
-                depth_metrics(z, truth, scale="none"),
+                depth_metrics(z, truth, UNSCALED),
                 recompute.scores(z, truth, "none", None),
             )
             assert [m.delta1, m.delta2, m.delta3] == [recomputed[f"delta{j}"] for j in (1, 2, 3)]
     exact = [1.25, 1.25**2, 1.25**3]
-    m = depth_metrics(exact, np.ones(3), scale="none")
+    m = depth_metrics(exact, np.ones(3), UNSCALED)
     assert [m.delta1, m.delta2, m.delta3] == [0.0, 1 / 3, 2 / 3]
 
 
 @quick
 @given(depths, depths, factors, st.sampled_from(["median", "mre", "lsq"]))
 def test_scale_of_the_estimate_changes_nothing(z, gt, factor, rule):
-    a, b = depth_metrics(z, gt, scale=rule), depth_metrics(factor * z, gt, scale=rule)
+    a, b = (
+        depth_metrics(z, gt, Convention(scale=rule)),
+        depth_metrics(factor * z, gt, Convention(scale=rule)),
+    )
     for name in ("mre", "rmse", "log_rmse", "sq_rel", "median_relative"):
         assert getattr(a, name) == pytest.approx(getattr(b, name), rel=1e-6, abs=1e-9)
     assert b.scale * factor == pytest.approx(a.scale, rel=1e-6)
@@ -119,12 +124,12 @@ def test_scale_of_the_estimate_changes_nothing(z, gt, factor, rule):
 @quick
 @given(depths, depths, st.floats(1e-2, 1e2))
 def test_each_scale_rule_minimises_its_error(z, gt, factor):
-    best = depth_metrics(z, gt, scale="mre").mre
-    rmse = depth_metrics(z, gt, scale="lsq").rmse
+    best = depth_metrics(z, gt, Convention(scale="mre")).mre
+    rmse = depth_metrics(z, gt, Convention(scale="lsq")).rmse
     for rule in ("median", "lsq"):
-        assert best <= depth_metrics(z, gt, scale=rule).mre * (1 + 1e-9) + 1e-12
-    assert best <= depth_metrics(factor * z, gt, scale="none").mre * (1 + 1e-9) + 1e-12
-    assert rmse <= depth_metrics(factor * z, gt, scale="none").rmse * (1 + 1e-9) + 1e-12
+        assert best <= depth_metrics(z, gt, Convention(scale=rule)).mre * (1 + 1e-9) + 1e-12
+    assert best <= depth_metrics(factor * z, gt, UNSCALED).mre * (1 + 1e-9) + 1e-12
+    assert rmse <= depth_metrics(factor * z, gt, UNSCALED).rmse * (1 + 1e-9) + 1e-12
 
 
 def test_constant_depth_and_skill():
@@ -161,21 +166,20 @@ def test_scene_flow_epe():
 
 
 @pytest.mark.parametrize(
-    ("kwargs", "words"),
+    ("score", "words"),
     [
-        ({"truth": [1.0, 2.0]}, "differ in shape"),
-        ({"scale": "mean"}, "unknown scale rule"),
-        ({"cap": 0.0}, "must be positive"),
-        ({"cap": float("nan")}, "must be positive"),
-        ({"mask": [True, False]}, "mask"),
-        ({"truth": [np.nan]}, "no pixel"),
-        ({"cap": 0.5}, "no pixel"),
+        (lambda: depth_metrics([1.0], [1.0, 2.0]), "differ in shape"),
+        (lambda: depth_metrics([1.0], [1.0], mask=[True, False]), "mask"),
+        (lambda: depth_metrics([1.0], [np.nan]), "no pixel"),
+        (lambda: depth_metrics([1.0], [1.0], Convention(cap=0.5)), "no pixel"),
+        (lambda: Convention(scale="mean"), "unknown scale rule"),
+        (lambda: Convention(cap=0.0), "must be positive"),
+        (lambda: Convention(cap=float("nan")), "must be positive"),
     ],
 )
-def test_bad_input(kwargs, words):
-    arguments = {"truth": [1.0], **kwargs}
+def test_bad_input(score, words):
     with pytest.raises(DataError, match=words):
-        depth_metrics([1.0], arguments.pop("truth"), **arguments)
+        score()
 
 
 def test_eigens_clamp_comes_after_the_scale():
@@ -184,14 +188,14 @@ def test_eigens_clamp_comes_after_the_scale():
     estimate = np.full(truth.shape, np.nan)
     for k, (z, gt) in enumerate([(10.0, 20.0), (20.0, 40.0), (30.0, 60.0), (60.0, 40.0)]):
         estimate[60, 50 + k], truth[60, 50 + k] = z, gt
-    m = PRESETS["eigen80"].score(estimate, truth)
+    m = depth_metrics(estimate, truth, PRESETS["eigen80"])
     assert m.scale == 2.0
     assert m.n_pixels == 4
     assert m.mre == pytest.approx((80.0 - 40.0) / 40.0 / 4)
     assert m.rmse == pytest.approx(np.sqrt((80.0 - 40.0) ** 2 / 4))
     # from below: an estimate near 0 is clamped to a millimetre
     estimate[60, 53] = 1e-6
-    m = PRESETS["eigen80"].score(estimate, truth)
+    m = depth_metrics(estimate, truth, PRESETS["eigen80"])
     assert m.log_rmse == pytest.approx(np.log(40.0 / 1e-3) / 2)
 
 
@@ -203,20 +207,18 @@ def test_presets_apply_cap_and_crop():
     truth = np.full((100, 200), 10.0)
     truth[:, 100:] = 75.0
     estimate = np.where(truth == 75.0, 300.0, 20.0)
-    assert PRESETS["sintel70"].score(estimate, truth).mre == pytest.approx(0.0)
-    assert PRESETS["sintel70"].score(estimate, truth).n_pixels == 100 * 100
-    assert PRESETS["kitti"].score(estimate, truth).mre > 0.2
+    assert depth_metrics(estimate, truth, PRESETS["sintel70"]).mre == pytest.approx(0.0)
+    assert depth_metrics(estimate, truth, PRESETS["sintel70"]).n_pixels == 100 * 100
+    assert depth_metrics(estimate, truth, PRESETS["kitti"]).mre > 0.2
     eigen = PRESETS["eigen80"]
     assert eigen.mask(truth).sum() == (99 - 40) * (192 - 7)
     # the upper part of the image does not count
     worse = estimate.copy()
     worse[:40] = 1.0
-    assert eigen.score(worse, truth) == eigen.score(estimate, truth)
+    assert depth_metrics(worse, truth, eigen) == depth_metrics(estimate, truth, eigen)
     assert not PRESETS["sintel70"].counts(np.full((2, 2), 71.0))
     with pytest.raises(DataError, match="crop"):
-        eigen.score([1.0], [1.0])
-    with pytest.raises(DataError, match="unknown metric preset"):
-        preset("papr")
+        depth_metrics([1.0], [1.0], eigen)
     assert all(p.text and p.name in str(p) for p in PRESETS.values())
 
 

@@ -14,7 +14,7 @@ from helpers_truth import majority
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.pair import Pair
-from soup_nlp.evaluate.metrics import depth_metrics
+from soup_nlp.evaluate.metrics import UNSCALED, depth_metrics
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import reconstruct
@@ -177,7 +177,7 @@ def test_both_kinds_of_regions_are_reconstructed_in_one_image():
     bends = truth.components == 1
     for mask, most in ((bends, 0.12), (~bends, 0.04)):
         true_depth = np.where(mask, truth.depth_ref, np.nan)
-        assert 1e-4 < depth_metrics(z, true_depth, scale="none").mre < most
+        assert 1e-4 < depth_metrics(z, true_depth, UNSCALED).mre < most
     assert depth_metrics(np.ones_like(z), truth.depth_ref).mre > 0.15
 
 
