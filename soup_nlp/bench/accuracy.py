@@ -15,7 +15,6 @@ from soup_nlp.bench.study import Cell
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.baselines import fill_nearest
 from soup_nlp.evaluate.metrics import (
     ERRORS,
     MEDIAN,
@@ -26,7 +25,7 @@ from soup_nlp.evaluate.metrics import (
     scene_flow_epe,
     skill,
 )
-from soup_nlp.evaluate.scoring import at_truth, coverage, sparsification, surest
+from soup_nlp.evaluate.scoring import at_truth, coverage, fill_nearest, sparsification, surest
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
