@@ -17,7 +17,7 @@ PAPER_TERMS = ("arap", "proj", "cont", "orient")
 GIVEN_TERMS = {"depth": "depth_weight", "order": "order_weight"}
 """Terms of data that few pairs have, and the weights in `EnergyData` that are 0 without them."""
 TERMS = (*PAPER_TERMS, "prior", *GIVEN_TERMS)
-"""All terms of the energy. A term is a key of `Weights` (its factor), of `oracle.ENERGIES` (its
+"""All terms of the energy. A term is a key of `Weights` (its factor), of `oracle.PAIR_TERMS` (its
 value) and of `elements.ELEMENTS` (its kernel)."""
 HINGE = 0.01
 """Width of the corner of the hinge of E_order, relative inverse depth."""

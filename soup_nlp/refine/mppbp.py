@@ -237,7 +237,7 @@ class Rounds:
         # the current belief is allowed even where it violates a constraint
         forbidden = ~np.isfinite(unary[:, 0])
         if forbidden.any():
-            exact = self.weights.proj * oracle.reprojection(best, data, self.weights)
+            exact = self.weights.proj * oracle.values("proj", best, data, self.weights)
             unary[forbidden, 0] = np.minimum(exact, 1e9)[forbidden]
         # single precision suffices: a choice is taken only where the exact energy falls
         return unary, self.pairs.tables(p, unit, np.float32)

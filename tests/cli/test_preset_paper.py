@@ -195,10 +195,10 @@ def test_the_unit_of_length_is_the_sum_that_it_names(case, length):
         "scales": start.distance.sum(),
     }[length]
     data = in_length(bare, start, length)
-    expected = oracle.continuity(start, bare, weights).sum() * start.distance.mean()
+    expected = oracle.values("cont", start, bare, weights).sum() * start.distance.mean()
     larger = Soup(2 * start.lam, start.n, start.d, start.R, start.t)
     for soup in (start, larger):
-        total = oracle.continuity(soup, data, weights).sum() * unit
+        total = oracle.values("cont", soup, data, weights).sum() * unit
         assert total == pytest.approx(expected, rel=1e-9)
 
 

@@ -47,7 +47,7 @@ def test_a_start_without_parallax_borrows_depth_but_fits_flow(tiles, angle):
     start = propose(FlowFit.of(tiles, flow, K, K))
     assert start.borrowed.all()
     data = build_energy_data(tiles, flow, K, K)
-    error = oracle.reprojection(start.soup, data, Weights())
+    error = oracle.values("proj", start.soup, data, Weights())
     assert error.max() < 1e-3
     np.testing.assert_allclose(error, start.error, atol=1e-3)
 

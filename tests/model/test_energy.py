@@ -128,8 +128,8 @@ def test_local_units_make_every_edge_blind_to_its_own_scale():
     lam = problem.soup.lam.copy()
     lam[[i, k]] *= 2
     twice = replace(problem.soup, lam=lam)
-    a = oracle.arap(problem.soup, problem.data, weights)
-    b = oracle.arap(twice, problem.data, weights)
+    a = oracle.values("arap", problem.soup, problem.data, weights)
+    b = oracle.values("arap", twice, problem.data, weights)
     assert b[0] == pytest.approx(a[0], rel=1e-12)
     touched = np.isin(problem.seg.edges, [i, k]).any(axis=1)
     np.testing.assert_allclose(b[~touched], a[~touched], rtol=1e-12)
@@ -197,20 +197,20 @@ def test_pixel_units_by_hand():
     angle = 1e-3
     turned[here] = turned[here] @ rotation.exp([0, 0, angle])
     # |R_i - R_k|_F = sqrt(8) sin(angle / 2); turning about z leaves the camera's own motion
-    e = oracle.arap(replace(soup, R=turned), data, wide)
+    e = oracle.values("arap", replace(soup, R=turned), data, wide)
     rotating = focal * np.sqrt(8) * np.sin(angle / 2)
     np.testing.assert_array_less(arap * rotating - 1e-9, e)
     assert np.median(e[edge] / (arap[edge] * rotating)) == pytest.approx(1, abs=0.5)
     moved = soup.t.copy()
     moved[here] += [0, 0, g / soup.lam[here]]
-    gap = oracle.arap(replace(soup, t=moved), data, wide)
+    gap = oracle.values("arap", replace(soup, t=moved), data, wide)
     at_least = arap * focal * g / Z
     assert (gap >= at_least - 1e-9).all()
     assert (gap <= 2 * at_least + 1e-9).all()
     assert gap[edge].min() > 0
     # deeper by g, with the motion unchanged: both frames' gaps are g along the rays
     deeper = replace(soup, d=np.where(np.arange(12) == here, soup.d * (1 + g / Z), soup.d))
-    cont = oracle.continuity(deeper, data, wide)
+    cont = oracle.values("cont", deeper, data, wide)
     pair = (data.pairs == here).any(axis=1)
     length = np.linalg.norm(data.boundary_ray, axis=2)
     whole = np.sqrt(np.sum(length**2, axis=1)) * data.pair_factor
@@ -232,8 +232,8 @@ def test_sampled_boundaries_stand_for_the_whole():
     soup = random_soup(0, 12, spread=0.0)
     lam = soup.lam * np.random.default_rng(0).uniform(0.8, 1.2, 12)
     soup = replace(soup, lam=lam)
-    few = oracle.continuity(soup, Tiny(boundary_samples=3).data, PAPER)
-    every = oracle.continuity(soup, Tiny(boundary_samples=None).data, PAPER)
+    few = oracle.values("cont", soup, Tiny(boundary_samples=3).data, PAPER)
+    every = oracle.values("cont", soup, Tiny(boundary_samples=None).data, PAPER)
     np.testing.assert_allclose(few, every, rtol=0.02)
 
 
@@ -270,7 +270,7 @@ def test_superpixels_without_flow_take_no_pixels_and_have_no_projection():
     data = build_energy_data(problem.seg, flow, K_REF, K_NEXT, 6)
     assert (data.pixel_weight[5] == 0).all()
     assert (data.pixel_weight[4] > 0).all()
-    error = oracle.reprojection(problem.soup, data, PAPER)
+    error = oracle.values("proj", problem.soup, data, PAPER)
     assert error[5] == 0
     nlp, _ = build_matrix_nlp(problem.soup, data, PAPER, form())
     assert np.isfinite(value(nlp, nlp.x0)[0])

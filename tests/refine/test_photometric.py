@@ -229,8 +229,8 @@ def test_e_proj_is_weaker_and_truncated_only_where_the_images_contradict(scene):
     contradicted = np.arange(scene.count) % 3 == 0
     photo = replace(scene.look(scene.truth), contradicted=contradicted)
     wrong = scene.soup(np.full(scene.count, 0.6 * FAR))
-    full = 2.0 * oracle.reprojection(wrong, data, w)
-    weak = 0.6 * oracle.reprojection(wrong, data, w.replace(sigma_proj=2.0))
+    full = 2.0 * oracle.values("proj", wrong, data, w)
+    weak = 0.6 * oracle.values("proj", wrong, data, w.replace(sigma_proj=2.0))
     assert full.max() > 4.0
     expected = np.where(contradicted, weak, full)
     costs, _ = photo.costs_of_flow(Particles.of(wrong), data, w)

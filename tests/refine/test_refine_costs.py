@@ -81,7 +81,7 @@ def test_every_entry_is_the_energy_of_its_pair():
     w = weights.replace(proj=0.0)
     for e in (0, len(costs.edges) // 2, len(costs.edges) - 1):
         i, k = costs.edges[e]
-        rows = ([r] if r >= 0 else [] for r in (costs.arap_row[e], costs.cont_row[e]))
+        rows = ([r] if r >= 0 else [] for r in (costs.rows["edges"][e], costs.rows["pairs"][e]))
         data = with_graph(tiny.data, *rows)
         for a in range(p.shape[1]):
             for b in range(p.shape[1]):

@@ -80,13 +80,13 @@ def test_the_prior_holds_the_relief_over_the_ground(world):
     weighted = over_ground(data, rough, grounded, 5 * data.prior_weight)
     expected = np.where(both, 5.0, 1.0) * data.prior_weight
     np.testing.assert_allclose(weighted.prior_weight, expected, rtol=1e-15)
-    np.testing.assert_allclose(oracle.prior(rough, weighted)[both], 0.0, atol=1e-12)
-    np.testing.assert_array_equal(
-        oracle.prior(rough, weighted)[~both], oracle.prior(rough, data)[~both]
-    )
+    usual, own = (oracle.values("prior", rough, d, Weights()) for d in (data, weighted))
+    np.testing.assert_allclose(own[both], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(own[~both], usual[~both])
     # in another unit of length the same relief costs nothing either
     far = replace(rough, d=3.0 * rough.d)
-    np.testing.assert_allclose(oracle.prior(far, weighted)[both], 0.0, atol=1e-12)
+    own = oracle.values("prior", far, weighted, Weights())
+    np.testing.assert_allclose(own[both], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("factor", [10.0, 1e4])
@@ -100,11 +100,12 @@ def test_a_component_gains_little_by_receding(world, factor):
     away = replace(soup, d=soup.d * far)
     np.testing.assert_allclose(away.translation, soup.translation, rtol=1e-14)
     gap = data.edge_weight[across] * 50.0 * 0.2 / 2.0  # focal x |T_i - T_k| / depth
-    near = oracle.arap(soup, data, weights)[across]
+    near = oracle.values("arap", soup, data, weights)[across]
     # the anchors' distance changes by at most |T_i - T_k|: the sum is once or twice the gap
     assert (near >= gap * (1 - 1e-12)).all()
     assert (near <= 2 * gap * (1 + 1e-12)).all()
-    assert (oracle.arap(away, data, weights)[across] >= 2**-0.25 * gap * (1 - 1e-12)).all()
+    receded = oracle.values("arap", away, data, weights)[across]
+    assert (receded >= 2**-0.25 * gap * (1 - 1e-12)).all()
 
 
 def test_pairs_across_an_occlusion_weigh_less(world):
