@@ -163,7 +163,7 @@ class SceneInput(PairInput):
     height: Annotated[int, Field(ge=48, le=MAX_SIDE)] = 436
     """Rows, pixels."""
     frame: Index = 0
-    """First frame of the pair; camera and components go on as from frame 0 to frame 1."""
+    """First frame of the pair; camera and components continue their motion of frames 0 and 1."""
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""

@@ -1,4 +1,4 @@
-"""The batches of nodes and the pairwise tables that TRW-S works through.
+"""The batches of nodes that TRW-S works through.
 
 A greedy colouring of the graph orders the nodes: colour by colour, and inside a colour by number.
 Nodes of one colour have no edge between them, so that processing them as one batch, a level, is the
@@ -12,8 +12,6 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-
-_CACHE_BYTES = 1 << 19  # tables handled together: half of a usual second-level cache
 
 
 @dataclass(frozen=True)
@@ -133,32 +131,3 @@ def _sides(
         parts = tuple(part for part in by_axis if part[1].size)
         out.append(Side(members, node, far[members], parts, linked, starts))
     return out
-
-
-class Tables:
-    """The pairwise tables, read block by block and never copied as a whole.
-
-    Args:
-        table: (E, L, L) costs; axis 1 belongs to ``edges[e, 0]``, axis 2 to ``edges[e, 1]``.
-    """
-
-    def __init__(self, table: np.ndarray) -> None:
-        size = table.shape[1]
-        self.table = table
-        self.step = max(1, _CACHE_BYTES // (size * size * table.itemsize))
-        self._buffer = np.empty((min(self.step, len(table)), size, size), table.dtype)
-
-    def block(self, ids: np.ndarray) -> np.ndarray:
-        """(n, L, L) tables of at most ``step`` edges, in a buffer that the caller may overwrite."""
-        out = self._buffer[: len(ids)]
-        np.take(self.table, ids, axis=0, out=out, mode="clip")
-        return out
-
-    def lines(self, side: Side, labels: np.ndarray) -> np.ndarray:
-        """(n, L) table entries over the labels of the level's node, the far end held fixed."""
-        fixed = labels[side.far]
-        out = np.empty((len(side.ids), self.table.shape[1]), self.table.dtype)
-        for axis, at in side.parts:
-            rows = side.ids[at]
-            out[at] = self.table[rows, :, fixed[at]] if axis == 1 else self.table[rows, fixed[at]]
-        return out

@@ -27,7 +27,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from soup_nlp.errors import ModelError
-from soup_nlp.mrf.levels import Level, Side, Tables, colours, plan_levels
+from soup_nlp.mrf.levels import Level, Side, colours, plan_levels
+
+_CACHE_BYTES = 1 << 19  # tables handled together: half of a usual second-level cache
 
 Callback = Callable[[int, float, float, float], bool | None]
 
@@ -91,7 +93,7 @@ def solve_trws(
     costs, begin = np.asarray(unary, np.float64), init_labels
     with np.errstate(over="ignore"):
         table = np.ascontiguousarray(pairwise, dtype)
-    solver = _Passes(costs, plan_levels(colours(len(costs), edges), edges), Tables(table))
+    solver = _Passes(costs, plan_levels(colours(len(costs), edges), edges), table)
     first = math.inf if begin is None else mrf_energy(begin, unary, edges, pairwise)
     best = (first, costs.argmin(axis=1) if begin is None else begin, 0)
     rows: list[tuple[float, float, float]] = []
@@ -144,15 +146,17 @@ class _Passes:
     Args:
         costs: (N, L) unary costs, +inf where a label is forbidden.
         plan: Levels, first to last.
-        tables: Tables of the edges, in the working type.
+        table: (E, L, L) tables of the edges in the working type; axis 1 belongs to ``edges[e, 0]``.
+            They are read block by block and never copied as a whole.
     """
 
-    def __init__(self, costs: np.ndarray, plan: list[Level], tables: Tables) -> None:
-        dtype = tables.table.dtype
+    def __init__(self, costs: np.ndarray, plan: list[Level], table: np.ndarray) -> None:
         with np.errstate(over="ignore", invalid="ignore"):
-            self.costs = costs.astype(dtype)
-        self.absent, self.plan, self.tables = np.isinf(costs), plan, tables
-        self.messages = np.zeros((len(tables.table), costs.shape[1]), dtype)
+            self.costs = costs.astype(table.dtype)
+        self.absent, self.plan, self.table = np.isinf(costs), plan, table
+        self.messages = np.zeros(table.shape[:2], table.dtype)
+        step = max(1, _CACHE_BYTES // (table.itemsize * table.shape[1] ** 2))
+        self.block = np.empty((min(step, len(table)), *table.shape[1:]), table.dtype)
 
     def sweep(self) -> float:
         """One forward and one backward pass; the lower bound."""
@@ -188,9 +192,10 @@ class _Passes:
         sent = belief[side.node] - self.messages[side.ids]
         out = np.empty_like(sent)
         for axis, part in side.parts:
-            for k in range(0, len(part), self.tables.step):
-                at = part[k : k + self.tables.step]
-                block = self.tables.block(side.ids[at])
+            for k in range(0, len(part), len(self.block)):
+                at = part[k : k + len(self.block)]
+                block = self.block[: len(at)]
+                np.take(self.table, side.ids[at], axis=0, out=block, mode="clip")
                 block += sent[at, :, None] if axis == 1 else sent[at, None]
                 out[at] = block.min(axis=axis)
         absent = self.absent[side.far]
@@ -201,6 +206,15 @@ class _Passes:
         self.messages[side.ids] = out
         return float(least.sum(dtype=np.float64))
 
+    def _lines(self, side: Side, labels: np.ndarray) -> np.ndarray:
+        """(n, L) table entries over the labels of the level's node, the far end held fixed."""
+        fixed = labels[side.far]
+        out = np.empty((len(side.ids), self.table.shape[1]), self.table.dtype)
+        for axis, at in side.parts:
+            rows = side.ids[at]
+            out[at] = self.table[rows, :, fixed[at]] if axis == 1 else self.table[rows, fixed[at]]
+        return out
+
     def decode(self) -> tuple[float, np.ndarray, int]:
         """Energy, (N,) labels and the number of ties of the decoding in order."""
         labels = np.zeros(len(self.costs), np.int64)
@@ -208,7 +222,7 @@ class _Passes:
         rounding = 1e3 * float(np.finfo(self.costs.dtype).eps)
         for level in self.plan:
             exact = self.costs[level.nodes]
-            level.down.add(exact, self.tables.lines(level.down, labels))
+            level.down.add(exact, self._lines(level.down, labels))
             total = exact.copy()
             level.up.add(total, self.messages[level.up.ids])
             best = total.argmin(axis=1)

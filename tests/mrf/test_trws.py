@@ -48,7 +48,7 @@ def test_equals_plain_loops(seed):
 
 
 def test_equals_plain_loops_on_a_grid(monkeypatch):
-    monkeypatch.setattr("soup_nlp.mrf.levels._CACHE_BYTES", 3 * 7 * 7 * 8)
+    monkeypatch.setattr("soup_nlp.mrf.trws._CACHE_BYTES", 3 * 7 * 7 * 8)
     rng = np.random.default_rng(3)
     index = np.arange(48).reshape(6, 8)
     edges = np.concatenate(

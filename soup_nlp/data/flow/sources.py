@@ -121,10 +121,10 @@ class FlowOptions(Section):
     black for unusable."""
     see_through: bool = True
     """Where flow that was computed follows a layer that stands still before a moving scene (a
-    reflection in a windscreen), search for the scene's own along its epipolar lines."""
+    reflection in a windscreen), search for the flow of the scene along its epipolar lines."""
     consistency: bool = True
     """Weight a vector of DIS, or of a file with a backward flow, by how well its round trip closes;
-    if false, all vectors that stay in the image count alike, as in the paper."""
+    if false, all vectors that stay in the image have the same weight, as in the paper."""
 
     def load(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
         """The flow of a pair.
