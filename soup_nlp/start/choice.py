@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
-from soup_nlp.geometry.plane_fit import PlaneFit
+from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.components import connected_pieces
 from soup_nlp.start.epipolar import Motion, estimate, fit_translation, repeated

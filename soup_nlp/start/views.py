@@ -12,8 +12,7 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.plane import about_anchor, normal_and_distance
-from soup_nlp.geometry.plane_fit import PlaneFit, fit_planes
+from soup_nlp.geometry.plane import PlaneFit, about_anchor, fit_planes, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
 from soup_nlp.start.epipolar import Matches, Motion

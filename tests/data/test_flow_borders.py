@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers_truth import majority
-from scipy import ndimage
+from helpers_truth import assert_partition, majority
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.borders import fit_affine, follow_depth, follow_flow
@@ -27,14 +26,6 @@ def two_motions(jump: float = 3.0, noise: float = 0.0) -> Flow:
 
 def grid() -> np.ndarray:
     return segment(np.zeros((HEIGHT, WIDTH, 3), np.uint8), 48, "grid")
-
-
-def assert_partition(labels: np.ndarray) -> int:
-    assert labels.dtype == np.int32
-    n = int(labels.max()) + 1
-    for i in range(n):
-        assert ndimage.label(labels == i)[1] == 1, i
-    return n
 
 
 def mixed(labels: np.ndarray) -> int:

@@ -1,4 +1,4 @@
-"""Pictures of the kinds on public trackers: bytes behind them, metadata, more than 8 bits."""
+"""Pictures and cameras of the kinds on public trackers: metadata, 16 bits, intrinsics, lenses."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 import struct
 import warnings
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,10 +15,17 @@ import pytest
 from helpers_photos import load, photo, photos, said, texture
 from PIL import Image, features
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.formats.camera_files import read_camera
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.formats.images import DataWarning, read_image, read_images
 from soup_nlp.data.pair import Pair
-from soup_nlp.errors import DataError
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.data.working_size import scaled_camera
+from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.pipeline.run import solve_pair
+
+MIDDLE = (47.5, 31.5)
 
 
 @pytest.fixture
@@ -172,3 +180,163 @@ def test_heic_gives_an_error_with_a_hint(brand: bytes, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="convert it to PNG or JPEG first") as caught:
         read_image(tmp_path / "a.heic")
     assert "damaged" not in str(caught.value)
+
+
+# --- every frame has its own camera --------------------------------------------------------------
+
+
+def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
+    photo(tmp_path / "wide.jpg", FocalLengthIn35mmFilm=26)
+    photo(tmp_path / "turned.jpg", turned=6, FocalLengthIn35mmFilm=26)
+    photo(tmp_path / "tele.jpg", FocalLengthIn35mmFilm=77)
+    photo(tmp_path / "small.jpg", texture(48, 32), FocalLengthIn35mmFilm=26)
+    Image.fromarray(texture(48, 32)).save(tmp_path / "plain.png")
+    expected = {
+        "wide.jpg": (26 / 36 * 96, *MIDDLE),
+        "turned.jpg": (26 / 36 * 96, *MIDDLE[::-1]),
+        "tele.jpg": (77 / 36 * 96, *MIDDLE),
+        "small.jpg": (26 / 36 * 48, 23.5, 15.5),
+        # a frame without EXIF gets the focal length of the other frame
+        "plain.png": (26 / 36 * 48, 23.5, 15.5),
+    }
+    for name, numbers in expected.items():
+        for fov in (None, 60.0):
+            pair, text = said(tmp_path, "wide.jpg", name, fov=fov)
+            scale = 1.0 if fov is None else 48 / np.tan(np.radians(30)) / (26 / 36 * 96)
+            K = pair.K_next
+            np.testing.assert_allclose((K[0, 0], *K[:2, 2]), np.multiply(numbers, [scale, 1, 1]))
+            assert K[1, 1] == K[0, 0]
+            assert (name in text) == (fov is None)
+    with pytest.raises(ConfigError, match="0 to 180"):
+        load(tmp_path, "wide.jpg", "tele.jpg", fov=180.0)
+
+
+# --- implausible intrinsics ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("camera", "outside", "cause", "fits"),
+    [
+        ((240, 240, 143.5, 95.5), True, "an image of 288 x 192", "80,80,47.5,31.5"),
+        ((40, 40, 23.5, 15.5), False, "an image of 48 x 32", "80,80,47.5,31.5"),
+        ((80, 160, 47.5, 63.5), False, "an image of 96 x 128", "80,80,47.5,31.5"),
+        ((80, 80, 31.5, 47.5), False, "cx and cy are exchanged", "80,80,47.5,31.5"),
+        ((80, 80, 33, 44), False, "cx and cy are exchanged", "80,80,44,33"),
+        ((80, 47.5, 80, 31.5), False, "the order is fx cx fy cy", "80,80,47.5,31.5"),
+        ((300, 47.5, 300, 31.5), True, "the order is fx cx fy cy", "300,300,47.5,31.5"),
+        ((80, 120, 47.5, 31.5), False, "a crop, or a wrong file", "80,80,47.5,31.5"),
+        ((80, 80, -3, 31.5), True, "a crop, or a wrong file", "80,80,47.5,31.5"),
+        ((80, 80, 47.5, 60), False, "a crop, or a wrong file", "80,80,47.5,31.5"),
+    ],
+)
+def test_implausible_intrinsics_name_their_cause(
+    camera: tuple[float, ...], outside: bool, cause: str, fits: str, folder: Path
+) -> None:
+    if outside:
+        with pytest.raises(DataError, match="principal point is outside") as caught:
+            load(folder, intrinsics=[*camera])
+        text = str(caught.value)
+        _, other = said(folder, intrinsics=[*camera], cropped=True)
+        assert "middle" not in other
+    else:
+        pair, text = said(folder, intrinsics=[*camera])
+        np.testing.assert_array_equal(pair.K_ref[:2, 2], camera[2:])
+    assert cause in text
+    assert f"{fits} would fit" in text
+
+
+def test_intrinsics_of_arrays_are_checked_too() -> None:
+    pair = render_scene("orbit", 0, 128, 54)
+    other = replace(pair, K_next=scaled_camera(pair.K_next, (54, 128), (135, 320)))
+    with pytest.raises(DataError, match=r"principal point is outside[\s\S]*K_next[\s\S]*320 x 135"):
+        solve_pair(other)
+    half = replace(pair, K_ref=scaled_camera(pair.K_ref, (54, 128), (32, 76)))
+    with (
+        pytest.warns(DataWarning, match="K_ref, 128 x 54.*an image of 76 x 32"),
+        pytest.raises(ConfigError),
+    ):
+        solve_pair(half, preset="none")
+    with pytest.raises(ConfigError):
+        solve_pair(other, preset="none", cropped=True)
+
+
+def test_plausible_intrinsics_give_no_warning(folder: Path) -> None:
+    for four in ((80, 80, 47.5, 31.5), (80, 90, 40, 38), (500, 500, 55, 31)):
+        assert said(folder, intrinsics=[*four])[1] == ""
+    # the principal point of the next frame is checked against its own middle
+    with pytest.warns(DataWarning, match=r"b\.png.*far from the middle"):
+        load(folder, intrinsics=[80, 80, 47.5, 31.5], intrinsics_next=[80, 80, 20, 31.5])
+
+
+LENS = (0.3, -0.9, 0.01, -0.004, 0.2)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "80 81 47.5 31.5 0.3 -0.9 0.01 -0.004 0.2",
+        "80, 0, 47.5\n0, 81, 31.5\n0, 0, 1\n0.3, -0.9, 0.01, -0.004, 0.2",
+        "fx: 80\nfy: 81\ncx: 47.5\ncy: 31.5\nk1: 0.3\nk2: -0.9\np1: 1e-2\np2: -0.004\nk3: 0.2",
+        '{"fx": 80, "fy": 81, "cx": 47.5, "cy": 31.5, "k1": 0.3, "k2": -0.9, "p1": 0.01,'
+        ' "p2": -0.004, "k3": 0.2}',
+        "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        "   data: [80., 0., 47.5, 0., 81., 31.5, 0., 0., 1.]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        "   data: [0.3, -0.9, 0.01, -0.004, 0.2]\n",
+        "image_width: 96\nK: [80, 0, 47.5, 0, 81, 31.5, 0, 0, 1]\n"
+        "D: [0.3, -0.9, 0.01, -0.004, 0.2]\ndistortion_model: plumb_bob\n",
+    ],
+)
+def test_distortion_is_named_or_removed(text: str, folder: Path) -> None:
+    (folder / "camera.txt").write_text(text)
+    K, distortion = read_camera(folder / "camera.txt")
+    np.testing.assert_allclose(distortion, LENS)
+    np.testing.assert_allclose(K, [[80, 0, 47.5], [0, 81, 31.5], [0, 0, 1]])
+    with pytest.raises(DataError, match=r"distortion[\s\S]*k1 0\.3[\s\S]*--undistort"):
+        load(folder, intrinsics="camera.txt")
+    pair = load(folder, intrinsics="camera.txt", undistort=True)
+    # a pixel has the colour of the distorted image at OpenCV's projection of its ray
+    u, v = 60, 20
+    ray = np.linalg.inv(pair.K_ref) @ [u, v, 1.0]
+    at, _ = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), K, np.array(LENS))
+    x, y = (np.full((1, 1), c, np.float32) for c in at.ravel())
+    image = read_image(folder / "a.png")
+    seen = cv2.remap(image, x, y, cv2.INTER_LINEAR)[0, 0]
+    # OpenCV rounds positions to 1/32 pixel
+    np.testing.assert_allclose(pair.image_ref[v, u], seen, atol=4)
+
+
+def test_undistortion_needs_the_file_of_a_camera_and_no_truth(folder: Path) -> None:
+    (folder / "K.txt").write_text("80 80 47.5 31.5 0.1")
+    np.save(folder / "d.npy", np.ones((64, 96)))
+    for keys in (
+        {"intrinsics": [80.0, 80.0, 47.5, 31.5]},
+        {"intrinsics": "K.txt", "depth": "d.npy"},
+    ):
+        with pytest.raises(ConfigError, match="cannot be undistorted"):
+            load(folder, undistort=True, **keys)
+
+
+# --- depth ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["files", "folder"])
+def test_an_assumed_scale_of_depth_gives_a_warning(kind: str, folder: Path) -> None:
+    for k, name in enumerate("ab"):
+        (folder / f"{name}.png").rename(folder / f"frame_{k}.png")
+    (folder / "K.txt").write_text("80 80 47.5 31.5")
+    cv2.imwrite(str(folder / "depth_0.png"), np.full((64, 96), 2000, np.uint16))
+    source = {"kind": kind, "path": str(folder)}
+    if kind == "files":
+        names = {"ref": "frame_0.png", "next": "frame_1.png", "depth": "depth_0.png"}
+        source = {"kind": kind, "intrinsics": "K.txt", **names}
+    for scale, depth in ((None, 2.0), (1000.0, 2.0), (256.0, 2000 / 256)):
+        problem = make_problem({"input": {**source, "depth_scale": scale}, "base": str(folder)})
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            truth = problem.load_pair().truth
+        assert truth is not None
+        assert truth.depth_ref is not None
+        assert truth.depth_ref[0, 0] == depth
+        words = ["assumed: 1000 values per unit" in str(w.message) for w in caught]
+        assert words == [True] * (scale is None)

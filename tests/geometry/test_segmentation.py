@@ -7,6 +7,7 @@ import itertools
 import helpers_model  # noqa: F401  (hypothesis profile)
 import numpy as np
 import pytest
+from helpers_truth import assert_partition
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -27,16 +28,6 @@ def image() -> np.ndarray:
 
 def noise(height: int, width: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
-
-
-def assert_partition(labels: np.ndarray) -> int:
-    """Labels are 0..N-1 and each is one 4-connected piece; returns N."""
-    assert labels.dtype == np.int32
-    n = int(labels.max()) + 1
-    np.testing.assert_array_equal(np.unique(labels), np.arange(n))
-    for k in range(n):
-        assert ndimage.label(labels == k)[1] == 1, f"superpixel {k} is not connected"
-    return n
 
 
 # --- superpixels -------------------------------------------------------------------------------

@@ -1,15 +1,26 @@
-"""Truth of test pairs: component of every superpixel, pairs without margins."""
+"""Superpixels and truth of test pairs: partitions, components, pairs without margins."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.geometry.graph import Segmentation
 
 IMAGES = ("depth_ref", "depth_next", "flow", "occluded", "components", "scene_flow")
+
+
+def assert_partition(labels: np.ndarray) -> int:
+    """Labels are 0..N-1 and each is one 4-connected piece; returns N."""
+    assert labels.dtype == np.int32
+    n = int(labels.max()) + 1
+    np.testing.assert_array_equal(np.unique(labels), np.arange(n))
+    for k in range(n):
+        assert ndimage.label(labels == k)[1] == 1, f"superpixel {k} is not connected"
+    return n
 
 
 def majority(truth: Truth, seg: Segmentation) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from helpers_model import flow_of, motion, plane_pose, plane_world
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
-from soup_nlp.geometry.plane_fit import PlaneFit
+from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start import choice as choosing

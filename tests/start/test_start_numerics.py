@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.plane_fit import PlaneFit
+from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.start import epipolar
 from soup_nlp.start.bending import constant_depth
 from soup_nlp.start.epipolar import (
