@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from helpers_odd_results import STRUCTURE
 
-from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import read_json
 from soup_nlp.storage.h5_files import read_attrs, read_h5
@@ -99,25 +98,3 @@ def test_json_that_is_none_is_an_error_of_the_file(text, tmp_path):
     path.write_bytes(b"\xff\xfe{}")
     with pytest.raises(DataError, match="not text"):
         read_json(path, "summary.json")
-
-
-def test_versions_that_are_no_json_are_an_error_of_the_file(tmp_path):
-    write_h5(tmp_path / "result.h5", {"a": {"x": 1.0}}, {"versions": 1})
-    with h5py.File(tmp_path / "result.h5", "a") as file:
-        file.attrs["versions"] = "{"
-    with pytest.raises(DataError, match="HDF5"):
-        read_attrs(tmp_path / "result.h5")
-
-
-@pytest.mark.parametrize("name", ["result.h5", "summary.json"])
-@pytest.mark.parametrize("kind", ["missing", "folder", "dangling link"])
-def test_files_that_are_not_there(kind, name, tmp_path, capsys):
-    write_h5(tmp_path / "result.h5", {"weights": {"arap": 1.0}}, {})
-    (tmp_path / "summary.json").write_text("{}")
-    (tmp_path / name).unlink()
-    if kind == "folder":
-        (tmp_path / name).mkdir()
-    elif kind == "dangling link":
-        (tmp_path / name).symlink_to("nowhere")
-    assert main(["check", str(tmp_path)]) == 2
-    assert name in capsys.readouterr().err

@@ -8,9 +8,13 @@ import signal
 import stat
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
@@ -19,10 +23,25 @@ from soup_nlp.storage.folders import MARK, claim, digest_of, files_in, mark_of, 
 from soup_nlp.storage.system import deferred_signals, scratch
 
 
-def write(folder: Path, whole: bool = True, overwrite: bool = False, **files: str) -> None:
+def put(folder: Path, files: Mapping[str, str]) -> None:
+    """Write files by name, with their folders."""
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def write(
+    folder: Path,
+    whole: bool = True,
+    overwrite: bool = False,
+    end: type[BaseException] | None = None,
+    **files: str,
+) -> None:
+    """Write a result, or end with an exception after its files are written."""
     with staged(folder, whole, overwrite) as new:
-        for name, text in files.items():
-            (new / name).write_text(text)
+        put(new, files)
+        if end:
+            raise end("ended")
 
 
 def content_names(folder: Path) -> set[str]:
@@ -33,52 +52,34 @@ def content(folder: Path) -> dict[str, str]:
     return {p.name: p.read_text() for p in folder.iterdir() if p.name != MARK}
 
 
-def test_a_new_result_replaces_the_old_one_whole(tmp_path):
-    target = tmp_path / "out"
-    write(target, a="1", b="1")
-    write(target, a="2", c="2")
-    assert content(target) == {"a": "2", "c": "2"}
-    assert mark_of(target).files.keys() == {"a", "c"}
-    assert os.listdir(tmp_path) == ["out"]
+NAMES = st.sets(st.sampled_from(["a", "b", "c/x", "c/d/y"]), min_size=1)
+ENDS = st.sampled_from([None, None, None, RuntimeError, KeyboardInterrupt, OSError, DataError])
 
 
-def test_files_of_the_user_stay(tmp_path):
-    target = tmp_path / "out"
-    write(target, a="1", b="1")
-    (target / "mine").write_text("m")
-    (target / "sub").mkdir()
-    (target / "sub" / "x").write_text("s")
-    (target / "b").write_text("changed by the user")
-    write(target, a="2")
-    assert (target / "sub" / "x").read_text() == "s"
-    (target / "sub" / "x").unlink()
-    (target / "sub").rmdir()
-    assert content(target) == {"a": "2", "b": "changed by the user", "mine": "m"}
-
-
-def test_pages_of_several_commands_share_a_folder(tmp_path):
-    for name in ("x", "y", "x"):
-        write(tmp_path, False, **{f"{name}.md": name})
-    assert content(tmp_path) == {"x.md": "x", "y.md": "y"}
-    assert mark_of(tmp_path).files.keys() == {"x.md", "y.md"}
-
-
-def test_a_failure_leaves_the_old_result(tmp_path):
-    target = tmp_path / "out"
-    write(target, a="1")
-
-    def fail(error: BaseException) -> None:
-        with staged(target, True) as new:
-            (new / "a").write_text("2")
-            raise error
-
-    for error in (RuntimeError("x"), KeyboardInterrupt("x"), DataError("x")):
-        with pytest.raises(type(error), match="x"):
-            fail(error)
-    with pytest.raises(DataError, match="cannot be written"):
-        fail(OSError(28, "No space left on device"))
-    assert content(target) == {"a": "1"}
-    assert os.listdir(tmp_path) == ["out"]
+@settings(max_examples=40)
+@given(st.lists(st.tuples(NAMES, st.sampled_from(["whole", "part", "user"]), ENDS), max_size=6))
+def test_a_folder_holds_the_newest_result_and_all_files_of_the_user(steps):
+    """Results that are written, or fail, and files of the user, against two dicts of files."""
+    with TemporaryDirectory() as home:
+        target, made, mine = Path(home) / "out", {}, {}
+        for step, (names, writer, end) in enumerate(steps):
+            files, whole = dict.fromkeys(names, str(step)), writer == "whole"
+            refused = DataError if end in (None, OSError) else end
+            if writer == "user":
+                mine |= files
+                made = {name: text for name, text in made.items() if name not in files}
+                put(target, files)
+            elif end or names & mine.keys():
+                with pytest.raises(refused):
+                    write(target, whole, end=end, **files)
+            else:
+                write(target, whole, **files)
+                made = files if whole else made | files
+                assert mark_of(target).files.keys() == made.keys()
+            found = {name: (target / name).read_text() for name in files_in(target)}
+            assert found == made | mine
+            assert all(any(p.iterdir()) for p in target.rglob("*") if p.is_dir())
+            assert os.listdir(home) == ["out"] * bool(made or mine)
 
 
 @pytest.mark.parametrize("fits", [0, 1], ids=["file", "mark"])
@@ -195,26 +196,12 @@ def test_a_symbolic_mark_is_not_followed(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["out", "victim"]
 
 
-def test_folders_in_a_result_are_replaced_file_by_file(tmp_path):
-    target = tmp_path / "out"
-
-    def colmap(text: str, *names: str) -> None:
-        with staged(target, True) as new:
-            for name in names:
-                (new / name).parent.mkdir(parents=True, exist_ok=True)
-                (new / name).write_text(text)
-
-    colmap("1", "c/x", "c/d/y", "a")
-    colmap("2", "c/x", "b")
-    assert files_in(target) == ["b", "c/x"]
-    (target / "c" / "mine").write_text("m")
-    colmap("3", "a")
-    assert files_in(target) == ["a", "c/mine"]
-    # a link on the way leads out of the folder
+def test_a_link_on_the_way_leads_out_of_the_folder(tmp_path):
     (tmp_path / "elsewhere").mkdir()
-    (target / "d").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(DataError, match="d/x"):
-        colmap("4", "d/x")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "d").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match="d/x"), staged(tmp_path / "out") as new:
+        put(new, {"d/x": "4"})
     assert os.listdir(tmp_path / "elsewhere") == []
 
 
