@@ -252,18 +252,16 @@ def depth_maps(run: Run) -> dict[str, Float]:
     """
     pair, seg = run.pair, run.segmentation
     labels = seg.labels
-    out = {"solution": run.reconstruction.depth_ref}
-    if run.nlp_reconstruction is not None:
-        out["nlp"] = run.nlp_reconstruction.depth_ref
-    out["start"] = run.start_reconstruction.depth_ref
+    out = {k: run.depth_maps[k] for k in ("solution", "nlp", "start") if k in run.depth_maps}
     alone = reconstruct(unorganised(run.start.soup), labels, pair.K_ref, pair.K_next)
     out["unorganised"] = alone.depth_ref
-    if run.rigid is not None:
-        valid = np.isfinite(run.rigid)
+    rigid = run.depth_maps.get("rigid")
+    if rigid is not None:
+        valid = np.isfinite(rigid)
         out["solution_rigid"] = np.where(valid, run.reconstruction.depth_ref, np.nan)
-        out["rigid"] = run.rigid
-        if np.isfinite(run.rigid).any():
-            out["rigid_filled"] = fill_nearest(run.rigid)
+        out["rigid"] = rigid
+        if valid.any():
+            out["rigid_filled"] = fill_nearest(rigid)
     if has_depth(pair.truth):
         out["constant"] = np.ones(pair.size)
     return out

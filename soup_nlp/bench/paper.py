@@ -207,7 +207,7 @@ def write_maps(path: Path, result: Run) -> None:
     step = max(1, -(-pair.size[1] // MAP_WIDTH))
     maps: dict[str, np.ndarray] = {
         "image": pair.image_ref,
-        "start": result.start_reconstruction.depth_ref.astype(np.float32),
+        "start": result.depth_maps["start"].astype(np.float32),
         "solution": result.reconstruction.depth_ref.astype(np.float32),
     }
     if pair.truth is not None and pair.truth.depth_ref is not None:

@@ -143,15 +143,8 @@ def _depths(result: object) -> dict[str, Float]:
         stored = tree.get("depth", {})
         require(tree, "depth/ref")
         return {k: require(tree, f"depth/{v}") for k, v in DEPTHS.items() if v in stored}
-    dense = getattr(result, "reconstruction", None)
-    if dense is None:
-        return {"solution": _map(result, "depth")}
-    other_depths = {
-        name: getattr(getattr(result, f"{name}_reconstruction", None), "depth_ref", None)
-        for name in ("nlp", "start")
-    }
-    maps = {"solution": dense.depth_ref, **other_depths, "rigid": getattr(result, "rigid", None)}
-    return {name: z for name, z in maps.items() if z is not None}
+    maps: Mapping[str, Float] | None = getattr(result, "depth_maps", None)
+    return {"solution": _map(result, "depth")} if maps is None else dict(maps)
 
 
 def _map(values: object, what: str) -> Float:

@@ -110,28 +110,25 @@ class Run(Case):
 
     Attributes:
         solution: Result of the constrained NLP, before any refinement.
-        start_reconstruction: Dense 3D of the start.
         reconstruction: Dense 3D of `soup`.
-        rigid: (H, W) depth by one rigid motion for the whole image, in lengths of its translation;
-            None without truth or where none fits.
-        metrics: By "solution" (delivered), "nlp" (where refined), "start", "constant", "rigid",
-            and "solution_next" for the next frame; a key without truth is absent.
+        depth_maps: (H, W) z of the reference frame by "solution" (delivered), "start", "nlp" (where
+            refined), and with a truth "rigid" (by one rigid motion for the whole image, in lengths
+            of its translation, where one fits).
+        metrics: By the names of `depth_maps`, "constant", and "solution_next" for the next frame;
+            a key without truth is absent.
         seconds: Wall time by stage; those that start with nlp_ are parts of "nlp".
         confidence: Uncertainty of `reconstruction`.
         refined: Result of the refinement of `solution`; None where it is off.
-        nlp_reconstruction: Dense 3D of `solution`, where there is an NLP and it was refined.
         full: Depth at the images' own size, where the pair was solved at a smaller one.
     """
 
     solution: Solution
-    start_reconstruction: Reconstruction
     reconstruction: Reconstruction
-    rigid: Float | None
+    depth_maps: Mapping[str, Float]
     metrics: Mapping[str, DepthMetrics]
     seconds: Mapping[str, float]
     confidence: Confidence
     refined: Refined | None = None
-    nlp_reconstruction: Reconstruction | None = None
     full: FullSize | None = None
 
     def __str__(self) -> str:

@@ -178,34 +178,30 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     def dense(soup: Soup) -> Reconstruction:
         return reconstruct(soup, labels, pair.K_ref, pair.K_next, size)
 
-    before, middle = dense(case.start.soup), dense(solution.soup)
-    after = middle if refined is None else dense(refined.soup)
-    between = middle if refined is not None and solution.stages else None
+    unrefined = dense(solution.soup)
+    after = unrefined if refined is None else dense(refined.soup)
     assert pair.flow is not None
     energy = case.data, case.weights, case.problem.formulation
     sure = confidence(after, pair, case.start, *energy, case.given)
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.original is None else full_size(case.original, pair, after)
-    rigid = rigid_depth(pair) if pair.truth is not None else None
-    depths = {"solution": after.depth_ref, "start": before.depth_ref}
-    if between is not None:
-        depths["nlp"] = between.depth_ref
-    if rigid is not None:
+    depths = {"solution": after.depth_ref, "start": dense(case.start.soup).depth_ref}
+    if refined is not None and solution.stages:
+        depths["nlp"] = unrefined.depth_ref
+    if pair.truth is not None and (rigid := rigid_depth(pair)) is not None:
         depths["rigid"] = rigid
     fields = vars(case) | {"soup": solution.soup if refined is None else refined.soup}
     return Run(
         **fields,
         solution=solution,
-        start_reconstruction=before,
         reconstruction=after,
-        rigid=rigid,
+        depth_maps=depths,
         metrics=score_depths(
             pair.truth, depths, depth_next=after.depth_next, sigma=after.sigma_ref
         ),
         seconds={},
         confidence=sure,
         refined=refined,
-        nlp_reconstruction=between,
         full=full,
     )
 

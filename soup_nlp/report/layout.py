@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.errors import DataError
+from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.pipeline.record import Run
 from soup_nlp.refine.records import Round
 from soup_nlp.storage.h5_files import RECORD, ReadTree
@@ -182,7 +183,7 @@ def _listed(values: Mapping[str, Any], place: str = "") -> ReadTree:
 
 def result_tree(run: Run) -> ReadTree:
     """Every array of a run that `TABLE` names."""
-    pair, rec, nlp, sure = run.pair, run.reconstruction, run.nlp_reconstruction, run.confidence
+    pair, rec, sure = run.pair, run.reconstruction, run.confidence
     form, parts = run.problem.formulation, run.components
     assert pair.flow is not None
     arrays = {
@@ -207,9 +208,7 @@ def result_tree(run: Run) -> ReadTree:
         "depth": {
             "ref": rec.depth_ref,
             "next": rec.depth_next,
-            "start_ref": run.start_reconstruction.depth_ref,
-            "rigid_ref": run.rigid,
-            "nlp_ref": None if nlp is None else nlp.depth_ref,
+            **{DEPTHS[name]: run.depth_maps.get(name) for name in ("start", "rigid", "nlp")},
             "sigma_ref": rec.sigma_ref,
             "sigma_next": rec.sigma_next,
         },

@@ -17,6 +17,7 @@ from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError, printable
 from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, NO_CONFIDENCE
 from soup_nlp.evaluate.metrics import DepthMetrics
+from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion
@@ -103,6 +104,12 @@ class Result:
     def depths(self) -> tuple[Float, Float]:
         """z of both frames, each at its own pixels; NaN where unknown."""
         return self.reconstruction.depth_ref, self.reconstruction.depth_next
+
+    @property
+    def depth_maps(self) -> dict[str, Float]:
+        """(H, W) z of the reference frame, as those of a `Run`."""
+        stored = self.tree["depth"]
+        return {name: stored[place] for name, place in DEPTHS.items() if place in stored}
 
     @property
     def points(self) -> tuple[Float, Float]:
