@@ -21,11 +21,12 @@ from soup_nlp.evaluate.metrics import (
     PRESETS,
     UNSCALED,
     Convention,
+    DepthMetrics,
     depth_metrics,
     scene_flow_epe,
     skill,
 )
-from soup_nlp.evaluate.scoring import at_truth, coverage, fill_nearest, sparsification, surest
+from soup_nlp.evaluate.scoring import at_truth, coverage, fill_nearest, score_depths, sparsification
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
@@ -96,15 +97,9 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
     maps, truth, solution = depth_maps(result), result.pair.truth, result.solution
     sigma = result.reconstruction.sigma_ref
     metrics: dict[str, dict[str, dict[str, float]]] = {}
-    if truth is not None and "constant" in maps:
-        scored = {method: at_truth(truth, depth) for method, depth in maps.items()}
-        if sigma is not None:
-            estimate, gt = scored["solution"]
-            kept = surest(gt, at_truth(truth, sigma)[0])
-            scored |= {name: (estimate, values) for name, values in kept.items()}
-        for name in presets:
-            if _applies(truth, PRESETS[name]):
-                metrics[name] = _metrics(scored, PRESETS[name])
+    for name in presets:
+        if _applies(truth, PRESETS[name]):
+            metrics[name] = _rows(score_depths(truth, maps, PRESETS[name], sigma=sigma))
     main = next(iter(metrics), "")
     return {
         "status": solution.status,
@@ -159,18 +154,13 @@ def _applies(truth: Truth | None, convention: Convention) -> bool:
     return convention.counts(truth.points[:, 2])
 
 
-def _metrics(
-    scored: Mapping[str, tuple[Float, Float]], convention: Convention
-) -> dict[str, dict[str, float]]:
-    """Metrics under one convention of estimate and truth by method, and their skill."""
-    out = {
-        method: {k: getattr(depth_metrics(*pair, convention), k) for k in KEPT_METRICS}
-        for method, pair in scored.items()
-        if convention.counts(pair[1])
+def _rows(scored: Mapping[str, DepthMetrics]) -> dict[str, dict[str, float]]:
+    """Metrics by method, and their skill."""
+    constant = scored["constant"].mre
+    return {
+        method: {**{k: getattr(m, k) for k in KEPT_METRICS}, "skill": skill(m.mre, constant)}
+        for method, m in scored.items()
     }
-    for m in out.values():
-        m["skill"] = skill(m["mre"], out["constant"]["mre"])
-    return out
 
 
 def moving(pair: Pair, depth: Float, convention: Convention) -> Row | None:
@@ -245,10 +235,9 @@ def unorganised(soup: Soup) -> Soup:
 
 
 def depth_maps(run: Run) -> dict[str, Float]:
-    """(H, W) depths of the reference frame by method, for a run whose pair has a truth of depth.
+    """(H, W) depths of the reference frame by method.
 
-    "nlp" is present if the NLP was refined, the rigid depths if a motion fits, and "constant" if
-    there is a truth.
+    "nlp" is present if the NLP was refined, and the rigid depths if a motion fits.
     """
     pair, seg = run.pair, run.segmentation
     labels = seg.labels
@@ -262,6 +251,4 @@ def depth_maps(run: Run) -> dict[str, Float]:
         out["rigid"] = rigid
         if valid.any():
             out["rigid_filled"] = fill_nearest(rigid)
-    if has_depth(pair.truth):
-        out["constant"] = np.ones(pair.size)
     return out

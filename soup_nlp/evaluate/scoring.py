@@ -72,7 +72,8 @@ def score_depths(
     if sigma is not None and "solution" in out:
         estimate, gt = at_truth(truth, depths["solution"])
         for name, sure_gt in surest(gt, at_truth(truth, sigma)[0]).items():
-            out[name] = depth_metrics(estimate, sure_gt, convention)
+            if convention.counts(sure_gt):
+                out[name] = depth_metrics(estimate, sure_gt, convention)
     gt_next = truth.depth_next
     if depth_next is not None and gt_next is not None and convention.counts(gt_next):
         out["solution_next"] = depth_metrics(depth_next, gt_next, convention)
