@@ -1,4 +1,4 @@
-"""Reading of HDF5 files, which rejects links and checks sizes before it allocates memory."""
+"""Reading of HDF5 files, which follows no link and checks sizes before it allocates memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import PathLike, parse_json, require_file
+from soup_nlp.storage.files import PathLike, require_file
 from soup_nlp.storage.system import require_memory
 
 ReadTree: TypeAlias = dict[str, Any]
@@ -19,10 +19,10 @@ ReadTree: TypeAlias = dict[str, Any]
 
 RECORD = "record"
 """Group of hashes of other files; `convert` rewrites it, so `contents_digest` leaves it out."""
-DIGEST = "contents_sha256"
-"""Root attribute with the result of `contents_digest`."""
 DEEPEST = 16
 """Largest number of nested groups."""
+DIGEST = "contents_sha256"
+"""Root attribute with the result of `contents_digest`."""
 BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError)
 """Exceptions that h5py raises for damaged files."""
 
@@ -31,11 +31,11 @@ def read_h5(path: PathLike) -> ReadTree:
     """All arrays of a result file, as nested dicts of numpy arrays (text as str or object arrays).
 
     Raises:
-        DataError: the file is missing, damaged or not HDF5, holds a link or a type that no result
-            has, or does not fit into memory.
+        DataError: the file is missing, damaged or not HDF5, holds a type that no result has, or
+            does not fit into memory.
     """
     with _opened(path) as file:
-        items = list(_items(file, "", {h5py.h5o.get_info(file["/"].id).addr}, path))
+        items = _items(file)
         size = sum(i.size * i.dtype.itemsize for _, i in items if isinstance(i, h5py.Dataset))
         require_memory(size, "the arrays of the result", path, "the file may be damaged")
         out: ReadTree = {}
@@ -53,67 +53,52 @@ def read_h5(path: PathLike) -> ReadTree:
         return out
 
 
-def _items(
-    group: h5py.Group, prefix: str, seen: set[Any], path: PathLike
-) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]:
-    """Names, groups and datasets below a group.
+def _items(file: h5py.File) -> list[tuple[str, h5py.Group | h5py.Dataset]]:
+    """Names, groups and arrays of an open file; every object once, and no link is followed.
 
     Raises:
-        DataError: there is a link, or an object that is neither a group nor an array.
+        DataError: there is an object that no result has.
     """
+    items = []
 
-    def wrong(name: str, actual: object, expected: str) -> DataError:
-        return DataError(
-            "result holds what no result has", where=f"{path}, {name}", found=actual,
-            expected=expected,
-        )  # fmt: skip
+    def see(name: str, item: Any) -> None:
+        wrong = None
+        if name.count("/") > DEEPEST:
+            wrong = "groups within groups"
+        elif not isinstance(item, h5py.Group | h5py.Dataset):
+            wrong = type(item).__name__
+        elif isinstance(item, h5py.Dataset):
+            if item.shape is None or item.external or item.is_virtual:
+                wrong = "an array without values of its own"
+            elif item.dtype.kind not in "fiub" and not h5py.check_string_dtype(item.dtype):
+                wrong = f"type {item.dtype}"
+        if wrong:
+            raise DataError(
+                "result holds what no result has",
+                where=f"{file.filename}, {name}",
+                found=wrong,
+                expected=f"numbers or text, in at most {DEEPEST} levels of groups",
+            )
+        items.append((name, item))
 
-    if prefix.count("/") > DEEPEST:
-        raise wrong(prefix, "groups within groups", f"at most {DEEPEST} levels")
-    for key in group:
-        name = f"{prefix}{key}"
-        link = group.get(key, getlink=True)
-        if not isinstance(link, h5py.HardLink):
-            raise wrong(name, type(link).__name__, "an array or a group, no link")
-        item = group[key]
-        address = h5py.h5o.get_info(item.id).addr
-        if address in seen:
-            raise wrong(name, "an object under two names", "a tree")
-        seen.add(address)
-        if isinstance(item, h5py.Group):
-            yield name, item
-            yield from _items(item, f"{name}/", seen, path)
-        elif not isinstance(item, h5py.Dataset):
-            raise wrong(name, type(item).__name__, "an array or a group")
-        elif item.shape is None or item.external or item.is_virtual:
-            raise wrong(name, "an array without values of its own", "numbers or text")
-        elif item.dtype.kind not in "fiub" and not h5py.check_string_dtype(item.dtype):
-            raise wrong(name, f"type {item.dtype}", "numbers or text")
-        else:
-            yield name, item
+    file.visititems(see)
+    return items
 
 
 def read_attrs(path: PathLike) -> dict[str, Any]:
-    """Root attributes of a result file.
-
-    `versions` is returned as a dict, other JSON texts as they were stored.
+    """Root attributes of a result file, numbers and texts.
 
     Raises:
         DataError: the file is missing or is not HDF5, or is damaged.
     """
     with _opened(path) as file:
-        out = dict(file.attrs)
-        out = {k: v.item() if isinstance(v, np.generic) else v for k, v in out.items()}
-        out = {k: v.decode() if isinstance(v, bytes) else v for k, v in out.items()}
-        if isinstance(out.get("versions"), str):
-            out["versions"] = parse_json(out["versions"])
-    return out
+        out = {k: v.item() if isinstance(v, np.generic) else v for k, v in file.attrs.items()}
+        return {k: v.decode() if isinstance(v, bytes) else v for k, v in out.items()}
 
 
 def contents_digest(file: h5py.File) -> str:
     """SHA-256 of all arrays and attributes of an open result, independent of their storage."""
-    seen = {h5py.h5o.get_info(file["/"].id).addr}
-    items = [(n, i) for n, i in _items(file, "", seen, file.filename) if n.split("/")[0] != RECORD]
+    items = [(name, item) for name, item in _items(file) if name.split("/")[0] != RECORD]
     sha = hashlib.sha256()
 
     def add(name: str, data: Any) -> None:
