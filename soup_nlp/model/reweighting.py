@@ -64,7 +64,6 @@ def with_prior(
     data: EnergyData,
     soup: Soup,
     log_depth: Float,
-    beside: Float,
     opened: Float,
     error: Float,
     component: Int,
@@ -78,8 +77,6 @@ def with_prior(
         data: Data of the pair.
         soup: Start; where the flow leaves slopes open, its planes are those of the prior.
         log_depth: (N,) log depth of the anchors by the depth prior.
-        beside: (N,) that from which other components differ by their scales: by the flow where it
-            determines the depth of the largest component.
         opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
         error: (N,) standard deviation of the prior; inf where it does not count.
         component: (N,) group of every superpixel: scales of different ones are open.
@@ -90,7 +87,6 @@ def with_prior(
     """
     i, k = data.edges.T
     same = component[i] == component[k]
-    change = np.where(same, log_depth[i] - log_depth[k], beside[i] - beside[k])
     between = np.where(same, np.maximum(opened[i], opened[k]), 1.0)
     between = np.where(np.isfinite(error[i] + error[k]), between, 0.0)
     slopes = np.where(opened > 0.5, stiffer, 1.0)[data.pairs].min(axis=1)
@@ -102,7 +98,7 @@ def with_prior(
     return replace(
         data,
         depth_weight=between * weight / np.maximum(error[i], error[k]),
-        depth_change=change,
+        depth_change=log_depth[i] - log_depth[k],
         prior_weight=(1 - between) * data.prior_weight,
         orient_weight=slopes * data.orient_weight,
     )

@@ -219,7 +219,7 @@ def build_energy(
     if given_depth is not None and given_depth.evidence.used:
         # the flow holds no slopes where the prior decides: E_orient does, as in bending regions
         stiffer = np.where(bends, 1.0, bending.orient / max(e.weights.orient, 1e-12))
-        values = given_depth.log_depth, given_depth.beside, given_depth.opened, given_depth.error
+        values = given_depth.log_depth, given_depth.opened, given_depth.error
         arguments = *values, start.component, prior_weight, stiffer
         data = with_prior(data, start.soup, *arguments, creased=not given_depth.evidence.confirmed)
         # a given depth may have steps inside a component too

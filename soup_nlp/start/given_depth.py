@@ -23,10 +23,6 @@ from soup_nlp.start.prior_evidence import FEWEST, LEAST_SIGMA, Evidence, Seen, w
 from soup_nlp.start.propose import Start
 from soup_nlp.start.views import FlowFit
 
-STANDS = {"contact below": 0.7, "ground": 0.7, "outline": 0.4, "cut off below": 0.4}
-"""Probability that the scale of a component by contact is right, by its origin (`TIES`)."""
-RIGHT, WRONG = 0.05, 0.5
-"""Standard deviation of the log of such a scale if it is right, and if it is not."""
 HELD, NEAR = 4 / 300, 0.1
 """Weight of the whole image's error beside residuals, as a share of its area; standard deviation of
 the distance up to which a residual counts, relative to the square root of that area."""
@@ -42,7 +38,6 @@ class Given:
     Attributes:
         evidence: Evidence of flow and image for it.
         log_depth: (N,) log depth at the anchors, up to a common scale.
-        beside: (N,) that depth, by the flow where it determines that of the largest component.
         sigma: (N,) its standard deviation, estimated from the flow; inf where it decides nothing.
         opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
         error: (N,) standard deviation of log depth by which E_depth weighs the prior.
@@ -51,7 +46,6 @@ class Given:
 
     evidence: Evidence
     log_depth: Float
-    beside: Float
     sigma: Float
     opened: Float
     error: Float
@@ -77,12 +71,12 @@ def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tup
     value, with_value, whole = without_gaps(pair, seg)
     prior, sigma = evidence.log_depth(value), np.full(n, evidence.sigma)
     if not evidence.used:
-        return start, Given(evidence, prior, prior, sigma, np.zeros(n), sigma, np.zeros(n, bool))
+        return start, Given(evidence, prior, sigma, np.zeros(n), sigma, np.zeros(n, bool))
     seen, main = Seen(start, flow), start.component == largest(start.component)
-    soup, contact = start.soup, np.log(start.soup.depth_at(anchor))
+    soup, before = start.soup, np.log(start.soup.depth_at(anchor))
     # components that are fixed in the image keep their depth relative to the scene
     fixed = start.tie == FIXED
-    off, from_prior, strong = np.zeros(n), np.zeros(n, bool), fixed.copy()
+    off, strong = np.zeros(n), fixed.copy()
     rigid = np.unique(start.component[~start.bends & ~fixed])
     for c in sorted(rigid, key=lambda c: not main[start.component == c].all()):
         mask = start.component == c
@@ -97,37 +91,27 @@ def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tup
         if reference:
             shift, sigma = _local(seg, firm & with_value, gap - off, evidence.sigma)
             prior = np.where(main, prior + shift, prior)
-        else:
-            wrong = float(np.median((contact - prior)[mask]) - np.median((contact - prior)[main]))
-            # a contact is no evidence where depths of the scene are the prior's
-            stands = STANDS.get(TIES[start.tie[mask][0]], 0.0) if evidence.determined else 0.0
-            keep = _kept(wrong, float(np.median(sigma[mask])), stands)
-            off[mask] -= keep * wrong
-            prior[mask] += keep * wrong
-            from_prior |= mask & (keep < 0.5)
-    off[fixed] = np.median((contact - prior)[main])
+    off[fixed] = np.median((before - prior)[main])
     # surfaces that bend have a motion for every superpixel, which grows with its depth
-    off = np.where(start.bends, contact - prior, off)
+    off = np.where(start.bends, before - prior, off)
     sigma = np.where(fixed | ~with_value, np.inf, sigma)
     noise = start.noise / np.maximum(flow.views.parallax(soup), 1e-3)
     opened = np.where(strong & ~fixed, 1 / (1 + (sigma / noise) ** 2) ** 2, 1.0)
-    from_prior |= ~strong
+    held = ~fixed & ~(main & strong)
     # a superpixel has the translation of its component, whatever its depth
     scaled = replace(soup, lam=soup.lam * np.exp(-off))
-    beside = np.where(main & strong, np.log(scaled.depth_at(anchor)), prior)
     planes = about_anchor(
         np.exp(prior), _slopes(np.exp(-evidence.log_depth(whole)), pair, seg), anchor
     )
     normal, D = normal_and_distance(planes)
     tilted = Soup(D, normal, np.ones(n), soup.R, scaled.translation / D[:, None])
     soup = scaled.taking(tilted, ~strong).normalised()
-    tie = np.where(from_prior & ~main, TIES.index("given depth"), start.tie)
+    tie = np.where(held & ~main, TIES.index("given depth"), start.tie)
     # without a flow to weigh it against, terms on shape must not undo the prior
     error = sigma if evidence.determined else np.where(np.isfinite(sigma), LEAST_SIGMA, np.inf)
-    decides = np.where(from_prior, sigma, np.inf)
-    return replace(start, soup=soup, tie=tie), Given(
-        evidence, prior, beside, decides, opened, error, from_prior
-    )
+    decides = np.where(held, sigma, np.inf)
+    given = Given(evidence, prior, decides, opened, error, held)
+    return replace(start, soup=soup, tie=tie), given
 
 
 def _shaped(
@@ -178,17 +162,6 @@ def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:
     out /= ndimage.mean(inverse, seg.labels, index)[:, None]
     steep = np.linalg.norm(out, axis=1) * np.sqrt(seg.sizes / np.pi) / K[0, 0]
     return np.asarray(out / np.maximum(1.0, steep / STEEPEST)[:, None])
-
-
-def _kept(gap: float, sigma: float, stands: float) -> float:
-    """Weight of the scale by contact in a component's scale, beside the scale by the prior.
-
-    The scale by contact is right (`RIGHT`) with the probability `stands`, else wrong (`WRONG`); the
-    gap of its log to the prior, which has the deviation `sigma`, updates these odds.
-    """
-    spread = np.hypot(sigma, [RIGHT, WRONG])
-    odds = np.array([stands, 1 - stands]) * np.exp(-0.5 * (gap / spread) ** 2) / spread
-    return float(odds[0] / odds.sum() * sigma**2 / spread[0] ** 2)
 
 
 def _local(seg: Segmentation, known: Mask, residual: Float, sigma: float) -> tuple[Float, Float]:
