@@ -16,13 +16,12 @@ import pytest
 from soup_nlp.cli.main import main
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
-from soup_nlp.report import scene3d
+from soup_nlp.report import page as page_module
 from soup_nlp.report.findings import limits, summary
 from soup_nlp.report.folder import write_folder
-from soup_nlp.report.page import MODES, page
+from soup_nlp.report.page import MODES, make_scene, page, surface_cells
 from soup_nlp.report.pictures import _enlarged, pictures
 from soup_nlp.report.result import result_of
-from soup_nlp.report.scene3d import make_scene, surface_cells
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +141,7 @@ def test_curtains_are_cut(shown, small_run):
 
 
 def test_large_images_are_thinned(shown, monkeypatch):
-    monkeypatch.setattr(scene3d, "MOST_PIXELS", 256 * 128 / 8)
+    monkeypatch.setattr(page_module, "MOST_PIXELS", 256 * 128 / 8)
     scene = make_scene(shown)
     assert scene["step"] == 3
     assert scene["labels"].shape == (43, 86)
@@ -155,7 +154,7 @@ def test_a_far_sky_is_left_out_at_first(shown):
     scene = make_scene(shown)
     assert scene["middle"] < scene["far"] <= scene["deepest"]
     z = np.concatenate([np.full(900, 2.0), np.full(100, 1e6)])
-    assert scene3d._far(z) == (8.0, 1e6)
+    assert page_module._far(z) == (8.0, 1e6)
 
 
 def test_a_folder_makes_the_same_page_again(folder, capsys):
