@@ -20,7 +20,7 @@ from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.geometry.superpixels import Labels
-from soup_nlp.report.result import Result, load
+from soup_nlp.report.result import INPUTS, Result, load
 
 MIN_PIXELS = 200
 """Links with fewer pixels are flagged."""
@@ -75,8 +75,8 @@ def read_pair(first: int, second: int, folder: Path) -> SolvedPair:
     tree = result.tree
     parallax = float(np.median(tree["start"]["parallax"][result.components.of_superpixel == 0]))
     # a chain holds many pairs, whose other arrays it does not need
-    without_arrays = replace(result, tree={})
-    return SolvedPair(first, second, without_arrays, dict(tree.get("truth", {})), parallax)
+    kept = replace(result, tree={"input": {name: tree["input"][name] for name in INPUTS}})
+    return SolvedPair(first, second, kept, dict(tree.get("truth", {})), parallax)
 
 
 def carried(of_pixel: NDArray[np.generic], rec: Reconstruction) -> NDArray[Any]:
