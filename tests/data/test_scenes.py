@@ -15,9 +15,9 @@ from soup_nlp.data.scenes.everyday import LAYOUTS
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
 from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Plane, Sheet
 from soup_nlp.data.scenes.texture import Texture, fractal_noise, pulse_coverage, value_noise
-from soup_nlp.data.scenes.things import SceneBuilder
+from soup_nlp.data.scenes.things import SceneBuilder, about, placed
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry import camera
 
 FIRST = [name for name in SCENES if name not in LAYOUTS]
 """Scenes of the catalogue itself; `LAYOUTS` are the everyday ones."""
@@ -147,7 +147,7 @@ def test_still_background_does_not_move():
     assert np.mean(change[same] == 0) > 0.95  # the others are edge pixels of the moving body
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_each_kind_has_its_parallax_and_moving_bodies(name, seed):
     p = pair(name, seed, 160, 120)
@@ -177,7 +177,7 @@ def test_each_kind_has_its_parallax_and_moving_bodies(name, seed):
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_seeds_differ_in_depth_and_camera_motion(name):
-    for a, b in combinations([pair(name, seed, 160, 120).truth for seed in range(6)], 2):
+    for a, b in combinations([pair(name, seed, 160, 120).truth for seed in range(4)], 2):
         assert abs(np.log(a.depth_ref / b.depth_ref)).mean() > 0.02
         assert name == "standing" or abs(a.motions[0] - b.motions[0]).max() > 1e-3
 
@@ -260,15 +260,13 @@ def test_hits_by_hand():
 
 
 def test_a_pose_and_its_inverse():
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.exp([0.1, -0.4, 0.3])
-    pose[:3, 3] = 1, 2, 3
+    pose = about(turn=[10, -30, 20], shift=[1, 2, 3])
     np.testing.assert_allclose(inverse(pose) @ pose, np.eye(4), atol=1e-15)
 
 
 def test_points_that_pass_the_camera_have_no_flow():
-    wall = Body((Part(Plane(), _at(0, 0, 9), GREY),))
-    near = Body((Part(Box((0.2, 0.2, 0.1)), _at(0, 0, 1), GREY),), _at(0, 0, -2))
+    wall = Body((Part(Plane(), placed(0, 0, 9), GREY),))
+    near = Body((Part(Box((0.2, 0.2, 0.1)), placed(0, 0, 1), GREY),), placed(0, 0, -2))
     K = camera.intrinsics(64, 64, 31.5, 23.5)
     T = render(Scene((wall, near), np.eye(4), np.eye(4)), K, 48, 64).truth
     assert np.isnan(T.flow[T.components == 1]).all()
@@ -283,20 +281,14 @@ def test_edge_pixels_mix_both_sides_by_their_share():
     # the right edge of the near box's front at depth 1 projects to u = 31.5 + 64 * half
     for third in (0, 1, 2, 3):
         half = (40 - 0.5 + third / 3 + 1e-6 - 31.5) / 64
-        near = Body((Part(Box((half, 9.0, 1e-6)), _at(0, 0, 1 + 1e-6), bright, glow=1.0),))
-        far = Body((Part(Plane(), _at(0, 0, 4), dark, glow=1.0),))
+        near = Body((Part(Box((half, 9.0, 1e-6)), placed(0, 0, 1 + 1e-6), bright, glow=1.0),))
+        far = Body((Part(Plane(), placed(0, 0, 4), dark, glow=1.0),))
         row = render(Scene((far, near), np.eye(4), np.eye(4)), K, 48, 64).image_ref[24, :, 0]
         inner, outer = int(row[36]), int(row[44])
         assert inner > 2 * outer
         assert row[39] == inner
         assert row[41] == outer
         assert abs(row[40] - (outer + (inner - outer) * third / 3)) <= 1
-
-
-def _at(x: float, y: float, z: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, 3] = x, y, z
-    return pose
 
 
 # --- textures ---------------------------------------------------------------------------------
@@ -332,7 +324,7 @@ def test_pulse_coverage_is_the_share_of_a_window():
 @pytest.mark.parametrize("name", SCENES)
 def test_same_seed_same_bytes_other_seed_other_scene(name):
     # not from the cache of conftest.py
-    a, b, c = (render_scene.__wrapped__(name, seed, 96, 64) for seed in (5, 5, 6))
+    a, b, c = (render_scene.__wrapped__(name, seed, 64, 48) for seed in (5, 5, 6))
     for what in ("image_ref", "image_next", "K_ref"):
         assert getattr(a, what).tobytes() == getattr(b, what).tobytes()
     assert a.truth.flow.tobytes() == b.truth.flow.tobytes()

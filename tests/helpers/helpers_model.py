@@ -15,6 +15,7 @@ from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, View, render
 from soup_nlp.data.scenes.shapes import Box, Plane
 from soup_nlp.data.scenes.texture import Texture
+from soup_nlp.data.scenes.things import about, placed
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
@@ -209,20 +210,12 @@ def exact_terms(
 
 def plane_pose(z: float, yaw: float = 0.0, pitch: float = 0.0) -> Float:
     """Pose of an infinite plane that crosses the optical axis at depth z (degrees)."""
-    out = np.eye(4)
-    out[:3, :3] = rotation.exp(np.radians([0.0, yaw, 0.0])) @ rotation.exp(
-        np.radians([pitch, 0.0, 0.0])
-    )
-    out[:3, 3] = 0, 0, z
-    return out
+    return placed(0, 0, z, yaw, pitch)
 
 
 def motion(turn_deg: tuple[float, float, float], shift: tuple[float, float, float]) -> Float:
     """(4, 4) next_from_ref."""
-    out = np.eye(4)
-    out[:3, :3] = rotation.exp(np.radians(turn_deg))
-    out[:3, 3] = shift
-    return out
+    return about(turn=turn_deg, shift=shift)
 
 
 def plane_world(
