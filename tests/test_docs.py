@@ -386,7 +386,8 @@ def test_a_solver_is_any_program_that_reads_nl(tmp_path, monkeypatch):
     tiny = Tiny(neighbours=2, samples=3, boundary_samples=1)
     form = Formulation(hessian="exact", compiled=False)
     nlp, layout = tiny.nlp(PAPER, form)
-    task = Task(nlp, nlp, layout, tiny.soup, tiny.data, PAPER, form, Limits(seconds=60), tmp_path)
+    task = Task(nlp, layout, tiny.soup, tiny.data, PAPER, form, Limits(seconds=60))
+    monkeypatch.chdir(tmp_path)
     answer = find_solver("my-solver")(task)
     assert answer.x == pytest.approx(nlp.x0)
     assert answer.status == "start"

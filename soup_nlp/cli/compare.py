@@ -2,46 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import pandas as pd
 import typer
 
-from soup_nlp.bench.processes import machine
 from soup_nlp.bench.solvers.page import (
-    by_start,
+    FILES,
+    OF_FAMILY,
     conclusion,
-    draw_profiles,
     frame_of_runs,
-    neutral,
-    of_family,
     page,
-    summary,
+    write_pictures,
 )
 from soup_nlp.bench.solvers.registry import available, find_solver
 from soup_nlp.bench.solvers.runner import compare as run_all
-from soup_nlp.bench.solvers.runner import family_tasks, is_family, make_task
+from soup_nlp.bench.solvers.runner import family_tasks, is_family, problem_task
 from soup_nlp.cli import options
 from soup_nlp.cli.options import option, out_option
 from soup_nlp.config.problem import load_problem, title
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import parse_formulations
 from soup_nlp.export.verify import Limits
-from soup_nlp.family.describe import write_results
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.files import write_text
 from soup_nlp.storage.folders import claim, default_folder, staged
 from soup_nlp.storage.rows import Row
-from soup_nlp.storage.store import write_json
 from soup_nlp.storage.system import scratch
-
-FILES = ("README.md", "profile.png")
-"""Files that are made from all rows."""
-OF_FAMILY = ("profiles.png", "results.json", "reached.json")
-"""Further files for rows of the family."""
 
 
 def compare(
@@ -72,60 +59,35 @@ def compare(
         find_solver(name)
     parse_formulations(None, coordinates)
     limits = Limits(seconds, iterations)
-    # load all problems first: a wrong file must not stop after hours of runs
+    # prepare all problems first: a wrong file must not stop after hours of runs
     sets = [path for path in problems if is_family(path)]
-    files = [path for path in problems if path not in sets]
-    chosen = [load_problem(path, overrides or []) for path in files]
-    written = (*FILES, *(OF_FAMILY if sets else ()))
+    chosen = [load_problem(path, overrides or []) for path in problems if path not in sets]
     subjects = [f"family {path.absolute()}" for path in sets] + [p.subject for p in chosen]
     subject = ", ".join(dict.fromkeys(subjects))
     names_of = dict.fromkeys([*(path.name for path in sets), *(p.name for p in chosen)])
     out = out or default_folder(title(f"solvers-{'-'.join(names_of)}"), subject)
+    written = (*FILES, *(OF_FAMILY if sets else ()))
     folder = claim(out, written, overwrite, subject)
-
-    def tasks() -> Iterator[list[Any]]:
-        """Tasks of one scene and size, or of one problem, at a time."""
-        for path in sets:
-            yield from family_tasks(path, limits)
-        for problem in chosen:
-            yield [make_task(prepare(problem), limits, coordinates)]
-
-    before: list[Row] = []
+    tasks = [task for path in sets for task in family_tasks(path, limits)]
+    tasks += [problem_task(prepare(problem), limits, coordinates) for problem in chosen]
     rows: list[Row] = []
 
     def keep(new_rows: list[Row]) -> None:
         """Write the page after every run: a run may take minutes, a command may be killed."""
-        rows[:] = [*before, *new_rows]
+        rows[:] = new_rows
         with staged(folder, overwrite=overwrite, subject=subject) as new:
             write_text(new / "README.md", page(frame_of_runs(rows)))
 
     kept = options.resumable("the runs that were finished are kept, with a page of them", folder)
     try:
         with kept, scratch() as temporary:
-            for tasks_of_problem in tasks():
-                runs = folder / "runs.jsonl"
-                before += run_all(tasks_of_problem, names, limits, runs, temporary, print, keep)
+            run_all(tasks, names, limits, folder / "runs.jsonl", temporary, print, keep)
     finally:
-        # write the page of the finished runs even after an error
+        # the runs that were finished before an interruption have pictures, too
         if rows:
-            _write(folder, frame_of_runs(rows), limits, overwrite, subject)
+            with staged(folder, overwrite=overwrite, subject=subject) as new:
+                write_pictures(new, frame_of_runs(rows), limits)
     print("\n".join(conclusion(frame_of_runs(rows))))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     verified = sum(bool(r["verified"]) for r in rows)
     options.finish(bool(verified), f"{verified} of {len(rows)} runs are verified")
-
-
-def _write(
-    folder: Path, frame: pd.DataFrame, limits: Limits, overwrite: bool, subject: str
-) -> None:
-    """Write FILES from all runs, and OF_FAMILY from those of the family."""
-    family = of_family(frame)
-    with staged(folder, overwrite=overwrite, subject=subject) as new:
-        write_text(new / "README.md", page(frame))
-        draw_profiles(new / "profile.png", {"": frame}, ("seconds", "energy"))
-        if len(family):
-            measures = "cpu_seconds", "objective"
-            draw_profiles(new / "profiles.png", by_start(family), measures)
-            note = {"limits": asdict(limits), "machine": machine()}
-            write_results(new / "results.json", neutral(family), note)
-            write_json(new / "reached.json", summary(family))

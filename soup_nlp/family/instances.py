@@ -209,7 +209,7 @@ def rounded_data(data: EnergyData) -> EnergyData:
 
 
 def build_instance(
-    case: Case, record: Frozen, formulation: str, start: str, hessian: str = "exact"
+    case: Case, record: Frozen, formulation: str, start: str
 ) -> tuple[NLP, MatrixLayout | TangentLayout, Formulation]:
     """The NLP of a formulation at a start, its layout and its formulation.
 
@@ -218,9 +218,8 @@ def build_instance(
         record: The record.
         formulation: gauge/norm.
         start: One of STARTS; "best" is the best known point without rounding.
-        hessian: Kind of the Hessian.
     """
-    form = case.formulation(**parse_formulation(formulation), hessian=hessian, compiled=False)
+    form = case.formulation(**parse_formulation(formulation), hessian="exact", compiled=False)
     assert form_label(form) == formulation
     soups = {"easy": record.best, "hard": record.start, "best": record.best}
     soup = constant_depth(case.data) if start == "cold" else soups[start]

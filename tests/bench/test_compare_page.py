@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from soup_nlp.bench.solvers import runner
 from soup_nlp.bench.solvers.page import (
     _draw_profile,
     by_start,
@@ -24,11 +25,7 @@ from soup_nlp.bench.solvers.page import (
 from soup_nlp.bench.solvers.page import page as page_of
 from soup_nlp.bench.study import panels
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import Problem
-from soup_nlp.errors import DataError
 from soup_nlp.export.verify import Limits
-from soup_nlp.pipeline.case import prepare
-from soup_nlp.pipeline.record import Case
 
 pytestmark = pytest.mark.slow
 
@@ -199,20 +196,23 @@ def test_files_are_read_before_anything_runs(tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_an_input_that_cannot_be_used_leaves_the_others_page(tmp_path, monkeypatch, capsys):
-    calls = []
+def test_an_interrupted_comparison_has_a_page_and_goes_on(tmp_path, monkeypatch, capsys):
+    isolated, done = runner.isolated, []
 
-    def second_fails(problem: Problem) -> Case:
-        calls.append(problem)
-        if len(calls) == 2:
-            raise DataError("image is gone")
-        return prepare(problem)
+    def second_is_interrupted(*args, **kwargs):
+        if len(done) == 1:
+            raise KeyboardInterrupt
+        done.append(isolated(*args, **kwargs))
+        return done[-1]
 
-    monkeypatch.setattr("soup_nlp.cli.compare.prepare", second_fails)
-    orbit = str(PROBLEMS / "orbit.yaml")
-    words = ["--solvers", "lm,lm", "--seconds", "5"]
-    out = tmp_path / "out"
-    assert main(["compare", orbit, orbit, "-o", str(out), *words, *SMALL]) == 2
+    monkeypatch.setattr(runner, "isolated", second_is_interrupted)
+    orbit, out = str(PROBLEMS / "orbit.yaml"), tmp_path / "out"
+    words = ["compare", orbit, "--solvers", "lm,soup-nlp", "--seconds", "5", "-o", str(out), *SMALL]
+    assert main(words) == 130
     assert "1 runs" in (out / "README.md").read_text()
-    assert "image is gone" in capsys.readouterr().err
+    assert (out / "profile.png").stat().st_size > 0
+    assert "the runs that were finished are kept" in capsys.readouterr().err
     assert np.isfinite([json.loads((out / "runs.jsonl").read_text())["energy"]]).all()
+    monkeypatch.setattr(runner, "isolated", isolated)
+    assert main(words) == 0
+    assert "2 runs" in (out / "README.md").read_text()

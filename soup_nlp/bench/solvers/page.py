@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from soup_nlp.arrays import Float
+from soup_nlp.bench.processes import machine
 from soup_nlp.bench.study import markdown, page_text, panels, save, show, titled
+from soup_nlp.export.verify import Limits
+from soup_nlp.family.describe import write_results
 from soup_nlp.family.write import REACHED
+from soup_nlp.storage.store import write_json
 
 Row = Mapping[str, Any]
 
@@ -59,6 +64,10 @@ COLUMNS = {
     "ended": ("status", ""),
 }
 """Title and format of every column of the table of runs, after the problem."""
+FILES = ("README.md", "profile.png")
+"""Files that are made from all runs."""
+OF_FAMILY = ("profiles.png", "results.json", "reached.json")
+"""Further files for runs of the family."""
 FURTHER = ("objective", "peak_bytes", "status", "best_known")
 """Further columns that the page and the records need."""
 
@@ -251,6 +260,17 @@ def draw_profiles(
             _draw_profile(ax, measure, len(cost), profile(cost))
             ax.set_title(title, fontsize=9)
     save(picture, path)
+
+
+def write_pictures(folder: Path, frame: pd.DataFrame, limits: Limits) -> None:
+    """Write profile.png from all runs, and OF_FAMILY from those of the family."""
+    draw_profiles(folder / "profile.png", {"": frame}, ("seconds", "energy"))
+    family = of_family(frame)
+    if len(family):
+        draw_profiles(folder / "profiles.png", by_start(family), ("cpu_seconds", "objective"))
+        note = {"limits": asdict(limits), "machine": machine()}
+        write_results(folder / "results.json", neutral(family), note)
+        write_json(folder / "reached.json", summary(family))
 
 
 def _draw_profile(ax: Axes, measure: str, count: int, share: pd.DataFrame) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -25,29 +25,30 @@ from soup_nlp.solve.functions import Functions, IterationCallback
 from soup_nlp.solve.ipopt import DEFAULTS
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Task:
-    """An NLP for a solver.
+    """An NLP for a solver, which may write files into the working folder.
 
     Attributes:
         nlp: The NLP with the exact Hessian.
-        gauss_newton: The same NLP with the Gauss-Newton Hessian.
-        layout: Layout of both.
+        layout: Its layout.
         soup: Start.
         data, weights, form: Energy and formulation, for the reference solver, which takes no NLP.
         limits: Limits of time, iterations, tolerance and memory.
-        folder: Scratch folder of the run.
     """
 
     nlp: NLP
-    gauss_newton: NLP
     layout: MatrixLayout | TangentLayout
     soup: Soup
     data: EnergyData
     weights: Weights
     form: Formulation
     limits: Limits
-    folder: Path
+
+    @cached_property
+    def gauss_newton(self) -> NLP:
+        """The same NLP with the Gauss-Newton Hessian."""
+        return replace(self.nlp, hessian_kind="gauss-newton+constraints")
 
     def point(self, soup: Soup) -> Float:
         """(nx,) vector of a soup, slack variables and switches at their best values."""
@@ -64,20 +65,18 @@ class Answer:
     """The answer of a solver.
 
     Attributes:
-        x: (nx,) point, or None if the solver returned none.
+        x: (nx,) point, a soup that stands for its point, or None if the solver returned none.
         lam_g: (ng,) multipliers, or None.
         status: Status text of the solver.
         claimed: Whether the solver claims an optimum.
         iterations: Outer iterations, -1 if unknown.
-        seconds: CPU time of set-up and solve.
     """
 
-    x: Float | None
+    x: Float | Soup | None
     lam_g: Float | None
     status: str
     claimed: bool
-    iterations: int
-    seconds: float
+    iterations: int = -1
 
 
 def clock() -> float:
@@ -203,8 +202,7 @@ def plugin(name: str, task: Task) -> Answer:
     chosen = PLUGINS[name]
     library = chosen.library
     nlp = task.gauss_newton if chosen.hessian == "gauss-newton" else task.nlp
-    begin = clock()
-    watch = _Watch(begin + task.limits.seconds)
+    watch = _Watch(clock() + task.limits.seconds)
     # parameters are replaced by numbers, since bonmin has no parameters
     x, functions = ca.MX.sym("x", nlp.nx), Functions(nlp)
     # these libraries differentiate f and g at set-up, in spite of cached derivatives
@@ -232,7 +230,6 @@ def plugin(name: str, task: Task) -> Answer:
         "Time_Limit" if watch.late else status,
         claimed and not watch.late,
         int(stats.get("iter_count", -1)),
-        clock() - begin,
     )
 
 

@@ -34,16 +34,14 @@ from soup_nlp.storage.system import end_with_parent
 
 def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
     """Solve with a program of the AMPL convention, `solver stub -AMPL key=value ...`."""
-    begin = clock()
-    file = write_nl(task.folder / "soup.nl", task.nlp)
-    path = task.folder / "soup.sol"
+    begin, path = clock(), Path("soup.sol")
+    file = write_nl(path.with_suffix(".nl"), task.nlp)
     # remove an answer to an earlier problem
     path.unlink(missing_ok=True)
-    with (task.folder / "solver.log").open("w") as log:
+    with path.with_name("solver.log").open("w") as log:
         try:
             code = subprocess.run(
                 [command, "soup", "-AMPL", *options],
-                cwd=task.folder,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 timeout=WALL_PER_CPU * max(1.0, task.limits.seconds - (clock() - begin)),
@@ -51,13 +49,12 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
                 preexec_fn=end_with_parent,
             ).returncode
         except subprocess.TimeoutExpired:
-            return Answer(None, None, "Time_Limit", False, -1, clock() - begin)
+            return Answer(None, None, "Time_Limit", False)
     if not path.is_file():
         raise SolverError("solver wrote no .sol", where=Path(command).name, found=f"exit {code}")
     sol = read_sol(path, file.variables, file.rows)
-    seconds = clock() - begin
     status = sol.message.splitlines()[-1] if sol.message else sol.status
-    return Answer(sol.x, sol.lam_g, status, sol.solved, -1, seconds)
+    return Answer(sol.x, sol.lam_g, status, sol.solved)
 
 
 def _find(name: str) -> str | None:
@@ -84,15 +81,12 @@ def reference(task: Task) -> Answer:
     last = task.form.eps
     eps = [*(e for e in EPS if e > last), last]
     energy = task.soup, task.data, task.weights, task.form
-    begin = clock()
     y = levenberg_marquardt(*energy, eps=eps, seconds=0.8 * WALL_PER_CPU * task.limits.seconds)
-    seconds = clock() - begin
-    return Answer(task.point(y.soup), None, y.status, False, y.iterations, seconds)
+    return Answer(y.soup, None, y.status, False, y.iterations)
 
 
 def package(task: Task) -> Answer:
     """Solve as this package does: Ipopt's stages, then the constrained NLP."""
-    begin = clock()
     m = task.limits
     options = SolverOptions(
         eps=task.form.eps,
@@ -100,16 +94,12 @@ def package(task: Task) -> Answer:
         max_iter=m.iterations,
         max_seconds=0.9 * WALL_PER_CPU * m.seconds,
     )
-    energy = task.soup, task.data, task.weights, task.form
-    answer = solve_soup(*energy, options)
-    stage = answer.stages[-1]
-    iterations = sum(s.iterations for s in answer.stages)
-    seconds = clock() - begin
-    ended = stage.status, stage.converged, iterations, seconds
-    if task.form.coordinates == "tangent":
-        # the package solves the program in matrices, whose multipliers differ
-        return Answer(task.point(answer.soup), None, *ended)
-    return Answer(stage.x, stage.lam_g, *ended)
+    answer = solve_soup(task.soup, task.data, task.weights, task.form, options)
+    stage, iterations = answer.stages[-1], sum(s.iterations for s in answer.stages)
+    # the package solves the program in matrices, whose multipliers differ from those in tangents
+    matrices = task.form.coordinates == "matrix"
+    x, lam_g = (stage.x, stage.lam_g) if matrices else (answer.soup, None)
+    return Answer(x, lam_g, stage.status, stage.converged, iterations)
 
 
 def available() -> dict[str, Solver]:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
-from functools import cache, partial
+from dataclasses import asdict
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from soup_nlp.bench.processes import isolated, processor
-from soup_nlp.bench.solvers.plugins import WALL_PER_CPU, Answer, Task
+from soup_nlp.bench.solvers.plugins import WALL_PER_CPU, Answer, Solver, Task, clock
 from soup_nlp.bench.solvers.registry import find_solver
 from soup_nlp.bench.study import show
 from soup_nlp.errors import DataError
@@ -23,9 +24,9 @@ from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
 from soup_nlp.family.frozen import load_frozen
 from soup_nlp.family.instances import build_instance, case_of, parse_name, problems
+from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
@@ -34,16 +35,28 @@ from soup_nlp.storage.rows import Job, Row, measure_all
 from soup_nlp.storage.versions import versions
 
 Label = Mapping[str, Any]
-Maker = Callable[[Path], Task]
-Program = tuple[NLP, MatrixLayout | TangentLayout, Formulation]
-Build = Callable[[Hessian], Program]
+Build = Callable[[], tuple[NLP, MatrixLayout | TangentLayout, Formulation]]
+Labelled = tuple[Label, Callable[[], Task]]
+"""Entries of the rows of a task, and what makes the task."""
 
 KEY = ("problem", "problem_hash", "superpixels", "formulation", "start")
 """Entries of a label that identify a task."""
 
 
-def make_task(case: Case, limits: Limits, coordinates: str) -> tuple[Label, Maker]:
-    """Label and maker of the task of a case in its formulation."""
+@lru_cache(maxsize=1)
+def make_task(case: Case, build: Build, limits: Limits) -> Task:
+    """The task of a case, whose `build` makes the NLP with the exact Hessian."""
+    nlp, layout, form = build()
+    soup = layout.unpack(nlp.x0).retracted()
+    task = Task(nlp, layout, soup, case.data, case.weights, form, limits)
+    # made here, so that the time of a solver does not include it
+    for program in (task.nlp, task.gauss_newton):
+        program.evaluated()
+    return task
+
+
+def problem_task(case: Case, limits: Limits, coordinates: str) -> Labelled:
+    """The task of a case in its formulation."""
     form = case.formulation(coordinates=coordinates, hessian="exact", compiled=False)
     ceiling = oracle.energy(case.start.soup, case.data, case.weights)["total"]
     label = {
@@ -54,35 +67,28 @@ def make_task(case: Case, limits: Limits, coordinates: str) -> tuple[Label, Make
         "start": "proposal",
         "energy_limit": ceiling * (1 + ENERGY_SLACK),
     }
-    build = lambda hessian: (*case.nlp(form.replace(hessian=hessian)), form)  # noqa: E731
-    return label, task_maker(case, build, limits)
+    return label, partial(make_task, case, lambda: (*case.nlp(form), form), limits)
 
 
-def task_maker(case: Case, build: Build, limits: Limits) -> Maker:
-    """Maker of the task of a case, whose `build` makes the NLP with a Hessian."""
-
-    @cache
-    def built() -> Task:
-        nlp, layout, form = build("exact")
-        second, _, _ = build("gauss-newton+constraints")
-        # made here, so that the time of a solver does not include it
-        both = nlp.evaluated(), second.evaluated()
-        soup = layout.unpack(nlp.x0).retracted()
-        return Task(*both, layout, soup, case.data, case.weights, form, limits, Path())
-
-    return lambda folder: replace(built(), folder=folder)
+def timed(solver: Solver, task: Task, folder: Path) -> tuple[Answer, float]:
+    """Answer of a solver that works in a folder, and its CPU seconds."""
+    os.chdir(folder)
+    begin = clock()
+    return solver(task), clock() - begin
 
 
-def run_row(task: Task, label: Label, solver: str) -> Row:
+def run_row(task: Task, label: Label, solver: str, folder: Path) -> Row:
     """Run a solver in a process of its own, verify its answer, and make the row.
 
-    `label` has the entries that identify the task, and "energy_limit".
+    Args:
+        task: The task.
+        label: Entries that identify the task, and "energy_limit".
+        solver: Name of the solver.
+        folder: Empty scratch folder.
     """
-    work, limits = find_solver(solver), task.limits
+    work, limits = partial(timed, find_solver(solver), task, folder), task.limits
     wall = WALL_PER_CPU * limits.seconds
-    ended = isolated(
-        lambda: work(task), task.folder, wall, limits.memory, cpu_seconds=limits.seconds
-    )
+    ended = isolated(work, folder, wall, limits.memory, cpu_seconds=limits.seconds)
     row: Row = {
         **label,
         "n": task.nlp.nx,
@@ -100,27 +106,29 @@ def run_row(task: Task, label: Label, solver: str) -> Row:
         "versions": versions(),
         "machine": f"{platform.system()} {platform.machine()}, {processor()}",
     }
-    if isinstance(ended.value, Answer):
-        row |= _verified(task, ended.value, float(label["energy_limit"]))
+    if ended.how == "returned":
+        answer, seconds = ended.value
+        row |= _verified(task, answer, seconds, float(label["energy_limit"]))
     return row
 
 
-def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
+def _verified(task: Task, answer: Answer, seconds: float, energy_limit: float) -> Row:
     """Entries of a row from an answer: claim, exact energy and residuals.
 
     One tolerance decides what is verified, whether the solver claims an optimum or not. The exact
     energy is that of the point retracted to the constraints; infinite if it is not finite.
     """
     # a claim after the time limit does not count
-    x, late = answer.x, not answer.seconds <= task.limits.seconds
+    x, late = answer.x, not seconds <= task.limits.seconds
     row: Row = {
         "status": f"over the time limit: {answer.status}" if late else answer.status,
         "claimed": answer.claimed and x is not None and not late,
         "iterations": answer.iterations,
-        "seconds": answer.seconds,
+        "seconds": seconds,
     }
     if x is None:
         return row
+    x = task.point(x) if isinstance(x, Soup) else x
     energy = np.inf
     with np.errstate(all="ignore"):
         value = task.nlp.value(x)
@@ -138,7 +146,7 @@ def _verified(task: Task, answer: Answer, energy_limit: float) -> Row:
 
 
 def compare(
-    tasks: Sequence[tuple[Label, Maker]],
+    tasks: Sequence[Labelled],
     solvers: Sequence[str],
     limits: Limits,
     path: Path,
@@ -152,12 +160,12 @@ def compare(
     all rows so far after each run.
     """
 
-    def run(label: Label, make: Maker, solver: str) -> Row:
+    def run(label: Label, make: Callable[[], Task], solver: str) -> Row:
         say(f"{label['problem']:<12} {label['superpixels']:>5} {solver:<12} runs ...")
         # the name of a solver may be a path
         folder = scratch / re.sub(r"[^\w-]+", "_", solver)
         folder.mkdir(parents=True, exist_ok=True)
-        return run_row(make(folder), label, solver)
+        return run_row(make(), label, solver, folder)
 
     jobs = []
     for label, make in tasks:
@@ -188,8 +196,8 @@ def is_family(path: Path) -> bool:
     return (path / INDEX).is_file()
 
 
-def family_tasks(folder: Path, limits: Limits) -> Iterator[list[tuple[Label, Maker]]]:
-    """Labels and makers of the tasks of all instances in a folder, one scene and size at a time.
+def family_tasks(folder: Path, limits: Limits) -> Iterator[Labelled]:
+    """The tasks of all instances in a folder.
 
     Raises:
         DataError: the index cannot be read.
@@ -203,7 +211,6 @@ def family_tasks(folder: Path, limits: Limits) -> Iterator[list[tuple[Label, Mak
         record = load_frozen(scene, size)
         case = case_of(record)
         digest = hashlib.sha256(record.text.encode()).hexdigest()[:12]
-        tasks: list[tuple[Label, Maker]] = []
         for instance in instances:
             label = {
                 "problem": f"{scene} {instance.start}",
@@ -216,5 +223,4 @@ def family_tasks(folder: Path, limits: Limits) -> Iterator[list[tuple[Label, Mak
                 "energy_limit": float("inf"),
             }
             build = partial(build_instance, case, record, instance.formulation, instance.start)
-            tasks.append((label, task_maker(case, build, limits)))
-        yield tasks
+            yield label, partial(make_task, case, build, limits)
