@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from textwrap import shorten
 from types import MappingProxyType
 
 import numpy as np
@@ -103,6 +104,15 @@ def make_plan(
                 key = cell.identity()["key"]
                 lines.append((section, method, change, dataset, item.name, cell, key))
     return pd.DataFrame(lines, columns=COLUMNS)
+
+
+def pairs_found(plan: pd.DataFrame) -> list[str]:
+    """A line for each section, and dataset of the comparison: number and names of its pairs."""
+    groups = plan.groupby(["section", "dataset"], sort=False)["name"].unique()
+    return [
+        f"{' '.join(filter(None, key))}: {len(names)} pairs: {shorten(', '.join(names), 90)}"
+        for key, names in groups.items()
+    ]
 
 
 def _variants(section: str, method: str) -> Mapping[str, Overrides]:

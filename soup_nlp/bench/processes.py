@@ -1,4 +1,4 @@
-"""Functions run in separate processes with limits; the description of the machine."""
+"""A function in a process of its own with limits; the description of the machine."""
 
 from __future__ import annotations
 
@@ -14,16 +14,13 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import psutil
 
 from soup_nlp.errors import SolverError, SoupError
-from soup_nlp.storage.rows import ONE_THREAD, Row, attempt, failure
-from soup_nlp.storage.system import end_with_parent, scratch
+from soup_nlp.storage.system import end_with_parent
 from soup_nlp.storage.versions import code_version, versions
 
 GRACE = 5.0
@@ -53,9 +50,7 @@ def isolated(
     work: Callable[[], Any],
     folder: Path,
     seconds: float,
-    memory: int | None = None,
-    *,
-    fresh: bool = False,
+    memory: int,
     cpu_seconds: float | None = None,
 ) -> ProcessResult:
     """Call a function in a process of its own; a crash becomes a result as well.
@@ -64,17 +59,13 @@ def isolated(
         work: Function without arguments; its return value must pickle.
         folder: Existing folder for the return value and the output.
         seconds: Limit of the wall time.
-        memory: Bytes that a forked process may have in addition to those of this one; None for no
-            limit.
-        fresh: Start a new interpreter, so that the peak memory is that of the work alone; the work
-            must pickle. Otherwise the process is forked.
+        memory: Bytes that the process may have in addition to those of this one.
         cpu_seconds: Limit of the CPU time of the process and of each of its children, or None.
 
     Raises:
         SolverError: the system cannot fork.
     """
-    method = "spawn" if fresh else "fork"
-    if method not in multiprocessing.get_all_start_methods():
+    if "fork" not in multiprocessing.get_all_start_methods():
         raise SolverError(
             "comparing needs a system that forks processes", found=sys.platform, expected="POSIX"
         )
@@ -82,7 +73,7 @@ def isolated(
     target.unlink(missing_ok=True)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.perf_counter()
-    context: Any = multiprocessing.get_context(method)
+    context = multiprocessing.get_context("fork")
     process = context.Process(target=_child, args=(work, target, memory, cpu_seconds))
     process.start()
     late = True
@@ -107,30 +98,14 @@ def isolated(
     return ProcessResult(how, value, spent, cpu, peak)
 
 
-def alone(work: Callable[[], Row], seconds: float = 7200.0) -> Row:
-    """The row of `attempt(work)` in a new interpreter with one thread.
-
-    "peak_bytes" is the largest resident size of the process, unless the row of the work has it.
-    """
-    with scratch() as folder, mock.patch.dict(os.environ, ONE_THREAD):
-        ended = isolated(partial(attempt, work), folder, seconds, fresh=True)
-    if ended.how == "returned":
-        return {"peak_bytes": ended.peak_bytes, **ended.value}
-    late = ended.how == "killed: time"
-    return failure(f"no answer after {seconds:g} s" if late else f"{ended.how} {ended.value}")
-
-
-def _child(
-    work: Callable[[], Any], target: Path, memory: int | None, cpu_seconds: float | None
-) -> None:
+def _child(work: Callable[[], Any], target: Path, memory: int, cpu_seconds: float | None) -> None:
     end_with_parent()
     # the output of the work goes to a file in its folder
     with target.with_name("output.log").open("wb") as log:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
-    if memory is not None:
-        limit = psutil.Process().memory_info().vms + memory
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    limit = psutil.Process().memory_info().vms + memory
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     if cpu_seconds is not None:
         most = math.ceil(1.2 * cpu_seconds) + 1
         resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,7 +25,7 @@ from soup_nlp.pipeline.run import make_run
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
-from soup_nlp.storage.rows import Row
+from soup_nlp.storage.rows import Row, peak_bytes
 from soup_nlp.storage.system import scratch
 
 REFERENCE_ITERATIONS = 100
@@ -165,7 +164,7 @@ def measure_speed(cell: Cell) -> Row:
         "energy_start": dict(solution.energy_start),
         "errors": {k: m.mre for k, m in run.metrics.items()},
         "residuals": dict(solution.residuals),
-        "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        "peak_bytes": peak_bytes(),
         "reference": _reference(case),
     }
 

@@ -21,7 +21,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from soup_nlp.bench.processes import alone
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.storage.files import atomic_path
 from soup_nlp.storage.rows import Job, MeasureRows, Row, attempt, measure_all, reason
@@ -108,11 +107,10 @@ class Cell:
             "input": _hash(problem.input, PATHS),
         }
 
-    def job(self, measure: Measure, own_process: bool = False) -> Job:
+    def job(self, measure: Measure) -> Job:
         """The job of the cell; it can be sent to another process."""
-        work = partial(measure, self)
         stale = self.keep is not None and not self.keep.exists()
-        return Job(self.identity(), partial(alone if own_process else attempt, work), stale)
+        return Job(self.identity(), partial(attempt, partial(measure, self)), stale)
 
 
 Measure = Callable[[Cell], Row]
@@ -133,7 +131,6 @@ def measure_cells(
     measure: Measure,
     path: Path,
     measure_rows: MeasureRows = measure_all,
-    own_process: bool = False,
 ) -> pd.DataFrame:
     """Measure cells and return the frame of their rows.
 
@@ -142,10 +139,8 @@ def measure_cells(
         measure: Makes the row of a cell.
         path: JSON-lines file of rows.
         measure_rows: `storage.rows.measure_all` with its options.
-        own_process: Measure every row in a process of its own with one thread, so that times and
-            peak memory are those of the row alone.
     """
-    return frame_of(measure_rows([cell.job(measure, own_process) for cell in cells], path))
+    return frame_of(measure_rows([cell.job(measure) for cell in cells], path))
 
 
 def frame_of(rows: Sequence[Row]) -> pd.DataFrame:

@@ -295,7 +295,7 @@ def list_suite(
     name: str,
     data: Path | None = None,
     options: Options | None = None,
-    say: Callable[[str], object] | None = None,
+    say: Callable[[str], object] = lambda line: None,
 ) -> list[Item]:
     """The available pairs of a suite, each with every flow.
 
@@ -315,9 +315,8 @@ def list_suite(
         listed = list(suite.items(Path(os.path.realpath(root / folder)), o))
         here = [i for i in listed if all(is_file(f) for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):
-            if say:
-                found, total = (len({i.name for i in items}) for items in (here, listed))
-                say(f"suite {name}: {found} of {total} pairs found")
+            found, total = (len({i.name for i in items}) for items in (here, listed))
+            say(f"suite {name}: {found} of {total} pairs found")
             return here
     if o.only and not listed and (not suite.layout or is_folder(root)):
         raise DataError(

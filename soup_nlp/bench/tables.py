@@ -14,10 +14,8 @@ import pandas as pd
 
 from soup_nlp.bench.study import Cell, Item, markdown, page_text, pivot, provenance, titled
 from soup_nlp.errors import DataError
-from soup_nlp.sequence.chain import make_chain
-from soup_nlp.sequence.frames import Frames, find_depths, find_images, scene_frames
 from soup_nlp.sequence.score import score
-from soup_nlp.sequence.solve import ROWS, solve_pairs
+from soup_nlp.sequence.solve import ROWS, SCENE, solve_chain
 from soup_nlp.storage.rows import Row, read_rows
 from soup_nlp.storage.system import scratch
 
@@ -28,6 +26,8 @@ NOTE = (
     " RMSE of its positions after the best similarity, over the path's length (no true path of"
     " kitti_tracking is known). DIS flow, default options."
 )
+KITTI_DEPTH = 256.0
+"""Values per metre of a depth of kitti_tracking."""
 COLUMNS = {
     "frames": ("frames", ".0f"),
     "mre_own_scale": ("a scale for every frame", ".4f"),
@@ -42,17 +42,15 @@ COLUMNS = {
 
 
 def sequences(data: Path | None) -> list[Item]:
-    """Rendered sequences, and kitti_tracking where its folder is there; frames are in `needs`."""
+    """Rendered sequences, and kitti_tracking where its folder is there."""
     out = [
         Item("rendered", scene, scene, "dis", {"kind": "scene", "scene": scene})
         for scene in ("street", "room", "orbit")
     ]
     folder = (data or Path()).resolve() / "kitti_tracking"
     if data is not None and folder.is_dir():
-        images = tuple(find_images(folder))
-        source = {"kind": "files", "ref": str(images[0]), "next": str(images[1])}
-        source["intrinsics"] = str(folder / "K.txt")
-        out.append(Item("shared", folder.name, folder.name, "dis", source, needs=images))
+        source = {"kind": "folder", "path": str(folder)}
+        out.append(Item("shared", folder.name, folder.name, "dis", source))
     return out
 
 
@@ -63,21 +61,18 @@ def measure_chain(cell: Cell, frames: int = 10) -> Row:
         DataError: the sequence has no truth.
     """
     item = cell.item
-    source = scene_frames(item.sequence, frames)
-    if item.needs:
-        images = list(item.needs[:frames])
-        camera = {"intrinsics": item.input["intrinsics"]}
-        source = Frames(tuple(map(str, images)), camera, find_depths(images), 256.0)
+    source = item.input.get("path", f"{SCENE}{item.sequence}")
     with scratch() as folder:
-        which = [(k, k + 1) for k in range(len(source) - 1)]
-        chain = make_chain(solve_pairs(source, which, folder, cell.overrides))
+        chain = solve_chain(
+            source, folder, most=frames, depth_scale=KITTI_DEPTH, overrides=cell.overrides
+        )
         seconds = {row["key"]: row["cpu_seconds"] for row in read_rows(folder / ROWS)}
     scores = score(chain)
     if scores is None:
         raise DataError("sequence has no truth", where=item.name)
     errors = [abs(np.log(k["estimated"] / k["true"])) for k in scores["links"]]
     return {
-        "frames": len(source),
+        "frames": len(chain),
         **{key: scores[key] for key in ("mre_own_scale", "mre_one_scale", "cost")},
         "worst_link": float(np.expm1(max(errors))),
         "path": None if scores["path"] is None else scores["path"]["share"],

@@ -16,7 +16,7 @@ from soup_nlp.bench import search as searching
 from soup_nlp.bench import speed as timing
 from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.accuracy_page import write_suite
-from soup_nlp.bench.paper import make_plan, measure_paper
+from soup_nlp.bench.paper import make_plan, measure_paper, pairs_found
 from soup_nlp.bench.paper_page import FILES, write_paper
 from soup_nlp.bench.study import Cell, measure_cells, show
 from soup_nlp.bench.suites import MOTORCYCLE, RENDERED, SUITES, Options, list_suite
@@ -95,6 +95,11 @@ def _text(page_of: Callable[[pd.DataFrame], str]) -> Callable[[Path, pd.DataFram
     return lambda path, frame: write_text(path, page_of(frame))
 
 
+def _say(quiet: bool) -> Callable[[str], object]:
+    """Prints a line on the pairs of a study, unless the command is quiet."""
+    return lambda line: None if quiet else print(line, file=sys.stderr)
+
+
 def _wanted(flow: list[str] | None, width: int, seeds: str, only: list[str] | None) -> Options:
     chosen = tuple(options.numbers(seeds, "--seeds"))
     return Options(tuple(flow or ()), width, chosen, tuple(only or ()))
@@ -131,10 +136,9 @@ def accuracy(
     if name and len(suite) > 1:
         raise ConfigError("one name for several suites", where="--name", found=", ".join(suite))
     wanted, changes = _wanted(flow, width, seeds, only), tuple(overrides or ())
-    say = None if quiet else partial(print, file=sys.stderr)
     studies = []
     for each in dict.fromkeys(suite):
-        cells = [Cell(item, changes) for item in list_suite(each, data, wanted, say)]
+        cells = [Cell(item, changes) for item in list_suite(each, data, wanted, _say(quiet))]
         note = f"Suite `{each}`: {SUITES[each].text}. Overrides of every pair: "
         note += f"{', '.join(f'`{o}`' for o in changes) or 'none'}."
         measured = partial(measure_cells, cells, measure_pair)
@@ -165,7 +169,7 @@ def search(
     """Search for better defaults and check them on the families that did not choose them."""
     suites, texts = suite or ["rendered"], params or searching.DEFAULT_SPACE
     wanted, space = _wanted(flow, width, seeds, only), searching.parse_space(texts)
-    items = [i for name in suites for i in list_suite(name, data, wanted)]
+    items = [i for name in suites for i in list_suite(name, data, wanted, _say(quiet))]
     settings = {"suite": suites, "trials": trials, "seeds": seeds, "width": width, "flow": flow}
     settings |= {"only": only, "param": params, "set": overrides}
     changes, command = tuple(overrides or ()), _command("search", data, settings)
@@ -191,6 +195,8 @@ def paper(
     changes = tuple(overrides or ())
     claim(out, FILES, overwrite)
     plan = make_plan(data, out, superpixels, analysis, limit, changes)
+    for line in pairs_found(plan):
+        _say(quiet)(line)
     settings = {"superpixels": superpixels, "analysis": analysis, "limit": limit, "set": overrides}
     note = f"Superpixels wanted: {superpixels} in the comparison, {analysis} elsewhere."
     if changes:
@@ -233,9 +239,9 @@ def speed(
     n = options.numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS)
     k = options.numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS)
     cells = timing.speed_cells(items, n, k, overrides or [])
-    measured = partial(measure_cells, cells, timing.measure_speed, own_process=True)
+    measured = partial(measure_cells, cells, timing.measure_speed)
     study = Study("table.md", measured, _text(timing.speed_page), line=timing.progress_line)
-    _run([study], out, quiet, overwrite)
+    _run([study], out, quiet, overwrite, fresh=True)
 
 
 def cost(
@@ -244,8 +250,8 @@ def cost(
     quiet: options.Quiet = False,
 ) -> None:
     """Time and memory of whole solves over N and image size, each in a process of its own."""
-    measured = partial(measure_cells, cost_cells(), measure_pair, own_process=True)
-    _run([Study("cost.md", measured, _text(cost_page))], out, quiet, overwrite)
+    measured = partial(measure_cells, cost_cells(), measure_pair)
+    _run([Study("cost.md", measured, _text(cost_page))], out, quiet, overwrite, fresh=True)
 
 
 def chain(
@@ -263,6 +269,12 @@ def chain(
         names = ", ".join(i.name for i in all_sequences)
         raise ConfigError("no sequence is left", where="--only", expected=names)
     cells = [Cell(item, tuple(overrides or ())) for item in chosen]
-    measured = partial(measure_cells, cells, measure_chain, own_process=True)
+    measured = partial(measure_cells, cells, measure_chain)
     line = lambda row: f"cost of one scale {show(row['cost'], '+.2%')}"  # noqa: E731
-    _run([Study("chain.md", measured, _text(chain_page), line=line)], out, quiet, overwrite)
+    _run(
+        [Study("chain.md", measured, _text(chain_page), line=line)],
+        out,
+        quiet,
+        overwrite,
+        fresh=True,
+    )

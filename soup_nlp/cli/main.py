@@ -127,7 +127,7 @@ COMMANDS: Mapping[str, str] = {
     "demo": "solve:demo",
     "view": "results:view",
     "check": "results:check",
-    "chain": "chain:chain",
+    "chain": "solve:chain",
     "convert": "results:convert",
     "evaluate": "results:evaluate",
     "show": "problems:show",

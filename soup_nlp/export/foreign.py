@@ -13,8 +13,8 @@ from soup_nlp.arrays import Float
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ExportError
 from soup_nlp.evaluate import recompute
-from soup_nlp.export.artefact import CHOICES, STUB, fingerprint, read_manifest
-from soup_nlp.export.nl import readable_names
+from soup_nlp.export.artefact import CHOICES, fingerprint, read_manifest
+from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import ENERGY_SLACK, Kind, Limits, examine, kind, violations
 from soup_nlp.model import oracle
@@ -27,7 +27,7 @@ from soup_nlp.pipeline.run import make_run
 from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.stages import Solution
-from soup_nlp.storage.files import as_path, read_text
+from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import recover
 
 SAME = 1e-7
@@ -84,7 +84,7 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
                 expected=repr(then),
                 hint="its images, its problem.yaml or the program have changed; export again",
             )
-    answer = read_sol(sol, *file_orders(folder, nlp, layout))
+    answer = read_sol(sol, *file_orders(nlp))
     # values at an arbitrary point may be infinite or NaN; such an answer is not verified
     with np.errstate(all="ignore"):
         run = foreign_run(case, form, nlp, layout, answer, source=Path(sol).name)
@@ -100,28 +100,6 @@ def sol_table(imported: Imported) -> list[Kind]:
         violated = recompute.constraints(state, run.data.rim_ray, facing)
     rows = [kind(k, v, KKT_LIMIT, superpixels=k != "simplex") for k, v in violated.items()]
     return rows + [kind(k, v, KKT_LIMIT, False) for k, v in imported.violations.items()]
-
-
-def file_orders(folder: Path, nlp: NLP, layout: MatrixLayout | TangentLayout) -> tuple[Any, Any]:
-    """Orders of variables and rows in the file, from its names."""
-    out = []
-    for suffix, names in zip((".col", ".row"), readable_names(nlp, layout)):
-        path = (folder / STUB).with_suffix(suffix)
-        place = {name: k for k, name in enumerate(names)}
-        try:
-            lines = read_text(path, "file of names", error=ExportError).split()[: len(names)]
-            order = np.array([place[name] for name in lines], np.int64)
-        except KeyError as error:
-            raise ExportError("names of the file cannot be used", where=path, found=error) from None
-        if len(np.unique(order)) != len(names):
-            raise ExportError(
-                "names of the file are not complete",
-                where=path,
-                found=len(np.unique(order)),
-                expected=len(names),
-            )
-        out.append(order)
-    return out[0], out[1]
 
 
 def foreign_run(

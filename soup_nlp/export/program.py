@@ -13,6 +13,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.errors import ExportError
 from soup_nlp.export.template import Template, make_template, trace
 from soup_nlp.model.kernel import Group
+from soup_nlp.model.nlp import NLP
 
 OBJECTIVE = -1
 """Row number of the objective."""
@@ -118,6 +119,11 @@ def orders(program: Program) -> tuple[Int, Int]:
     )
     variables = np.argsort(kind, kind="stable")
     return variables, np.argsort(~program.curved_rows, kind="stable")
+
+
+def file_orders(nlp: NLP) -> tuple[Int, Int]:
+    """Variables (nx,) and rows (ng,) of an NLP in the order of its .nl file."""
+    return orders(make_program(nlp.groups, nlp.nx, nlp.ng, nlp.thetas()))
 
 
 @dataclass(frozen=True)

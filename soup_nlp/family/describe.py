@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from soup_nlp.arrays import Float
 from soup_nlp.export.nl import NLFile
-from soup_nlp.export.program import make_program, orders
+from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import ACTIVE, Kind, Limits, Residuals, examine, kind, violations
 from soup_nlp.family.frozen import load_frozen
@@ -189,8 +189,7 @@ def check_sol(path: Path) -> Verdict:
     case = case_of(record)
     nlp = build_instance(case, record, instance.formulation, instance.start)[0]
     best = build_instance(case, record, instance.formulation, "best")[0].x0
-    program = make_program(nlp.groups, nlp.nx, nlp.ng, nlp.p[: len(nlp.theta)])
-    sol = read_sol(path, *orders(program))
+    sol = read_sol(path, *file_orders(nlp))
     with np.errstate(all="ignore"):
         return Verdict(
             sol,

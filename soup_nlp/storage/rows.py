@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import resource
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -69,16 +70,23 @@ def failure(reason: str) -> Row:
 def attempt(work: Callable[[], Row]) -> Row:
     """Result of `work`, with "ok", "error", "seconds" and "cpu_seconds", as plain JSON values.
 
-    An exception becomes a row with `ok` false and the reason.
+    "peak_bytes", unless the result has it, is the largest resident size of the process so far. An
+    exception becomes a row with `ok` false and the reason.
     """
     begin, cpu = time.perf_counter(), time.process_time()
     try:
         row = {"ok": True, "error": None, **work()}
+        row.setdefault("peak_bytes", peak_bytes())
     except Exception as error:
         row = failure(f"{type(error).__name__}: {error}")
     row["seconds"] = time.perf_counter() - begin
     row["cpu_seconds"] = time.process_time() - cpu
     return dict(plain(row))
+
+
+def peak_bytes() -> int:
+    """Largest resident size of this process so far, bytes."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -128,6 +136,7 @@ def measure_all(
     say: Say | None = None,
     after: Callable[[list[Row]], None] | None = None,
     any_code: bool = False,
+    fresh: bool = False,
 ) -> list[Row]:
     """The row of every job, from the file or else measured.
 
@@ -142,6 +151,8 @@ def measure_all(
         after: Called with all rows so far, in the order of the jobs, after every new row and at the
             end.
         any_code: Also use stored rows of other code versions.
+        fresh: Measure every row in a new process with one thread, so that times and peak memory
+            are those of the row only.
 
     Raises:
         DataError: the file cannot be written.
@@ -159,7 +170,7 @@ def measure_all(
     def so_far() -> list[Row]:
         return [row_of[name] for name in names if name in row_of]
 
-    for name, result in _measured(todo, workers):
+    for name, result in _measured(todo, workers, fresh):
         row_of[name] = {**plain(todo[name].name), "code": code, **plain(result)}
         append_row(path, row_of[name])
         if say:
@@ -176,9 +187,9 @@ def _identity(row: Mapping[str, Any], keys: Mapping[str, Any] | None = None) -> 
     return json.dumps(plain(named), sort_keys=True)
 
 
-def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]]:
+def _measured(todo: Mapping[str, Job], workers: int, fresh: bool) -> Iterator[tuple[str, Row]]:
     """Names and results of the jobs, in the order in which they end."""
-    if workers < 2 or not todo:
+    if not todo or not (fresh or workers > 1):
         yield from ((name, job.work()) for name, job in todo.items())
         return
     left = dict(todo)
@@ -190,7 +201,10 @@ def _measured(todo: Mapping[str, Job], workers: int) -> Iterator[tuple[str, Row]
         before = set(multiprocessing.active_children())
         # a fork of a process with threads may hang
         pool = ProcessPoolExecutor(
-            min(workers, len(again)), multiprocessing.get_context("spawn"), end_with_parent
+            min(workers, len(again)),
+            multiprocessing.get_context("spawn"),
+            end_with_parent,
+            max_tasks_per_child=1 if fresh else None,
         )
         futures: dict[Future[Row], str] = {}
         try:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers_rows import square
 
-from soup_nlp.bench.processes import alone, machine
+from soup_nlp.bench.processes import machine
 from soup_nlp.bench.speed import (
     exponent,
     growth,
-    measure_speed,
     schedule,
     speed_cells,
     speed_page,
@@ -24,7 +24,7 @@ from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.bench.tables import cost_cells, cost_page
 from soup_nlp.cli.main import main
 from soup_nlp.solve.solver_options import SolverOptions
-from soup_nlp.storage.rows import read_rows
+from soup_nlp.storage.rows import Job, attempt, measure_all, read_rows
 
 pytestmark = pytest.mark.slow
 
@@ -77,16 +77,17 @@ def test_the_plan_has_every_run_once_small_ones_first():
     assert not problems[0].refine.enabled
 
 
-def test_work_in_a_process_of_its_own(monkeypatch):
-    row = alone(partial(square, 3))
-    assert row["square"] == 9
-    assert row["process"] != os.getpid()
-    assert row["peak_bytes"] > 1e6
-    assert "out of numbers" in alone(partial(square, 4, breaks=True))["error"]
-    monkeypatch.setattr("soup_nlp.bench.processes.GRACE", 0.0)
-    cell = speed_cell("street", 60, 8)
-    late = alone(partial(measure_speed, cell), seconds=0.2)
-    assert late["error"] == "no answer after 0.2 s"
+def test_rows_of_new_processes(tmp_path, monkeypatch):
+    # the children must find the module of the function
+    monkeypatch.setenv("PYTHONPATH", str(Path(square.__code__.co_filename).parent), os.pathsep)
+    numbers = {2: False, 3: False, 4: True}
+    works = [partial(attempt, partial(square, n, breaks=b)) for n, b in numbers.items()]
+    jobs = [Job({"key": k}, work) for k, work in enumerate(works)]
+    *rows, failed_row = measure_all(jobs, tmp_path / "rows.jsonl", fresh=True)
+    assert [row["square"] for row in rows] == [4, 9]
+    assert len({os.getpid(), *(row["process"] for row in rows)}) == 3
+    assert all(row["peak_bytes"] > 1e6 for row in rows)
+    assert "out of numbers" in failed_row["error"]
     assert {"processor", "cores", "memory", "code"} <= machine().keys()
 
 

@@ -31,7 +31,7 @@ import numpy as np
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
-from soup_nlp.export.foreign import file_orders
+from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import write_sol
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.folders import digest_of, mark_of, recover
@@ -79,8 +79,8 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         run([*export, "--no-presolve", "--out", str(root / "exported")])
         problem = load_problem(root / "exported" / "problem.yaml")
         case = prepare(problem)
-        nlp, layout = case.nlp(case.formulation(hessian="exact", compiled=False))
-        write_sol(root / "a.sol", nlp.x0, None, *file_orders(root / "exported", nlp, layout))
+        nlp, _ = case.nlp(case.formulation(hessian="exact", compiled=False))
+        write_sol(root / "a.sol", nlp.x0, None, *file_orders(nlp))
     return [Command(name, words[name], out[name]) for name in names]
 
 
