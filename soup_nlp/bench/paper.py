@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -176,15 +177,13 @@ def _with_truth(suite: str, data: Path | None, sequences: tuple[str, ...] = ()) 
         items = [] if data is None else list_suite(suite, data, Options(("dis",)))
     except DataError:
         return []
-    wanted = [i for i in items if not sequences or i.sequence in sequences]
-    return [replace(i, presets=("paper", "best")) for i in wanted if _has_truth(i)]
-
-
-def _has_truth(item: Item) -> bool:
-    try:
-        return has_depth(item.problem().load_pair().truth)
-    except SoupError:
-        return False
+    out = []
+    for item in items:
+        with suppress(SoupError):
+            wanted = not sequences or item.sequence in sequences
+            if wanted and has_depth(item.problem().load_pair().truth):
+                out.append(replace(item, presets=("paper", "best")))
+    return out
 
 
 def measure_paper(cell: Cell) -> Row:

@@ -117,23 +117,17 @@ def _child(work: Callable[[], Any], target: Path, memory: int, cpu_seconds: floa
     except MemoryError:
         answer = ("killed: memory", None)
     except BaseException as error:
-        memory_gone = "bad_alloc" in str(error)
-        answer = ("killed: memory", None) if memory_gone else ("raised", _reason(error))
+        # the last line of a library's message has the cause
+        text = "".join(traceback.format_exception_only(error)).strip().rpartition("\n")[2]
+        if isinstance(error, SoupError):
+            text = f"{type(error).__name__}: {error.what}"
+            text += "" if error.found is None else f", found {error.found}"
+        answer = ("killed: memory", None) if "bad_alloc" in str(error) else ("raised", text)
     scopes = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
     peak = max(resource.getrusage(scope).ru_maxrss for scope in scopes)
     part = target.with_suffix(".part")
     part.write_bytes(pickle.dumps((*answer, peak * 1024)))
     part.rename(target)
-
-
-def _reason(error: BaseException) -> str:
-    """An exception in one line."""
-    if isinstance(error, SoupError):
-        detail = "" if error.found is None else f", found {error.found}"
-        return f"{type(error).__name__}: {error.what}{detail}"
-    # the last line of a library's message has the cause
-    text = "".join(traceback.format_exception_only(error)).strip().splitlines()
-    return text[-1] if text else type(error).__name__
 
 
 def processor() -> str:

@@ -15,7 +15,6 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from soup_nlp.arrays import Float
-from soup_nlp.export.nl import NLFile
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import ACTIVE, Kind, Limits, Residuals, examine, kind, violations
@@ -121,12 +120,6 @@ def qualification(nlp: NLP, x: Float) -> dict[str, Any]:
         "variables_on_bounds": int(len(x) - off.sum()),
         "licq": active_rank == int(active.sum()),
     }
-
-
-def sizes(nlp: NLP, file: NLFile) -> dict[str, Any]:
-    """Counts of variables, rows, nonzeros and nonlinear parts."""
-    finite = np.isfinite(nlp.lbx) | np.isfinite(nlp.ubx)
-    return {**nlp.sizes(), "bounded_variables": int(finite.sum()), **file.counts}
 
 
 # --- answers of solvers --------------------------------------------------------------------------

@@ -194,18 +194,12 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     )
     data, weights = build_energy(problem, pair, seg, start)
     options = solver_options(problem, start)
-    data = rounded_data(replace(data, prior_weight=record.prior_weight))
+    data = replace(data, prior_weight=record.prior_weight)
+    values = {f.name: np.asarray(getattr(data, f.name)) for f in fields(data)}
+    reals: dict[str, Any] = {k: rounded(v) for k, v in values.items() if v.dtype == np.float64}
+    data = replace(data, **reals)
     weights = record.weights(weights)
     return Case(problem, pair, seg, start, data, weights, start.soup, options, seen=pair)
-
-
-def rounded_data(data: EnergyData) -> EnergyData:
-    """The energy data with all real numbers rounded."""
-    values = {f.name: getattr(data, f.name) for f in fields(data)}
-    reals: dict[str, Any] = {
-        k: rounded(v) for k, v in values.items() if np.asarray(v).dtype == np.float64
-    }
-    return replace(data, **reals)
 
 
 def build_instance(

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from soup_nlp import __version__
 from soup_nlp.data.pair import Pair
@@ -19,7 +20,7 @@ from soup_nlp.export.nl import NLFile, readable_names, write_nl
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import examine
 from soup_nlp.family import run_solver
-from soup_nlp.family.describe import CLASSES, classes, classification, qualification, sizes
+from soup_nlp.family.describe import CLASSES, classes, classification, qualification
 from soup_nlp.family.frozen import Frozen, load_frozen
 from soup_nlp.family.instances import VERSION, Instance, build_instance, case_of, problems
 from soup_nlp.model.nlp import NLP
@@ -77,24 +78,24 @@ def write_family(
                 shared = shared or _solved(folder, case, record, instance, file, known)
                 entries.append(_entry(instance, nlp, file, shared, known))
                 programs.append(nlp)
-                say(_line(entries[-1]))
+                changed = "  NOT the published bytes" * (entries[-1]["published"] is False)
+                say(
+                    f"{file.path.name:<52} n {nlp.nx:>6}  m {nlp.ng:>6}"
+                    f"  {file.size / 1e6:5.1f} MB{changed}"
+                )
             write_text(folder / f"{starts[0].problem}.casadi", as_casadi(programs))
     index = {"set": "SOUP", "version": VERSION, "generator": f"soup_nlp {__version__}"}
     write_json(folder / "index.json", {**index, "instances": entries})
-    write_text(folder / "instancedata.csv", as_csv([instance_data(e) for e in entries]))
+    rows = [instance_data(e) for e in entries]
+    table = io.StringIO()
+    writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n", delimiter=";")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(folder / "instancedata.csv", table.getvalue())
     write_text(folder / "run.py", Path(run_solver.__file__).read_text(encoding="utf-8"))
     write_text(folder / "README.md", readme(entries))
     write_text(folder / "LICENSE.txt", _file("LICENSE.txt"))
     return entries
-
-
-def _line(entry: Mapping[str, Any]) -> str:
-    """An instance as one line of text."""
-    changed = "  NOT the published bytes" if entry["published"] is False else ""
-    return (
-        f"{entry['file']:<52} n {entry['variables']:>6}  m {entry['constraints']:>6}"
-        f"  {entry['bytes'] / 1e6:5.1f} MB{changed}"
-    )
 
 
 def _solved(
@@ -120,7 +121,9 @@ def _solved(
     r = examine(nlp, x, None).residuals
     return {
         "superpixels": len(case),
-        **sizes(nlp, file),
+        **nlp.sizes(),
+        "bounded_variables": int((np.isfinite(nlp.lbx) | np.isfinite(nlp.ubx)).sum()),
+        **file.counts,
         **kinds,
         "classification": classification(nlp, kinds),
         **qualification(nlp, x),
@@ -213,15 +216,6 @@ def instance_data(entry: Mapping[str, Any]) -> Entry:
     }
 
 
-def as_csv(rows: Sequence[Entry]) -> str:
-    """Rows as a table in the form of MINLPLib, separated by semicolons."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, list(rows[0]), lineterminator="\n", delimiter=";")
-    writer.writeheader()
-    writer.writerows(rows)
-    return out.getvalue()
-
-
 # --- README of the folder -------------------------------------------------------------------------
 
 COLUMNS: Mapping[str, Callable[[Entry], str]] = {
@@ -235,13 +229,12 @@ COLUMNS: Mapping[str, Callable[[Entry], str]] = {
     "best known": lambda e: f"{e['best_known']['objective']:.8g}",
     "dual inf.": lambda e: f"{e['best_known']['dual']:.0e}",
     "found by": lambda e: str(e["best_known"]["found_by"] or "soup_nlp"),
-    "reached by": lambda e: _share(e["best_known"]),
+    "reached by": lambda e: (
+        f"{len(e['best_known']['reached_by'])} of {len(tried)} solvers"
+        if (tried := e["best_known"]["tried_by"])
+        else "not measured"
+    ),
 }
-
-
-def _share(best: Entry) -> str:
-    tried, reached = best["tried_by"], best["reached_by"]
-    return f"{len(reached)} of {len(tried)} solvers" if tried else "not measured"
 
 
 def _reached(entries: Sequence[Entry]) -> list[str]:

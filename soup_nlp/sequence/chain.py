@@ -109,18 +109,11 @@ class Link:
 
 
 def link(
-    first: int,
-    second: int,
-    one: Float,
-    other: Float,
-    keep: Mask,
-    *,
-    bridge: bool = False,
-    flagged: bool = False,
+    ends: tuple[int, int], one: Float, other: Float, keep: Mask, flagged: bool = False
 ) -> Link | None:
     """The link of depth maps `one` and `other` (H, W) of a frame; None without a shared pixel.
 
-    `keep` (H, W) is the mask of used pixels; for the other arguments see `Link`.
+    `ends` are the numbers of the pairs, `keep` (H, W) is the mask of used pixels.
     """
     with np.errstate(invalid="ignore"):
         both = keep & (one > 0) & (other > 0)
@@ -130,7 +123,7 @@ def link(
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
     pixels = int(both.sum())
-    return Link(first, second, middle, spread, pixels, bridge, flagged or pixels < MIN_PIXELS)
+    return Link(*ends, middle, spread, pixels, flagged=flagged or pixels < MIN_PIXELS)
 
 
 def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
@@ -146,26 +139,22 @@ def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
             for frame in {first.first, first.second} & {second.first, second.second}:
                 (z1, keep1), (z2, keep2) = first.view(frame), second.view(frame)
                 guess = first.still or second.still
-                shared = link(a, b, z1, z2, keep1 & keep2, flagged=guess)
-                out.append(shared or link(a, b, z1, z2, np.ones_like(keep1), flagged=True))
+                shared = link((a, b), z1, z2, keep1 & keep2, guess)
+                out.append(shared or link((a, b), z1, z2, np.ones_like(keep1), flagged=True))
     # consecutive pairs are the first of those that start at a frame
     at = {pair.first: b for b, pair in reversed([*enumerate(pairs)])}
     for a, pair in enumerate(pairs):
         frame, (z, keep) = pair.second, pair.view(pair.second)
         while not pair.still and frame in at and pairs[at[frame]].still:
-            z, keep = _carry(z, keep, pairs[at[frame]])
-            frame = pairs[at[frame]].second
+            still = pairs[at[frame]]
+            source, static = still.result.reconstruction.source_next, still.result.components
+            keep = (source >= 0) & (keep & (static.of_pixel == 0)).ravel()[source]
+            z, frame = np.where(keep, z.ravel()[source], np.nan), still.second
         if frame > pair.second and frame in at:
             other, sure = pairs[at[frame]].view(frame)
-            out.append(link(a, at[frame], z, other, keep & sure, bridge=True))
+            bridge = link((a, at[frame]), z, other, keep & sure)
+            out.append(bridge and replace(bridge, bridge=True))
     return [shared for shared in out if shared]
-
-
-def _carry(z: Float, keep: Mask, still: SolvedPair) -> tuple[Float, Mask]:
-    """z (H, W) and mask of the reference frame of a pair without parallax, in its next frame."""
-    source = still.result.reconstruction.source_next
-    seen = (source >= 0) & (keep & (still.result.components.of_pixel == 0)).ravel()[source]
-    return np.where(seen, z.ravel()[source], np.nan), seen
 
 
 def solve_scales(total: int, links: Sequence[Link]) -> Float:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Image
+from soup_nlp.arrays import Image
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.models import GLTF
@@ -147,7 +147,11 @@ def write_animation(path: PathLike, chain: Chain, contents: Mapping[str, Any]) -
 
     def animate(node: int, poses: Sequence[RigidMotion]) -> None:
         shifts = np.array([GLTF @ p.t for p in poses])
-        for what, values in (("translation", shifts), ("rotation", _quaternions(poses))):
+        turns = np.array([RigidMotion(GLTF @ p.R @ GLTF, p.t).quaternion for p in poses])
+        # neighbours in one half of the sphere
+        signs = np.where((turns[1:] * turns[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        turns[1:] *= np.cumprod(signs)[:, None]
+        for what, values in (("translation", shifts), ("rotation", turns)):
             samplers.append({"input": times, "output": add(values), "interpolation": "LINEAR"})
             target = {"node": node, "path": what}
             channels.append({"sampler": len(samplers) - 1, "target": target})
@@ -167,7 +171,13 @@ def write_animation(path: PathLike, chain: Chain, contents: Mapping[str, Any]) -
         cloud = kept(cloud, cloud.label == track)
         if len(cloud):
             show(cloud, f"track {track}")
-            animate(len(nodes) - 1, _from_first(chain, track, first))
+            members = chain.members(track)
+            poses = [RigidMotion(np.eye(3), np.zeros(3))] * (first + 1)
+            # the track rests before its first frame, and where a pair does not show it
+            for k in range(first, len(chain.pairs)):
+                now = poses[-1]
+                poses.append(chain.motion(k, members[k].label) @ now if k in members else now)
+            animate(len(nodes) - 1, poses)
     K, (height, width) = chain.camera(0), chain.image(0).shape[:2]
     optics = {
         "yfov": 2 * float(np.arctan(height / 2 / K[1, 1])),
@@ -213,21 +223,3 @@ def _glb(tree: Mapping[str, Any], arrays: Sequence[NDArray[Any]]) -> bytes:
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(data), b"BIN\0") + data
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
-def _from_first(chain: Chain, track: int, first: int) -> list[RigidMotion]:
-    """Motion of a track from its first frame to every frame; it rests before and after."""
-    members = chain.members(track)
-    poses = [RigidMotion(np.eye(3), np.zeros(3))] * (first + 1)
-    for k in range(first, len(chain.pairs)):
-        now = poses[-1]
-        poses.append(chain.motion(k, members[k].label) @ now if k in members else now)
-    return poses
-
-
-def _quaternions(poses: Sequence[RigidMotion]) -> Float:
-    """(M, 4) x, y, z, w in the axes of glTF, neighbours in one half of the sphere."""
-    out = np.array([RigidMotion(GLTF @ p.R @ GLTF, p.t).quaternion for p in poses])
-    turns = np.where((out[1:] * out[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    out[1:] *= np.cumprod(turns)[:, None]
-    return out

@@ -51,16 +51,16 @@ def test_the_link_of_two_maps_is_their_median_ratio():
     # a fifth is far off, some is unknown
     other[:6] *= 3
     other[6:8] = np.nan
-    found = link(2, 3, one, other, np.ones(one.shape, bool))
+    found = link((2, 3), one, other, np.ones(one.shape, bool))
     assert (found.first, found.second, found.pixels) == (2, 3, 28 * 40)
     # the median of noise of 0.02, moved by the fifth on one side: less than one of its deviations
     assert found.log_ratio == pytest.approx(np.log(1.3), abs=0.02)
     assert 0.02 < found.spread < 0.04
     assert not found.flagged
-    assert link(0, 1, one, other, np.zeros(one.shape, bool)) is None
+    assert link((0, 1), one, other, np.zeros(one.shape, bool)) is None
     few = np.zeros(one.shape, bool)
     few[10, :20] = True
-    assert link(0, 1, one, other, few).flagged
+    assert link((0, 1), one, other, few).flagged
 
 
 def test_scales_follow_their_links():
