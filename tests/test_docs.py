@@ -23,7 +23,7 @@ from pydantic import BaseModel, Field
 from test_layers import ALLOWED
 
 from soup_nlp.bench.solvers.plugins import Task
-from soup_nlp.bench.solvers.registry import find_solver
+from soup_nlp.bench.solvers.runner import find_solver
 from soup_nlp.cli.main import app
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.sources import flow_sources, resolve_flow

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from soup_nlp.bench.solvers import runner
 from soup_nlp.bench.solvers.page import (
     FILES,
     OF_FAMILY,
@@ -15,9 +16,6 @@ from soup_nlp.bench.solvers.page import (
     page,
     write_pictures,
 )
-from soup_nlp.bench.solvers.registry import available, find_solver
-from soup_nlp.bench.solvers.runner import compare as run_all
-from soup_nlp.bench.solvers.runner import family_tasks, is_family, problem_task
 from soup_nlp.cli import options
 from soup_nlp.cli.options import option, out_option
 from soup_nlp.config.problem import load_problem, title
@@ -52,15 +50,15 @@ def compare(
             where="compare",
             found=f"{seconds:g} s, {iterations} iterations",
         )
-    names = [*available()] if solvers == "all" else options.listed(solvers)
+    names = [*runner.available()] if solvers == "all" else options.listed(solvers)
     if not names:
         raise ConfigError("no solver is named", where="--solvers", found=solvers)
     for name in names:
-        find_solver(name)
+        runner.find_solver(name)
     parse_formulations(None, coordinates)
     limits = Limits(seconds, iterations)
     # prepare all problems first: a wrong file must not stop after hours of runs
-    sets = [path for path in problems if is_family(path)]
+    sets = [path for path in problems if runner.is_family(path)]
     chosen = [load_problem(path, overrides or []) for path in problems if path not in sets]
     subjects = [f"family {path.absolute()}" for path in sets] + [p.subject for p in chosen]
     subject = ", ".join(dict.fromkeys(subjects))
@@ -68,8 +66,8 @@ def compare(
     out = out or default_folder(title(f"solvers-{'-'.join(names_of)}"), subject)
     written = (*FILES, *(OF_FAMILY if sets else ()))
     folder = claim(out, written, overwrite, subject)
-    tasks = [task for path in sets for task in family_tasks(path, limits)]
-    tasks += [problem_task(prepare(problem), limits, coordinates) for problem in chosen]
+    tasks = [task for path in sets for task in runner.family_tasks(path, limits)]
+    tasks += [runner.problem_task(prepare(problem), limits, coordinates) for problem in chosen]
     rows: list[Row] = []
 
     def keep(new_rows: list[Row]) -> None:
@@ -81,7 +79,7 @@ def compare(
     kept = options.resumable("the runs that were finished are kept, with a page of them", folder)
     try:
         with kept, scratch() as temporary:
-            run_all(tasks, names, limits, folder / "runs.jsonl", temporary, print, keep)
+            runner.compare(tasks, names, limits, folder / "runs.jsonl", temporary, print, keep)
     finally:
         # the runs that were finished before an interruption have pictures, too
         if rows:

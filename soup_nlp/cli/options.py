@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 from rich.console import Console
@@ -69,8 +69,8 @@ Folder = Annotated[Path, typer.Argument(help="Folder of a result or a chain.")]
 Presolve = Annotated[bool, option("Start at the presolve's answer, not at the initialisation.")]
 FORMULATIONS = "gauge/norm, e.g. unit-translation/epigraph; may be repeated."
 Formulations = Annotated[Words, option(FORMULATIONS, "--formulation")]
-COORDINATES = "matrix, or tangent: nine per superpixel about the initialisation, without gauge."
-Coordinates = Annotated[str, option(COORDINATES)]
+COORDINATES = "tangent: nine per superpixel about the initialisation, without gauge."
+Coordinates = Annotated[Literal["matrix", "tangent"], option(COORDINATES)]
 Superpixels = Annotated[
     list[int] | None, option("Number of superpixels, 50 to 2000; may be repeated.")
 ]

@@ -6,7 +6,7 @@ import webbrowser
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -74,16 +74,11 @@ def evaluate(
     depth: Annotated[
         Path, option("True depth: .dpt, .npy, .pfm, 16-bit .png; of a chain their folder.")
     ],
-    scale: Annotated[str, option("median, mre, lsq or none.")] = "median",
+    scale: Annotated[Scale, option("Rule of the one global scale.")] = "median",
     cap: Annotated[float | None, option("Drop truth beyond this depth.")] = None,
     depth_scale: Annotated[float | None, option(options.DEPTH_SCALE.format("a .png"))] = None,
 ) -> None:
     """Score a result against a truth file."""
-    rules = get_args(Scale)
-    if scale not in rules:
-        raise ConfigError(
-            "unknown scale rule", where="--scale", found=scale, expected=", ".join(rules)
-        )
     if is_chain(folder):
         if scale != "median" or cap is not None:
             raise ConfigError(
@@ -95,8 +90,7 @@ def evaluate(
         truths = [read_depth(path, depth_scale) for path in depth_files(depth)]
         print("\n".join(score_lines(score(read_chain(folder)[0], truths))))
         return
-    rule = cast(Scale, scale)
-    scores = evaluate_folder(folder, depth, scale=rule, cap=cap, depth_scale=depth_scale)
+    scores = evaluate_folder(folder, depth, scale=scale, cap=cap, depth_scale=depth_scale)
     print(protocol(scores), *accuracy(scores), sep="\n")
 
 

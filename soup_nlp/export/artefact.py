@@ -39,7 +39,7 @@ EXPORT_FILES = (
     MANIFEST,
 )
 """Files that an export may write."""
-FORMATS = ("nl", "casadi", "h5")
+Format = Literal["nl", "casadi", "h5"]
 STATIONARY = 1e-3
 """Largest dual infeasibility of a start whose multipliers are written."""
 START = """
@@ -93,18 +93,14 @@ def parse_formulation(text: str) -> dict[str, str]:
     return out
 
 
-def parse_formulations(texts: Sequence[str] | None, coordinates: str) -> list[dict[str, str]]:
+def parse_formulations(
+    texts: Sequence[str] | None, coordinates: Coordinates
+) -> list[dict[str, str]]:
     """Formulations of the command line, all of them in the coordinates.
 
     Raises:
         ConfigError: a word is unknown, or a gauge is named for tangent coordinates.
     """
-    known = get_args(Coordinates)
-    if coordinates not in known:
-        expected = ", ".join(known)
-        raise ConfigError(
-            "unknown coordinates", where="--coordinates", found=coordinates, expected=expected
-        )
     forms = [parse_formulation(text) for text in texts or []] or [{}]
     if coordinates == TANGENT:
         for form in forms:
@@ -126,7 +122,7 @@ def export_case(
     case: Case,
     form: Formulation,
     folder: Path,
-    formats: Sequence[str] = ("nl",),
+    formats: Sequence[Format] = ("nl",),
     presolved: bool = False,
     overwrite: bool = False,
     suffixes: bool = False,
@@ -139,28 +135,22 @@ def export_case(
         case: Problem with its start.
         form: Gauge and norm; the Hessian in the files is exact.
         folder: Output folder.
-        formats: Some of FORMATS; nl is always written, and casadi includes h5.
+        formats: Formats of files; nl is always written, and casadi includes h5.
         presolved: The case starts at the answer of the presolve (for the manifest).
         overwrite: Overwrite files that the program did not make.
         suffixes: Write the suffixes of `nl.suffixes_of`, which CasADi's reader does not accept.
 
     Raises:
-        ConfigError: a format is unknown.
         DataError: the folder cannot be written, or holds a file of the user with the same name.
         ExportError: the NLP cannot be written.
     """
-    for word in formats:
-        if word not in FORMATS:
-            raise ConfigError(
-                "unknown format", where="--format", found=word, expected=", ".join(FORMATS)
-            )
     form = form.replace(hessian="exact", compiled=False)
     nlp, layout = case.nlp(form)
     target = claim(folder, EXPORT_FILES, overwrite, case.problem.subject)
     with staged(target, True, overwrite, case.problem.subject) as new:
         names = readable_names(nlp, layout)
         duals = examine(nlp, nlp.x0, None) if presolved else None
-        if duals is not None and not duals.residuals.dual <= STATIONARY:
+        if duals is not None and not duals.dual <= STATIONARY:
             # multipliers of a point that is not stationary mislead
             duals = None
         kinds, segments = suffixes_of(nlp, names)

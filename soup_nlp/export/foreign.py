@@ -115,8 +115,7 @@ def foreign_run(
     It has converged if the solver claims success, the recomputed KKT residuals are within LIMITS
     and KKT_LIMIT, and the exact energy is not above that of the proposal.
     """
-    examined = examine(nlp, answer.x, answer.lam_g)
-    r = examined.residuals
+    r = examine(nlp, answer.x, answer.lam_g)
     point = layout.unpack(answer.x)
     soup = point.retracted()
     start, energy = (oracle.energy(s, case.data, case.weights) for s in (case.start.soup, soup))
@@ -133,8 +132,8 @@ def foreign_run(
         status=status,
         converged=good,
         x=answer.x,
-        lam_x=examined.lam_x,
-        lam_g=examined.lam_g,
+        lam_x=r.lam_x,
+        lam_g=r.lam_g,
         objective=nlp.value(answer.x),
         iterations=0,
         seconds=0.0,
@@ -142,7 +141,7 @@ def foreign_run(
         calls={},
     )
     parts = {
-        f"lam_g_{group.kernel.name}": examined.lam_g[np.unique(group.table.rows)]
+        f"lam_g_{group.kernel.name}": r.lam_g[np.unique(group.table.rows)]
         for group in nlp.groups
         if group.kernel.nc
     }
@@ -157,7 +156,7 @@ def foreign_run(
         energy_start=start,
         energy=energy,
         residuals=rest,
-        multipliers={"lam_x": examined.lam_x, **parts},
+        multipliers={"lam_x": r.lam_x, **parts},
         nlp=nlp.sizes(),
         description=str(nlp),
         seconds={},

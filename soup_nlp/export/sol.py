@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -13,7 +14,7 @@ from soup_nlp.errors import ExportError, printable
 from soup_nlp.export.template import number
 from soup_nlp.storage.files import as_path, read_bytes, write_text
 
-N = TypeVar("N", int, float)
+T = TypeVar("T")
 
 OPTIONS = "Options"
 """Line after the message."""
@@ -54,46 +55,6 @@ class Sol:
         return CLASSES[self.code // 100] if 0 <= self.code < 600 else "unknown"
 
 
-class _Lines:
-    """Reader of the lines of a file, with line numbers in error messages."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.at = path, 0
-        content = read_bytes(path, "solution file", error=ExportError, most=MOST_BYTES)
-        self.lines = content.decode("utf-8", errors="replace").split("\n")
-        if not self.lines[-1]:
-            self.lines.pop()
-
-    def next(self, expected: str) -> str:
-        if self.at >= len(self.lines):
-            raise ExportError(
-                "solution file ends early",
-                where=f"{self.path}, line {self.at}",
-                expected=expected,
-                hint="was the solver stopped before its end?",
-            )
-        self.at += 1
-        return self.lines[self.at - 1].strip()
-
-    def numbers(self, count: int, expected: str, kind: type[N]) -> list[N]:
-        out = []
-        for _ in range(count):
-            text = self.next(expected)
-            try:
-                out.append(kind(text))
-            except ValueError:
-                raise self.wrong(text, expected) from None
-        return out
-
-    def wrong(self, found: str, expected: str) -> ExportError:
-        return ExportError(
-            "solution file is not in AMPL's text format",
-            where=f"{self.path}, line {self.at}",
-            found=found[:60],
-            expected=expected,
-        )
-
-
 def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     """Read a .sol file.
 
@@ -103,19 +64,49 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
         ExportError: the file is missing, is not a .sol in text format, has no point, or belongs to
             a problem of another size.
     """
-    lines = _Lines(as_path(path, "solution file", error=ExportError))
+    path = as_path(path, "solution file", error=ExportError)
+    content = read_bytes(path, "solution file", error=ExportError, most=MOST_BYTES)
+    lines = content.decode("utf-8", errors="replace").rstrip("\n").split("\n")
+    at = 0
+
+    def wrong(found: str, expected: str) -> ExportError:
+        return ExportError(
+            "solution file is not in AMPL's text format",
+            where=f"{path}, line {at}",
+            found=found[:60],
+            expected=expected,
+        )
+
+    def take(count: int, expected: str, kind: Callable[[str], T]) -> list[T]:
+        """The next lines, of which each holds a value of a kind."""
+        nonlocal at
+        out = []
+        for _ in range(count):
+            if at >= len(lines):
+                raise ExportError(
+                    "solution file ends early",
+                    where=f"{path}, line {at}",
+                    expected=expected,
+                    hint="was the solver stopped before its end?",
+                )
+            text, at = lines[at].strip(), at + 1
+            try:
+                out.append(kind(text))
+            except ValueError:
+                raise wrong(text, expected) from None
+        return out
+
     message = []
-    while (line := lines.next(OPTIONS)) != OPTIONS:
+    while (line := take(1, OPTIONS, str)[0]) != OPTIONS:
         # the file may contain control characters
         message.append(printable(line))
     said = [line for line in message if line]
-    (count,) = lines.numbers(1, "number of options", int)
+    (count,) = take(1, "number of options", int)
     # a count above 4 announces a tolerance
     tolerance = count > 4
-    for _ in range(count - 2 * tolerance):
-        lines.next("an option")
-    sizes = lines.numbers(4, "number of constraints, duals, variables, values", int)
-    lines.numbers(int(tolerance), "tolerance", float)
+    take(count - 2 * tolerance, "an option", str)
+    sizes = take(4, "number of constraints, duals, variables, values", int)
+    take(int(tolerance), "tolerance", float)
     if (sizes[0], sizes[2]) != (len(rows), len(variables)):
         raise ExportError(
             "solution is for another problem",
@@ -130,17 +121,17 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
             found=f"{sizes[3]} of {len(variables)} values, {sizes[1]} duals",
             hint="; ".join(said) or None,
         )
-    y = np.array(lines.numbers(sizes[1], "a dual value", float))
-    z = np.array(lines.numbers(sizes[3], "a value of a variable", float))
+    y = np.array(take(sizes[1], "a dual value", float))
+    z = np.array(take(sizes[3], "a value of a variable", float))
     if not (np.isfinite(y).all() and np.isfinite(z).all()):
         raise ExportError("solution is not finite", where=path, hint="; ".join(said) or None)
     code = -1
     # suffixes are ignored: multipliers of the bounds are computed from the point
-    for line in lines.lines[lines.at :]:
+    for line in lines[at:]:
         words = line.split()
         if words[:1] == ["objno"]:
             if len(words) < 3 or not words[2].lstrip("-").isdigit():
-                raise lines.wrong(line, "objno, objective, code")
+                raise wrong(line, "objno, objective, code")
             code = int(words[2])
     x = np.empty(len(variables))
     x[variables] = z

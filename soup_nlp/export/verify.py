@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import sparse
@@ -47,7 +47,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Residuals:
-    """KKT residuals of a point, unscaled.
+    """KKT residuals of a point, unscaled, with its multipliers.
 
     Attributes:
         primal: Largest violation of a bound or a row.
@@ -55,12 +55,16 @@ class Residuals:
         complementarity: Largest product of a gap and its multiplier.
         multipliers: Origin of lam_g, "solver" or "least squares", whichever gives the smaller
             residuals; "none" if derivatives at the point are not finite.
+        lam_x: (nx,) multipliers of the bounds.
+        lam_g: (ng,) multipliers of the rows.
     """
 
     primal: float
     dual: float
     complementarity: float
     multipliers: str
+    lam_x: Float = field(repr=False)
+    lam_g: Float = field(repr=False)
 
     def within(self, limits: Limits) -> bool:
         """Whether the residuals are small enough for a verified answer."""
@@ -69,21 +73,6 @@ class Residuals:
             and self.dual <= SLACK * limits.tol
             and self.complementarity <= SLACK * limits.tol
         )
-
-
-@dataclass(frozen=True)
-class Optimality:
-    """Residuals of a point with their multipliers.
-
-    Attributes:
-        residuals: Residuals of point and multipliers.
-        lam_x: (nx,) multipliers of the bounds.
-        lam_g: (ng,) multipliers of the rows.
-    """
-
-    residuals: Residuals
-    lam_x: Float
-    lam_g: Float
 
 
 def violations(nlp: NLP, x: Float) -> dict[str, Float]:
@@ -97,7 +86,7 @@ def violations(nlp: NLP, x: Float) -> dict[str, Float]:
     return {k: np.maximum(0.0, np.where(np.isnan(v), np.inf, v)) for k, v in outside.items()}
 
 
-def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
+def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Residuals:
     """Residuals of a point x (nx,) with the multipliers lam_g (ng,) or with least-squares ones.
 
     The multipliers with the smaller residuals are used. Those of the bounds follow from the point.
@@ -107,7 +96,7 @@ def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
     nothing = np.zeros(nlp.ng)
     values = nlp.value(x), nlp.gradient(x), nlp.constraints(x), nlp.jacobian_nonzeros(x)
     if not all(np.isfinite(v).all() for v in values):
-        return Optimality(Residuals(primal, np.inf, np.inf, "none"), np.zeros(nlp.nx), nothing)
+        return Residuals(primal, np.inf, np.inf, "none", np.zeros(nlp.nx), nothing)
     candidates = {"least squares": least_squares_multipliers(nlp, x)}
     if lam_g is not None:
         candidates["solver"] = lam_g
@@ -121,8 +110,8 @@ def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Optimality:
             np.inf if np.isnan(off[key]) else off[key]
             for key in ("dual_infeasibility", "complementarity")
         )
-        examined.append(Optimality(Residuals(primal, dual, gap, name), lam_x, lam))
-    return min(examined, key=lambda o: max(o.residuals.dual, o.residuals.complementarity))
+        examined.append(Residuals(primal, dual, gap, name, lam_x, lam))
+    return min(examined, key=lambda r: max(r.dual, r.complementarity))
 
 
 def bound_multipliers(nlp: NLP, x: Float, lam_g: Float) -> Float:

@@ -188,7 +188,7 @@ def check_sol(path: Path) -> Verdict:
             sol,
             nlp.value(sol.x),
             nlp.value(best),
-            examine(nlp, sol.x, sol.lam_g).residuals,
+            examine(nlp, sol.x, sol.lam_g),
             [kind(k, v, FEASIBLE, False) for k, v in violations(nlp, sol.x).items()],
         )
 

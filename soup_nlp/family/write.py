@@ -118,7 +118,7 @@ def _solved(
     kinds = classes(nlp)
     solved = dict(known["solved"].get(instance.problem, {}))
     runs = solved.pop("runs", {})
-    r = examine(nlp, x, None).residuals
+    r = examine(nlp, x, None)
     return {
         "superpixels": len(case),
         **nlp.sizes(),

@@ -17,8 +17,7 @@ from helpers_model import PAPER, Tiny
 from soup_nlp.bench.processes import isolated
 from soup_nlp.bench.solvers import runner
 from soup_nlp.bench.solvers.plugins import PLUGINS, Answer, Task
-from soup_nlp.bench.solvers.registry import available, executable, find_solver, reference
-from soup_nlp.bench.solvers.runner import compare
+from soup_nlp.bench.solvers.runner import available, compare, executable, find_solver, reference
 from soup_nlp.errors import SolverError
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, violations
@@ -153,7 +152,7 @@ def test_a_reference_solver_returns_a_point_of_the_epigraph_form():
     # with the slack variables of the start it is off the constraints
     stale = np.concatenate([x[:size], task.nlp.x0[size:]])
     assert violations(task.nlp, stale)["rows"].max() > 1e-3
-    assert examine(task.nlp, x, None).residuals.primal < 1e-6
+    assert examine(task.nlp, x, None).primal < 1e-6
 
 
 def test_names_of_solvers(tmp_path):
@@ -181,7 +180,7 @@ def test_a_program_runs_in_a_folder_of_its_own(task, tmp_path, monkeypatch):
 
 def test_a_program_that_only_waits_has_no_answer(task, tmp_path, monkeypatch):
     # it uses no CPU time, so that wall time ends it
-    monkeypatch.setattr("soup_nlp.bench.solvers.registry.WALL_PER_CPU", 1.0)
+    monkeypatch.setattr("soup_nlp.bench.solvers.plugins.WALL_PER_CPU", 1.0)
     mine = program(tmp_path, "exec sleep 30")
     (row,) = run(replace(task, limits=replace(task.limits, seconds=1.0)), [str(mine)], tmp_path)
     assert row["status"] == "Time_Limit"
@@ -194,12 +193,12 @@ def test_a_program_that_only_waits_has_no_answer(task, tmp_path, monkeypatch):
 
 def test_residuals_of_known_points(task):
     nlp = task.nlp
-    start = examine(nlp, nlp.x0, None).residuals
+    start = examine(nlp, nlp.x0, None)
     assert start.primal < 1e-9
     assert start.dual > 1e-2
     assert not start.within(task.limits)
     # multipliers that are not numbers are not used
-    residuals = examine(nlp, nlp.x0, np.full(nlp.ng, np.nan)).residuals
+    residuals = examine(nlp, nlp.x0, np.full(nlp.ng, np.nan))
     assert residuals.multipliers == "least squares"
 
 

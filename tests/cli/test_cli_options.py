@@ -73,16 +73,6 @@ def test_a_folder_of_inputs_is_no_output_folder(tmp_path, capsys):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("name", ["flow.png", "config.yaml", "depth_ref.png"])
-def test_files_of_no_result_are_not_overwritten(name, tmp_path, capsys):
-    args = foreign(tmp_path / "pair")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / name).write_text("precious")
-    assert main([*args, "--out", str(tmp_path / "out")]) == 2
-    assert name in capsys.readouterr().err
-    assert [p.read_text() for p in (tmp_path / "out").iterdir()] == ["precious"]
-
-
 def test_an_input_in_a_result_folder_is_not_overwritten(solved, tmp_path, capsys):
     args, out = solved[0], shutil.copytree(solved[1], tmp_path / "out")
     flow = ["--flow", str(out / "flow.png")]

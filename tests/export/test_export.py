@@ -170,11 +170,11 @@ def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
 def test_a_point_with_nan_is_not_verified(exported, optimum):
     _, nlp, _, _, _ = problem_of(exported)
     x, lam = optimum
-    assert examine(nlp, x, lam).residuals.within(Limits())
+    assert examine(nlp, x, lam).within(Limits())
     bad = x.copy()
     bad[3] = np.nan
     assert violations(nlp, bad)["bounds"].max() == np.inf
-    found = examine(nlp, bad, lam).residuals
+    found = examine(nlp, bad, lam)
     assert (found.primal, found.dual, found.multipliers) == (np.inf, np.inf, "none")
     assert not found.within(Limits())
 
@@ -251,7 +251,8 @@ def test_options_are_checked(tmp_path, capsys):
             parse_formulation(text)
     assert write(tmp_path, "--formulation", "nothing") == 2
     assert write(tmp_path, "--superpixels", "12", "--format", "mps") == 2
-    assert "nl, casadi, h5" in capsys.readouterr().err
+    assert "'mps' is not one of 'nl', 'casadi', 'h5'" in capsys.readouterr().err
+    assert write(tmp_path, "--coordinates", "euler") == 2
     assert not list(tmp_path.rglob("manifest.json"))
 
 

@@ -56,14 +56,6 @@ def test_sizes_of_equal_number_have_their_own_folders(tmp_path, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 1
 
 
-@pytest.mark.parametrize("name", ["problem.yaml", "manifest.json"])
-def test_files_of_the_user_are_not_overwritten(name, tmp_path, capsys):
-    (tmp_path / name).write_text("precious")
-    assert write(tmp_path, "--superpixels", "9") == 2
-    assert f"found: {name}" in capsys.readouterr().err
-    assert [p.read_text() for p in tmp_path.iterdir()] == ["precious"]
-
-
 def test_the_start_of_a_presolved_export_is_where_solvers_start(tmp_path, capsys):
     assert write(tmp_path, "--superpixels", "12", "--presolve", "-q") == 0
     manifest = json.loads((tmp_path / "manifest.json").read_text())
@@ -192,5 +184,3 @@ def test_tangent_coordinates_have_no_gauge():
     ]
     with pytest.raises(ConfigError, match="gauge"):
         parse_formulations(["unit-offset"], "tangent")
-    with pytest.raises(ConfigError, match="coordinates"):
-        parse_formulations(None, "euler")

@@ -188,7 +188,7 @@ def test_residuals_are_within_a_few_times_the_tolerance(place):
     for factor, good in ((0.5, True), (2.0, False)):
         found = np.zeros(3)
         found[place] = factor * verify.SLACK * bounds[place]
-        assert verify.Residuals(*found.tolist(), "").within(limits) is good
+        assert verify.Residuals(*found.tolist(), "", found, found).within(limits) is good
 
 
 def test_groups_without_elements_are_passed_over():

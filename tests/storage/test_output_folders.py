@@ -415,12 +415,24 @@ def test_a_file_that_cannot_be_written_ends_in_an_error(tmp_path):
     assert json.loads((target / MARK).read_text())["files"].keys() == {"a"}
 
 
-@pytest.mark.parametrize("command", ["bench paper", "bench speed", "bench accuracy", "compare"])
-def test_pages_of_the_user_are_refused_before_anything_is_measured(command, tmp_path, capsys):
-    page = {"bench speed": "table.md", "bench accuracy": "rendered.md"}.get(command, "README.md")
-    (tmp_path / page).write_text("mine")
-    words = {"bench accuracy": ["--suite", "rendered"], "compare": ["orbit"]}.get(command, [])
-    assert main([*command.split(), *words, "-o", str(tmp_path)]) == 2
-    assert "that this program did not make" in " ".join(capsys.readouterr().err.split())
-    assert (tmp_path / page).read_text() == "mine"
-    assert not list(tmp_path.glob("*.jsonl"))
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("bench paper", "README.md"),
+        ("bench speed", "table.md"),
+        ("bench accuracy --suite rendered", "rendered.md"),
+        ("compare orbit", "README.md"),
+        ("solve orbit", "depth_ref.png"),
+        ("solve orbit", "config.yaml"),
+        ("export orbit", "manifest.json"),
+        ("export orbit", "problem.yaml"),
+        ("chain scene:orbit", "chain.json"),
+    ],
+)
+def test_files_of_the_user_are_refused_before_anything_is_computed(command, name, tmp_path, capsys):
+    (tmp_path / name).write_text("mine")
+    assert main([*command.split(), "-o", str(tmp_path)]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "that this program did not make" in error
+    assert f"found: {name}" in error
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]

@@ -1,17 +1,24 @@
-"""Task and answer of a solver, and CasADi's plug-ins as solvers."""
+"""Task and answer of a solver; CasADi's plug-ins and programs that read .nl as solvers."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from soup_nlp.arrays import Float
+from soup_nlp.errors import SolverError
+from soup_nlp.export.nl import write_nl
+from soup_nlp.export.sol import read_sol
 from soup_nlp.export.verify import Limits
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
@@ -23,6 +30,7 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.solve.functions import Functions, IterationCallback
 from soup_nlp.solve.ipopt import DEFAULTS
+from soup_nlp.storage.system import end_with_parent
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,3 +268,47 @@ def _derivatives(
         values = [derivatives[k] for k in outputs]
         out[name] = ca.Function(name, [inputs[w] for w in words], values, words, list(outputs))
     return out
+
+
+# --- programs that read .nl ----------------------------------------------------------------------
+
+
+def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
+    """Solve with a program of the AMPL convention, `solver stub -AMPL key=value ...`."""
+    begin, path = clock(), Path("soup.sol")
+    file = write_nl(path.with_suffix(".nl"), task.nlp)
+    # remove an answer to an earlier problem
+    path.unlink(missing_ok=True)
+    with path.with_name("solver.log").open("w") as log:
+        try:
+            code = subprocess.run(
+                [command, "soup", "-AMPL", *options],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                timeout=WALL_PER_CPU * max(1.0, task.limits.seconds - (clock() - begin)),
+                check=False,
+                preexec_fn=end_with_parent,
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return Answer(None, None, "Time_Limit", False)
+    if not path.is_file():
+        raise SolverError("solver wrote no .sol", where=Path(command).name, found=f"exit {code}")
+    sol = read_sol(path, file.variables, file.rows)
+    status = sol.message.splitlines()[-1] if sol.message else sol.status
+    return Answer(sol.x, sol.lam_g, status, sol.solved)
+
+
+def find_program(name: str) -> str | None:
+    """Absolute path of an executable on the PATH or beside Python; None if there is none."""
+    path = shutil.which(name) or shutil.which(str(Path(sys.executable).parent / name))
+    # absolute, since it runs in another folder
+    return None if path is None else str(Path(path).absolute())
+
+
+def pounce(command: str, task: Task, near: bool = False) -> Answer:
+    """Solve with POUNCE, which has the options of Ipopt; `near` adds those for a near start."""
+    m = task.limits
+    options = {option: getattr(m, name) for option, name in TOLERANCES.items()}
+    options |= {"acceptable_iter": 0, "max_cpu_time": 0.9 * m.seconds, "print_level": 0}
+    options |= NEAR_START if near else {}
+    return executable(command, task, [f"{k}={v}" for k, v in options.items()])

@@ -1,4 +1,7 @@
-"""Runs of solvers as rows: each in a process of its own, with its claim verified."""
+"""Solvers by name, and their runs as rows: each in a process of its own, its claim verified.
+
+Solvers are CasADi's plug-ins, programs that read .nl, the reference solver, and this package.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import hashlib
 import os
 import platform
 import re
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -13,13 +17,25 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from soup_nlp.bench.processes import isolated, processor
-from soup_nlp.bench.solvers.plugins import WALL_PER_CPU, Answer, Solver, Task, clock
-from soup_nlp.bench.solvers.registry import find_solver
+from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
+from soup_nlp.bench.solvers.plugins import (
+    PLUGINS,
+    WALL_PER_CPU,
+    Answer,
+    Solver,
+    Task,
+    clock,
+    executable,
+    find_program,
+    plugin,
+    pounce,
+)
 from soup_nlp.bench.study import show
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, SolverError
 from soup_nlp.export.artefact import form_label
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
 from soup_nlp.family.frozen import load_frozen
@@ -30,6 +46,8 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.files import read_json
 from soup_nlp.storage.rows import Job, Row, measure_all
 from soup_nlp.storage.versions import versions
@@ -41,6 +59,79 @@ Labelled = tuple[Label, Callable[[], Task]]
 
 KEY = ("problem", "problem_hash", "superpixels", "formulation", "start")
 """Entries of a label that identify a task."""
+
+
+# --- solvers -------------------------------------------------------------------------------------
+
+
+def reference(task: Task) -> Answer:
+    """Solve with Levenberg-Marquardt on the manifold; the answer has no multipliers.
+
+    It ends when the energy stops decreasing, and it claims no optimum.
+    """
+    last = task.form.eps
+    eps = [*(e for e in EPS if e > last), last]
+    energy = task.soup, task.data, task.weights, task.form
+    y = levenberg_marquardt(*energy, eps=eps, seconds=0.8 * WALL_PER_CPU * task.limits.seconds)
+    return Answer(y.soup, None, y.status, False, y.iterations)
+
+
+def package(task: Task) -> Answer:
+    """Solve as this package does: Ipopt's stages, then the constrained NLP."""
+    m = task.limits
+    options = SolverOptions(
+        eps=task.form.eps,
+        tol=m.tol,
+        max_iter=m.iterations,
+        max_seconds=0.9 * WALL_PER_CPU * m.seconds,
+    )
+    answer = solve_soup(task.soup, task.data, task.weights, task.form, options)
+    stage, iterations = answer.stages[-1], sum(s.iterations for s in answer.stages)
+    # the package solves the program in matrices, whose multipliers differ from those in tangents
+    matrices = task.form.coordinates == "matrix"
+    x, lam_g = (stage.x, stage.lam_g) if matrices else (answer.soup, None)
+    return Answer(x, lam_g, stage.status, stage.converged, iterations)
+
+
+def available() -> dict[str, Solver]:
+    """Installed solvers by name."""
+    out: dict[str, Solver] = {
+        name: partial(plugin, name) for name, row in PLUGINS.items() if ca.has_nlpsol(row.library)
+    }
+    command = find_program("pounce")
+    if command:
+        out["pounce"] = partial(pounce, command)
+        out["pounce-tuned"] = partial(pounce, command, near=True)
+    out["lm"] = reference
+    out["soup-nlp"] = package
+    return out
+
+
+def find_solver(name: str) -> Solver:
+    """The solver of a name, or the executable of that name (AMPL convention).
+
+    Raises:
+        SolverError: there is neither a solver nor an executable.
+    """
+    installed = available()
+    if name in installed:
+        return installed[name]
+    # options may follow the name of the program, whose path may have spaces
+    command, options = find_program(name), list[str]()
+    if command is None:
+        program, *options = shlex.split(name) or [""]
+        command = find_program(program)
+    if command is None or name in PLUGINS:
+        raise SolverError(
+            "solver is not here",
+            where="--solvers",
+            found=name,
+            expected=", ".join(installed) + ", or a program that reads .nl",
+        )
+    return partial(executable, command, options=options)
+
+
+# --- runs ----------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=1)
@@ -140,9 +231,10 @@ def _verified(task: Task, answer: Answer, seconds: float, energy_limit: float) -
     row["objective"] = value if np.isfinite(value) else None
     if not finite:
         return row
-    residuals = examine(task.nlp, x, answer.lam_g).residuals
+    residuals = examine(task.nlp, x, answer.lam_g)
     good = residuals.within(task.limits) and row["energy"] <= energy_limit
-    return {**row, **vars(residuals), "verified": bool(good and not late)}
+    shown = {k: v for k, v in vars(residuals).items() if not k.startswith("lam_")}
+    return {**row, **shown, "verified": bool(good and not late)}
 
 
 def compare(
