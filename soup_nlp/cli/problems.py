@@ -16,7 +16,7 @@ from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
 from soup_nlp.errors import ConfigError, DataError, printable
 from soup_nlp.export.artefact import (
     EXPORT_FILES,
-    Format,
+    FORMATS,
     export_case,
     form_label,
     parse_formulations,
@@ -84,7 +84,8 @@ def export(
     coordinates: options.Coordinates = "matrix",
     superpixels: options.Superpixels = None,
     format_: Annotated[
-        list[Format] | None, option("casadi has h5, too; may be repeated.", "--format")
+        list[str] | None,
+        option(f"{', '.join(FORMATS)} (casadi has h5); may be repeated.", "--format"),
     ] = None,
     presolve: options.Presolve = True,
     suffixes: Annotated[

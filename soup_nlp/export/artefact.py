@@ -39,7 +39,7 @@ EXPORT_FILES = (
     MANIFEST,
 )
 """Files that an export may write."""
-Format = Literal["nl", "casadi", "h5"]
+FORMATS = ("nl", "casadi", "h5")
 STATIONARY = 1e-3
 """Largest dual infeasibility of a start whose multipliers are written."""
 START = """
@@ -122,7 +122,7 @@ def export_case(
     case: Case,
     form: Formulation,
     folder: Path,
-    formats: Sequence[Format] = ("nl",),
+    formats: Sequence[str] = ("nl",),
     presolved: bool = False,
     overwrite: bool = False,
     suffixes: bool = False,
@@ -135,15 +135,21 @@ def export_case(
         case: Problem with its start.
         form: Gauge and norm; the Hessian in the files is exact.
         folder: Output folder.
-        formats: Formats of files; nl is always written, and casadi includes h5.
+        formats: Some of FORMATS; nl is always written, and casadi includes h5.
         presolved: The case starts at the answer of the presolve (for the manifest).
         overwrite: Overwrite files that the program did not make.
         suffixes: Write the suffixes of `nl.suffixes_of`, which CasADi's reader does not accept.
 
     Raises:
+        ConfigError: a format is unknown.
         DataError: the folder cannot be written, or holds a file of the user with the same name.
         ExportError: the NLP cannot be written.
     """
+    for word in formats:
+        if word not in FORMATS:
+            raise ConfigError(
+                "unknown format", where="--format", found=word, expected=", ".join(FORMATS)
+            )
     form = form.replace(hessian="exact", compiled=False)
     nlp, layout = case.nlp(form)
     target = claim(folder, EXPORT_FILES, overwrite, case.problem.subject)

@@ -39,9 +39,6 @@ class NLFile:
         size: Number of bytes.
         variables: (nx,) variable of the NLP for each variable of the file.
         rows: (ng,) constraint of the NLP for each row of the file.
-        nonlinear: Number of variables nonlinear in (constraints, objective, both).
-        defined: Defined variables by use: both, constraints, objective (several), one constraint,
-            the objective alone.
         counts: Nonzeros and nonlinear parts, for the manifest and the index of the family.
     """
 
@@ -50,8 +47,6 @@ class NLFile:
     size: int
     variables: Int = field(repr=False)
     rows: Int = field(repr=False)
-    nonlinear: tuple[int, ...]
-    defined: tuple[int, int, int, int, int]
     counts: dict[str, Any]
 
 
@@ -119,20 +114,18 @@ def write_nl(
     write_text(path.with_suffix(".col"), "".join(f"{name}\n" for name in x_names))
     # the objective's name follows those of the rows
     write_text(path.with_suffix(".row"), "".join(f"{name}\n" for name in [*g_names, "E"]))
-    used = program.in_rows, program.in_objective, program.in_rows & program.in_objective
-    nonlinear = tuple(int(mask.sum()) for mask in used)
+    in_rows, in_objective = program.in_rows, program.in_objective
+    nonlinear = {"rows": in_rows, "objective": in_objective, "both": in_rows & in_objective}
     return NLFile(
         path=path,
         sha256=hashlib.sha256(data).hexdigest(),
         size=len(data),
         variables=variables,
         rows=rows,
-        nonlinear=nonlinear,
-        defined=body.classes,
         counts={
             "gradient_nonzeros": int(G.nnz),
             "nonlinear_rows": int(program.curved_rows.sum()),
-            "nonlinear_variables": dict(zip(("rows", "objective", "both"), nonlinear)),
+            "nonlinear_variables": {key: int(mask.sum()) for key, mask in nonlinear.items()},
             "defined_variables": sum(body.classes),
         },
     )
@@ -147,7 +140,7 @@ def header(
         program: Parts of the NLP.
         bounds: (ng,) lower and upper bounds of the rows.
         longest: Length of the longest name of a row and of a variable.
-        defined: Defined variables by use, see `NLFile`.
+        defined: Defined variables by use, see `NlBody`.
     """
     lower, upper = bounds
     equations = lower == upper

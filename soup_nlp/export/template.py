@@ -158,41 +158,23 @@ def make_template(name: str, outputs: ca.SX, group: Group, theta: Float) -> Temp
     return Template(defined, tuple(roots), tuple(constants), graph.number)
 
 
-def _operations(graph: _Graph) -> list[int]:
-    """Operations that outputs need and that depend on variables, arguments first."""
-    needed = set()
-    todo = [r for r in graph.roots if r >= 0]
-    while todo:
-        node = todo.pop()
-        if node in needed or graph.op[node] < 0:
-            continue
-        needed.add(node)
-        todo += graph.args[node]
-    return sorted(needed)
-
-
 def _defined(graph: _Graph, group: Group) -> set[int]:
     """Nodes that become defined variables."""
-    nodes = _operations(graph)
-    uses = dict.fromkeys(nodes, 0)
+    # operations that depend on variables, arguments first
+    nodes = [node for node, op in enumerate(graph.op) if op >= 0]
     parents: dict[int, list[int]] = {n: [] for n in nodes}
     for node in nodes:
         for a in graph.args[node]:
-            if a in uses:
-                uses[a] += 1
+            if a in parents:
                 parents[a].append(node)
-    roots = set()
-    for root in graph.roots:
-        if root in uses:
-            uses[root] += 1
-            roots.add(root)
+    uses = {n: len(parents[n]) + graph.roots.count(n) for n in nodes}
     common = _common(graph, nodes, group) if group.size > 1 else set()
     size: dict[int, int] = {}
     names = set()
     for node in nodes:
         size[node] = 1 + sum(1 if a in names else size.get(a, 1) for a in graph.args[node])
         # only the largest part that elements share
-        top = node in common and (node in roots or not common.issuperset(parents[node]))
+        top = node in common and (node in graph.roots or not common.issuperset(parents[node]))
         if (uses[node] > 1 or top) and size[node] >= WORTH_NAMING:
             names.add(node)
     return names
@@ -241,52 +223,50 @@ def _emit(graph: _Graph, top: int, names: set[int], root: bool = False) -> Text:
     """Prefix text of a node; defined nodes below it (and, for a root, itself) are holes."""
     lines: list[str] = []
     holes: list[tuple[str, int]] = []
-    todo: list[int | str] = [top]
-    first = not root
-    while todo:
-        node = todo.pop()
-        if isinstance(node, str):
-            lines.append(node)
-        elif node in names and not first:
+
+    def write(node: int, inside: bool = True) -> None:
+        value = graph.number.get(node)
+        if node in names and inside:
             lines.append("v%s")
             holes.append((DEFINED, node))
         elif node in graph.variable:
             lines.append("v%s")
             holes.append((VARIABLE, graph.variable[node]))
-        elif node in graph.number:
-            value = graph.number[node]
-            if np.ndim(value):
-                lines.append("n%s")
-                holes.append((NUMBER, node))
-            else:
-                lines.append(f"n{number(float(value))}")
+        elif value is None:
+            operation(node)
+        elif np.ndim(value):
+            lines.append("n%s")
+            holes.append((NUMBER, node))
         else:
-            todo += reversed(_expand(graph, node, names, lines))
-        first = False
-    return Text("\n".join(lines), tuple(holes))
+            lines.append(f"n{number(float(value))}")
 
-
-def _expand(graph: _Graph, node: int, names: set[int], lines: list[str]) -> list[int | str]:
-    """Write the opcode of an operation; returns its operands in order."""
-    op, args = graph.op[node], graph.args[node]
-    if op == ca.OP_ADD:
-        terms: list[int | str] = []
-        todo = [node]
-        while todo:
-            term = todo.pop()
-            inner = term == node or (graph.op[term] == ca.OP_ADD and term not in names)
-            if inner:
-                todo += reversed(graph.args[term])
+    def operation(node: int) -> None:
+        op, args = graph.op[node], graph.args[node]
+        if op == ca.OP_ADD:
+            terms, todo = [], [node]
+            while todo:
+                term = todo.pop()
+                if term == node or (graph.op[term] == ca.OP_ADD and term not in names):
+                    todo += reversed(graph.args[term])
+                else:
+                    terms.append(term)
+            lines.append(PLUS if len(terms) == 2 else f"{SUM}\n{len(terms)}")
+            operands: list[str | int] = [*terms]
+        elif op == ca.OP_SQ and (args[0] in names or args[0] in graph.variable):
+            lines.append("o2")
+            operands = [args[0], args[0]]
+        else:
+            code, *words = OPERATIONS[op].nl.split()
+            lines.append(code)
+            operands = [args[int(word[1])] if word.startswith("{") else word for word in words]
+        for operand in operands:
+            if isinstance(operand, str):
+                lines.append(operand)
             else:
-                terms.append(term)
-        lines.append(PLUS if len(terms) == 2 else f"{SUM}\n{len(terms)}")
-        return terms
-    if op == ca.OP_SQ and (args[0] in names or args[0] in graph.variable):
-        lines.append("o2")
-        return [args[0], args[0]]
-    code, *operands = OPERATIONS[op].nl.split()
-    lines.append(code)
-    return [args[int(word[1])] if word.startswith("{") else word for word in operands]
+                write(operand)
+
+    write(top, inside=root)
+    return Text("\n".join(lines), tuple(holes))
 
 
 def number(value: float) -> str:

@@ -99,14 +99,13 @@ def find_images(source: Path) -> list[Path]:
     """
     source = as_path(source, "frames")
     root = next(folder for folder in (source, *source.parents) if folder.is_dir())
+    pattern = "*" if root == source else str(source.relative_to(root))
     # glob leaves out hidden files and folders
+    files = [root / name for name in glob(pattern, root_dir=root, recursive=True)]
+    chosen = [path for path in files if path.is_file()]
     if root == source:
-        files = [root / name for name in glob("*", root_dir=root)]
-        images = [p for p in files if p.suffix.lower() in IMAGES]
-        chosen = [p for p in images if p.match(LAYOUT)] or images
-    else:
-        matches = glob(str(source.relative_to(root)), root_dir=root, recursive=True)
-        chosen = [p for p in (root / name for name in matches) if p.is_file()]
+        images = [path for path in chosen if path.suffix.lower() in IMAGES]
+        chosen = [path for path in images if path.match(LAYOUT)] or images
     names = {*chosen}
     chosen = [p for p in chosen if names.isdisjoint(_shorter(p))]
     if len(chosen) < 2:

@@ -126,18 +126,6 @@ def test_sigterm_ends_like_ctrl_c(times, earlier, monkeypatch, capfd):
     assert cli.main(["check", str(earlier)]) == 0
 
 
-def test_a_second_one_in_the_solver_aborts_too(tmp_path, monkeypatch, capfd):
-    def interrupted(self, progress):
-        if progress.stage == "constrained NLP":
-            ctrl_c()
-            ctrl_c()
-
-    monkeypatch.setattr(solve_module.options.SolveLog, "iteration", interrupted)
-    assert solve(tmp_path / "out") == 130
-    assert "no result is written" in capfd.readouterr().err
-    assert not (tmp_path / "out" / "summary.json").exists()
-
-
 def test_files_that_are_being_written_are_written(earlier, monkeypatch, capfd):
     original, seen = folders.write_h5, []
 

@@ -46,6 +46,11 @@ def write_sx_nl(path: Path, problem: dict[str, ca.SX], **given: object) -> NLFil
     return write_nl(path, plain_nlp("plain", groups, **{"x0": np.zeros(n), **given}))
 
 
+def defined_variables(file: NLFile) -> list[int]:
+    """Those of the header by use: both, rows, objective (several), one row, the objective only."""
+    return [int(word) for word in file.path.read_text().splitlines()[9].split("\t")[0].split()]
+
+
 class ReadBack:
     """A .nl file as CasADi reads it: sizes, bounds, start and derivatives of its own."""
 
