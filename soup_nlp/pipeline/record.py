@@ -15,7 +15,7 @@ from soup_nlp.evaluate.confidence import Confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.components import Components, find_components
-from soup_nlp.geometry.full_size import Labels, grown_labels, plane_depth
+from soup_nlp.geometry.full_size import grown_labels, plane_depth
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup
@@ -90,13 +90,11 @@ class FullSize:
     Attributes:
         depth_ref: (H, W) z of the reference frame, NaN where unknown.
         depth_next: (H', W') z of the next frame, NaN where nothing lands.
-        labels: (H, W) superpixel of every pixel of the reference frame.
         metrics: Score of `depth_ref`; None without truth.
     """
 
     depth_ref: FloatMap
     depth_next: FloatMap
-    labels: Labels
     metrics: DepthMetrics | None = None
 
     def __repr__(self) -> str:
@@ -224,4 +222,4 @@ def full_size(full: Pair, small: Pair, result: Reconstruction) -> FullSize:
     labels_next = grown_labels(shown, small.image_next, full.image_next)
     depth_next = plane_depth(labels_next, turned, moved, full.K_next)
     scores = score_depths(full.truth, {"full": depth_ref.astype(np.float64)})
-    return FullSize(depth_ref, depth_next, labels, scores.get("full"))
+    return FullSize(depth_ref, depth_next, scores.get("full"))

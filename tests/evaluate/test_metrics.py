@@ -50,8 +50,10 @@ def test_hand_values():
     ],
 )
 def test_scale_rules(rule, scale):
-    m = depth_metrics([1.0, 4.0, 16.0], [4.0, 8.0, 16.0], Convention(scale=rule))
-    assert m.scale == pytest.approx(scale)
+    z, gt = np.array([1.0, 4.0, 16.0]), np.array([4.0, 8.0, 16.0])
+    assert depth_metrics(z, gt, Convention(scale=rule)).scale == pytest.approx(scale)
+    # the check has the rules once more
+    assert recompute.scores(z, gt, rule, None)["scale"] == pytest.approx(scale, rel=1e-12)
 
 
 def test_coverage_cap_and_mask():

@@ -99,7 +99,6 @@ def test_a_large_pair_comes_back_at_its_size():
     done = run(make_problem(settings), pair=pair)
     assert done.pair.size[0] * done.pair.size[1] <= 12_500
     assert done.full.depth_ref.shape == (128, 256)
-    assert done.full.labels.shape == (128, 256)
     covered = np.isfinite(done.full.depth_next)
     assert covered.mean() > 0.9
     # the error does not grow at full size

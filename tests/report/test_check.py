@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -15,7 +14,6 @@ import pytest
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate import recompute
 from soup_nlp.geometry.camera import pixel_grid, project, rays
 from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import WRITTEN, CheckReport, check_folder
@@ -120,7 +118,7 @@ def test_forged_arrays_are_recomputed(place, folder):
     ["versions numpy", "seconds nlp", "start motions", "sizes equalities", "refinement status",
      "flow", "name", "expected", "metrics", "metrics start", "metrics solution mre", "refinement",
      "sizes hessian_nonzeros", "depth_png_scale next", "answer_residuals positive",
-     "residuals dual_infeasibility"],
+     "residuals dual_infeasibility", "delivered"],
 )  # fmt: skip
 @pytest.mark.parametrize("how", ["changed", "removed"])
 def test_entries_are_as_written(how, place, folder):
@@ -138,31 +136,15 @@ def test_entries_are_as_written(how, place, folder):
     (folder / "summary.json").write_text(json.dumps(claims))
     try:
         report = check_folder(folder)
-    except DataError:
+    except DataError as error:
         # a claim that is needed is not there
-        assert how == "removed" or place in (
-            "metrics",
-            "metrics start",
-            "refinement status",
-            "metrics solution mre",
-            "depth_png_scale next",
-        )
+        needed = ("metrics", "metrics start", "refinement status", "metrics solution mre")
+        missing = how == "removed" and "lacks a claim" in str(error)
+        if not missing and place not in (*needed, "depth_png_scale next"):
+            raise
         return
     assert not report.ok
     assert any(row.how == WRITTEN and not row.ok for row in report.rows)
-
-
-def change(folder: Path, edit: Callable[[dict], object]) -> None:
-    path = folder / "summary.json"
-    claims = json.loads(path.read_text())
-    edit(claims)
-    path.write_text(json.dumps(claims))
-
-
-def test_a_missing_claim_is_an_error_of_the_file(folder):
-    change(folder, lambda s: s.pop("delivered"))
-    with pytest.raises(DataError, match="lacks a claim"):
-        check_folder(folder)
 
 
 def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
@@ -196,14 +178,6 @@ def test_contents_of_the_arrays_are_as_written(place, folder):
             first = (0,) * file[place].ndim
             file[place][first] += 1e-3
     assert "contents of result.h5 as written" in bad(check_folder(folder))
-
-
-@pytest.mark.parametrize(("rule", "scale"), [("lsq", 16.5 / 9), ("none", 1.0), ("median", 1.75)])
-def test_rules_of_scale(rule, scale):
-    """By hand: least squares is sum z gt / sum z z, of ratios 1.5, 2, 1.75."""
-    z, gt = np.array([1.0, 2.0, 2.0]), np.array([1.5, 4.0, 3.5])
-    found = recompute.scores(z, gt, rule, None)
-    assert found["scale"] == pytest.approx(scale, rel=1e-12)
 
 
 # --- rounding of an energy that should be zero ---

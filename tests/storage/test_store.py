@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 import stat
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import h5py
@@ -12,7 +13,7 @@ import pytest
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import atomic_path, write_text
 from soup_nlp.storage.h5_files import read_attrs, read_h5
-from soup_nlp.storage.store import parse_table, plain, require, write_h5, write_json
+from soup_nlp.storage.store import parse_table, require, write_h5, write_json
 from soup_nlp.storage.versions import versions
 
 
@@ -35,32 +36,23 @@ def tree():
 # --- atomic ---------------------------------------------------------------------------------
 
 
-def test_atomic_replaces_and_keeps_suffix(tmp_path):
+@pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt])
+def test_atomic_replaces_a_file_whole_or_not_at_all(error, tmp_path):
     target = tmp_path / "a.json"
     target.write_text("old")
-    with atomic_path(target) as temporary:
-        assert temporary.parent == tmp_path
-        assert temporary.suffix == ".json"
-        temporary.write_text("new")
-        assert target.read_text() == "old"
-    assert target.read_text() == "new"
-    assert os.listdir(tmp_path) == ["a.json"]
 
-
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_atomic_leaves_nothing_after_a_failure(tmp_path, error):
-    target = tmp_path / "a.txt"
-    target.write_text("old")
-
-    def fail():
+    def write():
         with atomic_path(target) as temporary:
-            temporary.write_text("half")
-            raise error
+            assert (temporary.parent, temporary.suffix) == (tmp_path, ".json")
+            temporary.write_text("new")
+            assert target.read_text() == "old"
+            if error:
+                raise error
 
-    with pytest.raises(error):
-        fail()
-    assert target.read_text() == "old"
-    assert os.listdir(tmp_path) == ["a.txt"]
+    with pytest.raises(error) if error else nullcontext():
+        write()
+    assert target.read_text() == ("old" if error else "new")
+    assert os.listdir(tmp_path) == ["a.json"]
 
 
 def test_atomic_permissions(tmp_path):
@@ -133,28 +125,29 @@ def test_h5_compresses_only_large_arrays(tmp_path):
         assert small.compression is None
 
 
-@pytest.mark.parametrize("value", [np.array([object()]), [[1], [1, 2]]])
-def test_h5_bad_array_leaves_the_old_file(tmp_path, value):
-    path = tmp_path / "r.h5"
+def full_disk(*args, **options):
+    raise OSError("disk is full")
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (lambda path: write_h5(path, {"good": np.zeros(3), "bad": [object()]}, {}), "cannot write"),
+        (lambda path: write_h5(path, {"good": np.zeros(3), "bad": [[1], [1, 2]]}, {}), "cannot"),
+        (lambda path: write_h5(path, tree(), {}), "disk is full"),
+        (lambda path: write_json(path, {"a": object()}), "JSON"),
+    ],
+    ids=["object", "ragged", "full disk", "JSON"],
+)
+def test_what_cannot_be_written_leaves_the_old_file(write, said, tmp_path, monkeypatch):
+    path = tmp_path / "old"
     path.write_bytes(b"old")
-    with pytest.raises(DataError, match="cannot write"):
-        write_h5(path, {"good": np.zeros(3), "bad": value}, {})
+    if said == "disk is full":
+        monkeypatch.setattr("soup_nlp.storage.store._write_array", full_disk)
+    with pytest.raises(DataError, match=said):
+        write(path)
     assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["r.h5"]
-
-
-def test_h5_failure_half_way_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "r.h5"
-    path.write_bytes(b"old")
-
-    def fail(*args, **kwargs):
-        raise OSError("disk is full")
-
-    monkeypatch.setattr("soup_nlp.storage.store._write_group", fail)
-    with pytest.raises(DataError, match="disk is full"):
-        write_h5(path, tree(), {})
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["r.h5"]
+    assert os.listdir(tmp_path) == ["old"]
 
 
 def test_h5_unreadable(tmp_path):
@@ -196,6 +189,7 @@ def test_json(tmp_path):
         "nan": float("nan"),
         "inf": np.float64(-np.inf),
         "array": np.array([[1.0, np.nan]]),
+        "number": np.array(1.5),
         "record": Record(np.float64(2), (1, 2)),
         "path": tmp_path,
         "set": {2, 1},
@@ -215,21 +209,13 @@ def test_json(tmp_path):
         "nan": None,
         "inf": None,
         "array": [[1.0, None]],
+        "number": 1.5,
         "record": {"a": 2.0, "b": [1, 2]},
         "path": str(tmp_path),
         "set": [1, 2],
         "text": "ä",
         "3": None,
     }
-
-
-def test_json_bad_value_leaves_the_old_file(tmp_path):
-    path = tmp_path / "a.json"
-    write_json(path, {"a": 1})
-    with pytest.raises(DataError, match="JSON"):
-        write_json(path, {"a": object()})
-    assert json.loads(path.read_text()) == {"a": 1}
-    assert plain(np.array(1.5)) == 1.5
 
 
 def test_versions():
