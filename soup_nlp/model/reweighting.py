@@ -13,8 +13,8 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.oracle import relief
 
-STEPS = 0.05, 0.35
-"""Least and largest step of inverse depth that E_order asks for, relative."""
+LEAST_STEP = 0.05
+"""Least step of inverse depth that E_order asks for where it asks for one, relative."""
 CREASE = 0.01
 """1 - cos of the angle between two planes of a depth prior that halves E_orient between them, 8
 degrees: 0.005 and 0.02 differ by at most 0.0006 in the mean relative error of robot."""
@@ -105,23 +105,22 @@ def with_prior(
 
 
 def with_order(
-    data: EnergyData, soup: Soup, order: Float, guessed: Mask, weight: float
+    data: EnergyData, soup: Soup, order: Float, most: Float, weight: float
 ) -> EnergyData:
-    """The same data with E_order where occlusion shows which superpixel of a pair is in front.
+    """The same data with E_order where it is known which superpixel of a pair is in front.
 
-    Where that is all that gives a scale, the step of the start is asked for, within `STEPS`; else
-    none, only the order.
+    Where nothing else gives a scale, the step of the start is asked for; else none, only the order.
 
     Args:
         data: Data of the pair.
         soup: Start.
         order: (P,) probability of the order, signed as `EnergyData.order_weight`.
-        guessed: (N,) True where the start has placed a superpixel by that order.
+        most: (N,) largest step of a superpixel that is asked for, 0 where none is.
         weight: Of a sure order.
     """
     z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
     step = np.where(order > 0, z[0] / z[1], z[1] / z[0]) - 1
-    step = np.where(guessed[data.pairs].any(axis=1), np.clip(step, *STEPS), 0.0)
+    step = np.clip(step, LEAST_STEP, most[data.pairs].max(axis=1))
     return replace(data, order_weight=weight * order, order_step=step)
 
 

@@ -184,6 +184,8 @@ def in_order(start: Start, pair: Pair, flow: FlowFit) -> Start:
     # the scale of a placed region is held along its whole outline
     beside_moved = moved[seg.pairs].any(axis=1) & (flow.jump >= CLOSING_PX)
     order = np.where(beside_moved, whole, order)
+    if start.order is not None:
+        order = np.where(order == 0, start.order, order)
     soup = replace(start.soup, lam=start.soup.lam * factor).normalised()
     tie = np.where(moved, TIES.index("occlusion"), start.tie)
     grouped = np.where(moved & start.bends, len(seg) + region, start.component)

@@ -16,7 +16,9 @@ from soup_nlp.start.components import (
     connected_pieces,
     contact_scales,
     largest,
+    nearer_where_fast,
     numbered,
+    order_in_front,
 )
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import on_ground
@@ -58,8 +60,8 @@ class Start:
         at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Noise of the flow, pixels, see `limited_noise`.
         order: (P,) probability that the second superpixel of a neighbour pair covers the first one,
-            negative if the first covers the second, 0 where neither is known (`start.occlusion`);
-            None where nothing is known.
+            negative if the first covers the second, 0 where neither is known (`start.occlusion`,
+            `order_in_front`); None where nothing is known.
     """
 
     soup: Soup
@@ -160,12 +162,15 @@ def propose(flow: FlowFit) -> Start:
             component = numbered(np.where(mask, regions, component))
     scale, tie = contact_scales(flow, soup, component, fixed)
     soup = replace(soup, lam=soup.lam * scale)
+    soup, tie = nearer_where_fast(flow, soup, component, tie)
     grounded = np.zeros(len(seg), bool)
     if o.upright and o.ground:
         soup, component, tie, floor = on_ground(
             flow, soup, ~weak & rigid.views.usable, component, tie
         )
         grounded = weak & (floor > 0)
+        # what was lowered to the ground may be too fast there
+        soup, tie = nearer_where_fast(flow, soup, component, tie)
     mixed = unmoved(flow, choice, component) & ~(fixed | bends)
     return Start(
         soup=soup.normalised(),
@@ -182,6 +187,7 @@ def propose(flow: FlowFit) -> Start:
         bends=bends,
         wrong=(wrong | fixed & (shift > STILL_PX)) & ~bends,
         noise=limited_noise(error[~bends]),
+        order=order_in_front(flow, soup, component, tie),
     )
 
 

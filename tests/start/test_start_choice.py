@@ -26,12 +26,10 @@ from soup_nlp.start.choice import (
     select,
 )
 from soup_nlp.start.components import (
-    FAST,
     TIES,
     borrow,
     contact_scales,
     depth_from_inside,
-    nearer_where_fast,
 )
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.propose import propose
@@ -378,11 +376,3 @@ def test_a_motion_that_explains_little_more_is_dropped(gain, moves):
     flow = np.where(piece, 9.0, 0.0)[:, None] * [1.0, 0.0]
     still = gathering.unmoved(flow_of_turns(views, seg, shift=flow), choice, piece.astype(int))
     np.testing.assert_array_equal(still, piece & (not moves))
-
-
-def test_a_component_too_fast_by_contact_comes_a_third_nearer():
-    label = np.repeat([0, 1, 2, 3], [6, 3, 3, 3])
-    far = np.array([1.0, np.exp(0.9 * FAST), np.exp(2.0 * FAST), 1e3])[label]
-    # beyond a ratio of 100 the camera is taken to be at rest
-    np.testing.assert_allclose(nearer_where_fast(far, label), [0, 0, 2 * FAST / 3, 0])
-    assert not nearer_where_fast(np.where(label == 0, 0.0, far), label).any()
