@@ -96,7 +96,7 @@ def street(car: float) -> tuple[Segmentation, np.ndarray, np.ndarray, np.ndarray
     height, width = labels.shape
     K = np.array([[150.0, 0, width / 2], [0, 150.0, height / 2], [0, 0, 1]])
     image = np.full((height, width, 3), 128, np.uint8)
-    seg = build_segmentation(labels, image, 8, 0.02, 1.0, 3)
+    seg = build_segmentation(labels, image, 8)
     ray = rays(K, seg.anchors)
     Z = np.where(ray[:, 1] > HIGH / FAR, HIGH / np.maximum(ray[:, 1], 1e-6), FAR)
     row, column = np.divmod(np.arange(rows * columns), columns)
