@@ -100,9 +100,10 @@ def find_images(source: Path) -> list[Path]:
     source = as_path(source, "frames")
     root = next(folder for folder in (source, *source.parents) if folder.is_dir())
     pattern = "*" if root == source else str(source.relative_to(root))
-    # glob leaves out hidden files and folders
+    # glob leaves out hidden files
     files = [root / name for name in glob(pattern, root_dir=root, recursive=True)]
-    chosen = [path for path in files if path.is_file()]
+    # links without a target and pipes are errors when they are read
+    chosen = [path for path in files if not path.is_dir()]
     if root == source:
         images = [path for path in chosen if path.suffix.lower() in IMAGES]
         chosen = [path for path in images if path.match(LAYOUT)] or images
