@@ -11,8 +11,6 @@ from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR, scale_by_conta
 from soup_nlp.report.findings import GUESSES, certainty, certainty_lines, guess_reason
 from soup_nlp.start.components import FIXED, TIES, displacement
 
-REASONS = GUESSES
-
 
 def unsure(run, component_variance=None):
     """The same run where every pixel is a guess, though the flow is evidence of depth."""
@@ -36,7 +34,7 @@ def test_shares_add_up(small_run):
     assert sum(shares[k] for k in ("flow", "contact", "outline")) == pytest.approx(
         shares["determined"]
     )
-    assert sum(shares[k] for k in REASONS) == pytest.approx(shares["guess"])
+    assert sum(shares[k] for k in GUESSES) == pytest.approx(shares["guess"])
     assert shares["median_sigma"] < MOST_SIGMA
 
 
@@ -44,7 +42,7 @@ def test_every_guess_has_one_reason(small_run):
     shares = certainty(unsure(small_run))
     assert shares["determined"] == 0
     assert np.isnan(shares["median_sigma"])
-    assert sum(shares[k] for k in REASONS) == pytest.approx(1.0)
+    assert sum(shares[k] for k in GUESSES) == pytest.approx(1.0)
 
 
 def test_a_scale_that_contact_hardly_determines_is_named(small_run):

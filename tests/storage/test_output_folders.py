@@ -58,7 +58,7 @@ ENDS = st.sampled_from([None, None, None, RuntimeError, KeyboardInterrupt, OSErr
 
 @settings(max_examples=40)
 @given(st.lists(st.tuples(NAMES, st.sampled_from(["whole", "part", "user"]), ENDS), max_size=6))
-def test_a_folder_holds_the_newest_result_and_all_files_of_the_user(steps):
+def test_results_and_files_of_the_user_share_a_folder(steps):
     """Results that are written, or fail, and files of the user, against two dicts of files."""
     with TemporaryDirectory() as home:
         target, made, mine = Path(home) / "out", {}, {}
