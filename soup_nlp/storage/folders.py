@@ -69,14 +69,18 @@ def digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def _is_blocked(folder: Path, name: str) -> bool:
+    """Whether a folder is in the place of a file, or a file or link in that of its folder."""
+    path, above = folder / name, [folder / p for p in PurePosixPath(name).parents[:-1]]
+    wrong = (os.path.lexists(p) and (p.is_symlink() or not p.is_dir()) for p in above)
+    return any(wrong) or (path.is_dir() and not path.is_symlink())
+
+
 def _is_foreign(folder: Path, name: str) -> bool:
     """Whether a folder holds something under this name that the program did not make."""
-    path = folder / name
-    above = [folder / parent for parent in PurePosixPath(name).parents][:-1]
-    if any(os.path.lexists(p) and (p.is_symlink() or not p.is_dir()) for p in above):
-        return True
-    if path.is_symlink() or not path.is_file():
-        return os.path.lexists(path)
+    path, blocked = folder / name, _is_blocked(folder, name)
+    if blocked or path.is_symlink() or not path.is_file():
+        return blocked or os.path.lexists(path)
     return mark_of(folder).files.get(name) != digest_of(path)
 
 
@@ -129,9 +133,9 @@ def claim(
                 expected="a new or empty folder, or that of an earlier result",
                 hint="choose another --out, or --overwrite",
             )
-        for path in (target / name for name in foreign):
-            if path.is_dir() and not path.is_symlink():
-                raise DataError("cannot write a file over a folder", where=path)
+        for name in foreign:
+            if _is_blocked(target, name):
+                raise DataError("cannot write a file over a folder or link", where=target / name)
     return Path(folder)
 
 

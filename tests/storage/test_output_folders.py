@@ -196,13 +196,17 @@ def test_a_symbolic_mark_is_not_followed(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["out", "victim"]
 
 
-def test_a_link_on_the_way_leads_out_of_the_folder(tmp_path):
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_link_on_the_way_leads_out_of_the_folder(overwrite, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "d").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(DataError, match="d/x"), staged(tmp_path / "out") as new:
-        put(new, {"d/x": "4"})
+    (tmp_path / "out" / "f").touch()
+    for name in ("d/x", "f/x"):
+        with pytest.raises(DataError, match=name):
+            write(tmp_path / "out", overwrite=overwrite, **{name: "4"})
     assert os.listdir(tmp_path / "elsewhere") == []
+    assert sorted(os.listdir(tmp_path / "out")) == ["d", "f"]
 
 
 def test_a_mark_owns_nothing_outside_its_folder(tmp_path):
