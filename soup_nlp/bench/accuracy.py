@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from soup_nlp.arrays import Float, Mask
+from soup_nlp.arrays import Float
 from soup_nlp.bench.study import Cell
 from soup_nlp.bench.suites import SUITES
 from soup_nlp.data.pair import Pair, Truth
@@ -166,6 +166,9 @@ def _rows(scored: Mapping[str, DepthMetrics]) -> dict[str, dict[str, float]]:
 def moving(pair: Pair, depth: Float, convention: Convention) -> Row | None:
     """Errors of independently moving pixels and of all other pixels, under one common scale.
 
+    Components move independently if their true motion is not that of the static scene; without
+    known motions, all do.
+
     Args:
         pair: Its truth must have components (0 is the static scene) and dense depth.
         depth: (H, W) z.
@@ -179,7 +182,10 @@ def moving(pair: Pair, depth: Float, convention: Convention) -> Row | None:
     if truth is None or truth.components is None or truth.depth_ref is None:
         return None
     gt, label = truth.depth_ref, truth.components
-    moving_part = (label > 0) & moves_by_itself(truth)[label]
+    moving_part = label > 0
+    if truth.motions is not None:
+        near = np.isclose(truth.motions, truth.motions[0], rtol=0, atol=1e-9).all(axis=(1, 2))
+        moving_part &= ~np.isin(label, np.flatnonzero(near))
     counts = convention.mask(gt)
     moves, static = counts & moving_part, counts & (label >= 0) & ~moving_part
     if not moves.any() or not static.any():
@@ -187,19 +193,6 @@ def moving(pair: Pair, depth: Float, convention: Convention) -> Row | None:
     z = depth * depth_metrics(depth, gt, convention).scale
     masks = {"mre": moves, "rest": static}
     return {k: depth_metrics(z, gt, UNSCALED, m).mre for k, m in masks.items()}
-
-
-def moves_by_itself(truth: Truth) -> Mask:
-    """(B,) bool, True for components that move differently from component 0, the static scene.
-
-    Without known motions it is True for all components but 0.
-    """
-    assert truth.components is not None
-    out = np.arange(int(truth.components.max()) + 1) > 0
-    if truth.motions is not None:
-        near = np.isclose(truth.motions, truth.motions[0], rtol=0, atol=1e-9).all(axis=(1, 2))
-        out[: len(near)] &= ~near[: len(out)]
-    return out
 
 
 def _scene_flow(result: Run, scale: float) -> dict[str, float | int] | None:

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from soup_nlp.arrays import Float
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import Sol, read_sol
-from soup_nlp.export.verify import ACTIVE, Kind, Limits, Residuals, examine, kind, violations
+from soup_nlp.export.verify import Kind, Limits, Residuals, active, examine, kind, violations
 from soup_nlp.family.frozen import load_frozen
 from soup_nlp.family.instances import VERSION, build_instance, case_of, parse_name
 from soup_nlp.model.nlp import NLP
@@ -105,20 +105,16 @@ def rank(matrix: sparse.csr_matrix) -> int:
 
 def qualification(nlp: NLP, x: Float) -> dict[str, Any]:
     """Rank of the Jacobian and of its active rows, and LICQ, at a feasible point x (nx,)."""
-    g, J = nlp.constraints(x), nlp.jacobian(x)
-    active = np.zeros(nlp.ng, bool)
-    for bound in (nlp.lbg, nlp.ubg):
-        near = np.isfinite(bound)
-        active[near] |= np.abs(g - bound)[near] <= ACTIVE * (1 + np.abs(bound[near]))
+    J, (at_lower, at_upper, off) = nlp.jacobian(x), active(nlp, x)
+    rows = at_lower | at_upper
     # variables on their bounds cannot move
-    off = (x - nlp.lbx > ACTIVE) & (nlp.ubx - x > ACTIVE)
-    active_rank = rank(J[active][:, off])
+    active_rank = rank(J[rows][:, off])
     return {
         "jacobian_rank": rank(J),
-        "active_rows": int(active.sum()),
+        "active_rows": int(rows.sum()),
         "active_rank": active_rank,
         "variables_on_bounds": int(len(x) - off.sum()),
-        "licq": active_rank == int(active.sum()),
+        "licq": active_rank == int(rows.sum()),
     }
 
 

@@ -50,11 +50,10 @@ def fuse(chain: Chain, most: int = MOST) -> Cloud:
     if not len(cloud):
         return cloud
     side = VOXEL * float(np.median(np.linalg.norm(cloud.points, axis=1)))
-    voxel = np.floor(cloud.points / side).astype(np.int64)
-    order = np.lexsort((cloud.sigma, *voxel.T))
-    first = np.ones(len(order), bool)
-    first[1:] = (np.diff(voxel[order], axis=0) != 0).any(axis=1)
-    return every_kth(kept(cloud, order[first]), most)
+    cloud = kept(cloud, np.argsort(cloud.sigma, kind="stable"))
+    voxel = np.floor(cloud.points[:, ::-1] / side).astype(np.int64)
+    _, first = np.unique(voxel, axis=0, return_index=True)
+    return every_kth(kept(cloud, first), most)
 
 
 def every_kth(cloud: Cloud, most: int) -> Cloud:

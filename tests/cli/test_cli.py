@@ -129,14 +129,10 @@ def images(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("images")
     pair = render_scene("orbit", 0, 160, 120)
     write_pair(folder, pair)
-    cv2.imwrite(str(folder / "small.png"), pair.image_next[:50, :50, ::-1])
     cv2.imwrite(str(folder / "flat.png"), np.full((120, 160, 3), 128, np.uint8))
     flow = pair.truth.flow.astype(np.float32)
     write_flo(folder / "true.flo", flow)
     (folder / "cut.flo").write_bytes((folder / "true.flo").read_bytes()[:1000])
-    write_flo(folder / "wrong_size.flo", flow[:50])
-    np.save(folder / "nan.npy", np.full_like(flow, np.nan))
-    np.save(folder / "inf.npy", np.full_like(flow, np.inf))
     write_flo(folder / "zero.flo", 0 * flow)
     return folder
 
@@ -158,13 +154,9 @@ def solve_files(images: Path, out: Path, **changes: str) -> int:
         ({"intrinsics": "0.9,0.9,0.5,0.5"}, "normalised"),
         ({"intrinsics": "a.png,b.png"}, "a file"),
         ({"intrinsics": "0,0,79.5,59.5"}, "focal"),
-        ({"intrinsics": "-9,9,1,1"}, "focal"),
         ({"intrinsics": "nan,9,1,1"}, "finite"),
         ({"intrinsics": "1,2,3"}, "fx,fy,cx,cy"),
         ({"flow": "cut.flo"}, "cut.flo"),
-        ({"flow": "wrong_size.flo"}, "wrong_size.flo"),
-        ({"flow": "nan.npy"}, "nan.npy"),
-        ({"flow": "inf.npy"}, "inf.npy"),
         ({"ref": "flat.png", "next": "flat.png"}, "too few pixels"),
         ({"sets": "segmentation.superpixels=10 segmentation.neighbours=15"}, "K"),
     ],
