@@ -166,7 +166,7 @@ def export_case(
             for function in FUNCTIONS:
                 # the file writer of CasADi ignores a full disk
                 text = ca.StringSerializer()
-                text.pack(getattr(nlp, function))
+                text.pack(getattr(nlp.graph, function))
                 write_text(new / f"{function}.casadi", text.encode())
         write_text(new / "problem.yaml", dump_problem(case.problem))
         manifest = {
@@ -240,9 +240,10 @@ def _write_start_h5(
         row, column = m.row.astype(np.int64), m.col.astype(np.int64)
         return {"row": row, "column": column, "value": m.data, "shape": np.array(m.shape)}
 
-    vectors = {key: getattr(nlp, key) for key in ("x0", "lbx", "ubx", "lbg", "ubg", "p")}
+    vectors = {key: getattr(nlp, key) for key in ("x0", "lbx", "ubx", "lbg", "ubg")}
     tree = {
         **{key: np.asarray(value, float).ravel() for key, value in vectors.items()},
+        "p": nlp.graph.p,
         "x_names": names[0],
         "g_names": names[1],
         "at_start": {

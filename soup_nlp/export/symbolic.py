@@ -109,5 +109,6 @@ def nlp(
         made = build_tangent_nlp(case.soup, case.data, case.weights, form)
     record, layout = made
     x, p = ca.MX.sym("x", record.nx), ca.MX.sym("p", len(record.theta))
-    f, g = record.oracle(x, ca.vertcat(p, record.p[len(record.theta) :]))
+    graph = record.graph
+    f, g = graph.oracle(x, ca.vertcat(p, graph.p[len(record.theta) :]))
     return SymbolicNLP(case, record, layout, x, p, f, g, Functions(record))

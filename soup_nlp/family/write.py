@@ -176,7 +176,7 @@ def as_casadi(programs: Sequence[NLP]) -> str:
     """
     nlp = programs[0]
     x = ca.MX.sym("x", nlp.nx)
-    f, g = nlp.oracle(x, nlp.p)
+    f, g = nlp.graph.oracle(x, nlp.graph.p)
     text = ca.StringSerializer()
     text.pack(ca.Function("nlp", [x], [f, g], ["x"], ["f", "g"]))
     for vector in (nlp.lbx, nlp.ubx, nlp.lbg, nlp.ubg, *(p.x0 for p in programs)):

@@ -73,22 +73,23 @@ class Builder:
         return first + np.arange(count)
 
     def add_norms(
-        self, name: str, element: Element, view: Callable[..., View], stride: int
+        self, name: str, element: Element, view: Callable[..., View], option: str, stride: int
     ) -> None:
         """Add an energy term: kernel of its norms in solver form, and its table.
 
         Args:
             name: Of the kernel.
             element: Data columns, indices of variables and the norms.
-            view: Makes a View of local variables (stride,) and the data row, by position; the same
-                one for the same coordinates.
+            view: Makes a View of local variables (stride,), the data row, the position of a
+                superpixel and the option.
+            option: Gauge or chart.
             stride: Variables per superpixel.
         """
         size = len(element.index)
         if not size:
             return
         fields = tuple(element.fields.items())
-        term = name, element.norms, fields, element.arity, view, stride
+        term = name, element.norms, fields, element.arity, view, option, stride
         kernel, slacks = _kernel(*term, self.form.norm)
         index = [element.index, *(self.new_slacks(f"s_{k}", size)[:, None] for k in slacks)]
         rows = [self.new_rows(f"epigraph_{k}", size, 0.0) for k in slacks]
@@ -183,13 +184,14 @@ def _kernel(
     fields: tuple[tuple[str, int], ...],
     arity: int,
     view: Callable[..., View],
+    option: str,
     stride: int,
     norm: NormForm,
 ) -> tuple[Kernel, list[str]]:
     """Kernel of a term's norms in solver form, made once, and the names of norms with a slack."""
     x = ca.SX.sym("x", stride * arity)
     row = {k: ca.SX.sym(k, c) for k, c in fields}
-    views = [view(x[stride * a : stride * (a + 1)], row, a) for a in range(arity)]
+    views = [view(v, row, a, option) for a, v in enumerate(ca.vertsplit(x, stride))]
     norms_of_term = norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
     named = [n.name for n in norms_of_term if norm == "epigraph" and n.kind == "norm"]
     slacks = {k: ca.SX.sym(f"s_{k}") for k in named}

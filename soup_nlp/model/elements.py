@@ -85,9 +85,9 @@ def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]
     return {name: ELEMENTS[name](data, w).placed(layout) for name in used}
 
 
-def _full(count: int, value: float) -> Float:
-    """A constant column; 0 where a truncation is infinite, which the norms then leave out."""
-    return np.full(count, value if np.isfinite(value) else 0.0)
+def _truncations(count: int, **sigma: float) -> dict[str, Float]:
+    """Constant columns of the truncations that are finite; a norm without one is not truncated."""
+    return {k: np.full(count, v) for k, v in sigma.items() if np.isfinite(v)}
 
 
 def _rays(data: EnergyData, ends: Int) -> dict[str, Float]:
@@ -107,53 +107,48 @@ def _pixel(data: EnergyData, unit: Float) -> dict[str, Float]:
 
 
 def _arap(data: EnergyData, w: Weights) -> Element:
-    e, truncated = data.edges, bool(np.isfinite(w.sigma_arap))
+    e = data.edges
     columns = {
         "weight": w.arap * data.edge_weight,
         "unit": data.edge_unit,
         "turn": data.rotation_scale,
-        "sigma": _full(len(e), w.sigma_arap),
-        "leak": _full(len(e), w.leak_arap),
+        **_truncations(len(e), sigma=w.sigma_arap),
+        "leak": np.full(len(e), w.leak_arap),
         **_rays(data, e),
         **_pixel(data, data.edge_unit),
     }
-    given = truncated, data.arap_at_anchors, data.local_units
-    return Element(e, columns, Norms(terms.arap, given), 2)
+    return Element(e, columns, Norms(terms.arap, (data.arap_at_anchors,)), 2)
 
 
 def _proj(data: EnergyData, w: Weights) -> Element:
     used = data.pixel_weight > 0
     owner, count = np.nonzero(used)[0][:, None], int(used.sum())
-    truncated = bool(np.isfinite(w.sigma_proj))
     # intrinsics are data, so that kernels compiled once serve every camera
     K = data.K_next[:2]
     nonzero = np.nonzero(K.T)[::-1]
     columns = {
         "weight": w.proj * data.pixel_weight[used],
-        "sigma": _full(count, w.sigma_proj),
+        **_truncations(count, sigma=w.sigma_proj),
         "ray": data.pixel_ray[used],
         "target": data.pixel_target[used],
         "K": np.tile(K[nonzero], (count, 1)),
     }
     places = tuple(zip(*(index.tolist() for index in nonzero)))
-    norms = Norms(terms.reprojection, (places, truncated), in_pixels=True)
+    norms = Norms(terms.reprojection, (places,), in_pixels=True)
     return Element(owner, columns, norms, 1)
 
 
 def _cont(data: EnergyData, w: Weights) -> Element:
-    pairs, samples = data.pairs, data.boundary_ray.shape[1]
-    truncated = bool(np.isfinite(w.sigma_cont_ref)), bool(np.isfinite(w.sigma_cont))
+    pairs = data.pairs
     columns = {
         "weight": w.cont * data.pair_weight,
         "factor": data.pair_factor / data.pair_unit,
-        "sigma_ref": _full(len(pairs), w.sigma_cont_ref),
-        "sigma": _full(len(pairs), w.sigma_cont),
+        **_truncations(len(pairs), sigma_ref=w.sigma_cont_ref, sigma=w.sigma_cont),
         **_rays(data, pairs),
-        "rays": data.boundary_ray.reshape(len(pairs), 3 * samples),
+        "rays": data.boundary_ray.reshape(len(pairs), 3 * data.boundary_ray.shape[1]),
         **_pixel(data, data.pair_unit),
     }
-    given = samples, *truncated, data.local_units
-    return Element(pairs, columns, Norms(terms.continuity, given), 2)
+    return Element(pairs, columns, Norms(terms.continuity), 2)
 
 
 def _prior(data: EnergyData, w: Weights) -> Element:
@@ -163,10 +158,9 @@ def _prior(data: EnergyData, w: Weights) -> Element:
         "reach": np.linalg.norm(rays["ray_i"] - rays["ray_k"], axis=1),
         **rays,
     }
-    with_relief = bool(data.prior_relief.any())
-    if with_relief:
+    if data.prior_relief.any():
         columns["relief"] = data.prior_relief
-    return Element(data.edges, columns, Norms(terms.prior, (with_relief,)), 2)
+    return Element(data.edges, columns, Norms(terms.prior), 2)
 
 
 def _depth(data: EnergyData, w: Weights) -> Element:
@@ -195,12 +189,11 @@ def _order(data: EnergyData, w: Weights) -> Element:
 
 
 def _orient(data: EnergyData, w: Weights) -> Element:
-    truncated = bool(np.isfinite(w.sigma_orient))
     columns = {
         "weight": w.orient * data.orient_weight,
-        "sigma": _full(len(data.pairs), w.sigma_orient),
+        **_truncations(len(data.pairs), sigma=w.sigma_orient),
     }
-    return Element(data.pairs, columns, Norms(terms.orientation, (truncated,)), 2)
+    return Element(data.pairs, columns, Norms(terms.orientation), 2)
 
 
 ELEMENTS: Mapping[str, Callable[[EnergyData, Weights], Element]] = {

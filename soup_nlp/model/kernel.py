@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ModelError
@@ -75,24 +76,13 @@ class Kernel:
         """Local constraint rows."""
         return 0 if self.constraints is None else int(self.constraints.numel())
 
-    def _hessian(self, kind: str, lam_f: ca.SX, lam_c: ca.SX) -> ca.SX:
-        H = ca.SX(self.nx, self.nx)
-        if self.objective is not None:
-            if kind == "exact" or self.curvature is None:
-                H += lam_f * ca.hessian(self.objective, self.x)[0]
-            else:
-                H += lam_f * self.curvature
-        if self.constraints is not None and kind != "gauss-newton":
-            H += ca.hessian(ca.dot(lam_c, self.constraints), self.x)[0]
-        return ca.sparsify(ca.triu(H))
-
     @_once
     def first_order(self) -> dict[str, ca.Function]:
-        """Value, gradient, constraints and Jacobian nonzeros of one element.
+        """Value, gradient, constraints and Jacobian of one element.
 
         Returns:
-            Functions "f" and "grad", "con" and "jac" of (x, row, theta); absent where there is
-            nothing to compute.
+            Functions "f" and "grad", "con" and "jac" (sparse) of (x, row, theta); absent where
+            there is nothing to compute.
         """
         out: dict[str, ca.SX] = {}
         if self.objective is not None:
@@ -100,13 +90,13 @@ class Kernel:
             out["grad"] = ca.densify(ca.gradient(self.objective, self.x))
         if self.constraints is not None:
             out["con"] = ca.densify(self.constraints)
-            out["jac"] = _nonzeros(ca.jacobian(self.constraints, self.x))
+            out["jac"] = ca.jacobian(self.constraints, self.x)
         args = [self.x, self.row, self.theta]
         return {k: ca.Function(f"{self.name}_{k}", args, ca.cse([v])) for k, v in out.items()}
 
     @_once
     def second_order(self, hessian: str) -> ca.Function | None:
-        """Nonzeros of the triu-Hessian of one element.
+        """The upper triangle of the Hessian of one element, sparse.
 
         Args:
             hessian: One of HESSIANS.
@@ -115,31 +105,22 @@ class Kernel:
             Function of (x, row, theta, lam_f, lam_c); None where it is 0.
         """
         lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
-        H = self._hessian(hessian, lam_f, lam_c)
+        H = ca.SX(self.nx, self.nx)
+        if self.objective is not None:
+            majorant = None if hessian == "exact" else self.curvature
+            H += lam_f * (ca.hessian(self.objective, self.x)[0] if majorant is None else majorant)
+        if self.constraints is not None and hessian != "gauss-newton":
+            H += ca.hessian(ca.dot(lam_c, self.constraints), self.x)[0]
+        H = ca.sparsify(ca.triu(H))
         if not H.nnz():
             return None
         args = [self.x, self.row, self.theta, lam_f, lam_c]
-        return ca.Function(f"{self.name}_hess", args, ca.cse([_nonzeros(H)]))
-
-    @_once
-    def jacobian_pattern(self) -> tuple[Int, Int]:
-        """(row, column) of every nonzero of the local Jacobian, in storage order."""
-        return _triplet(ca.jacobian(self.constraints, self.x).sparsity())
-
-    @_once
-    def hessian_pattern(self, hessian: str) -> tuple[Int, Int]:
-        """(row, column) of every nonzero of the local triu-Hessian, in storage order."""
-        lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
-        return _triplet(self._hessian(hessian, lam_f, lam_c).sparsity())
+        return ca.Function(f"{self.name}_hess", args, ca.cse([H]))
 
 
-def _nonzeros(matrix: ca.SX) -> ca.SX:
-    nz = matrix.nonzeros()
-    return ca.vertcat(*nz) if nz else ca.SX(0, 1)
-
-
-def _triplet(sparsity: ca.Sparsity) -> tuple[Int, Int]:
-    row, column = sparsity.get_triplet()
+def nonzeros(function: ca.Function | None) -> tuple[Int, Int]:
+    """(row, column) of every nonzero of a function's matrix, in storage order."""
+    row, column = ([], []) if function is None else function.sparsity_out(0).get_triplet()
     return np.asarray(row, np.int64), np.asarray(column, np.int64)
 
 
@@ -160,6 +141,26 @@ class Table:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def blocks(self, width: int, dtype: type = np.int64) -> Blocks:
+        """Index, data and rows in blocks of elements, the indices of a type; see `in_blocks`."""
+        index, rows = (in_blocks(part, width, dtype) for part in (self.index, self.rows))
+        return index, in_blocks(self.data, width, np.float64), rows
+
+
+Blocks = tuple[NDArray[np.integer], Float, NDArray[np.integer]]
+"""(B, nx, width) variables, (B, np, width) data and (B, nc, width) constraint rows."""
+
+
+def in_blocks(
+    table: NDArray[Any], width: int, dtype: type, fill: int | None = None
+) -> NDArray[Any]:
+    """(E, k) table as (B, k, width); the last row, or `fill`, in what is left over."""
+    extra = -len(table) % width
+    last = table[-1:] if fill is None else np.full_like(table[-1:], fill)
+    full: NDArray[Any] = np.concatenate([table, np.repeat(last, extra, axis=0)]).astype(dtype)
+    blocks = full.reshape(len(full) // width, width, table.shape[1])
+    return np.ascontiguousarray(blocks.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True)

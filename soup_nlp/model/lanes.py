@@ -8,9 +8,8 @@ take a fifth of the time.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
 from soup_nlp.model.compile import shared_library
-from soup_nlp.model.kernel import Table
+from soup_nlp.model.kernel import Blocks, in_blocks
 from soup_nlp.model.operations import OPERATIONS, input_sizes, instructions
 
 LANES = 8
@@ -129,61 +128,29 @@ def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL:
         raise NoCompilerError(str(error)) from error
 
 
-@dataclass(frozen=True)
-class Lanes:
-    """A table in blocks of LANES elements; the last element fills the last block.
-
-    Attributes:
-        index: (B, nx, LANES) variables.
-        data: (B, np, LANES) data.
-        rows: (B, nc, LANES) constraint rows.
-    """
-
-    index: NDArray[np.int32]
-    data: Float
-    rows: NDArray[np.int32]
-
-    @classmethod
-    def of(cls, table: Table) -> Lanes:
-        """The same table."""
-        index, rows = (in_lanes(part, np.int32) for part in (table.index, table.rows))
-        return cls(index, in_lanes(table.data), rows)
-
-
-@dataclass(frozen=True, eq=False)
 class Summed:
-    """One function of a kernel, summed over the kernel's table.
+    """One function of a kernel as machine code, summed over the kernel's table."""
 
-    Attributes:
-        call: The loop, of a library of `compile_lanes`.
-        lanes: The table.
-        place: (B, entries, LANES) index of the sum that each value is added to; the sum of the
-            values that pad the last block is dropped.
-    """
-
-    call: Callable[..., None]
-    lanes: Lanes
-    place: NDArray[np.int32]
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         library: ctypes.CDLL,
         function: ca.Function,
-        lanes: Lanes,
+        blocks: Blocks,
         place: NDArray[np.integer],
         size: int,
-    ) -> Summed:
-        """A function of a library of `compile_lanes`, its entries (E, k) added to `size` sums."""
-        call = library[f"{function.name()}_sum"]
-        call.restype = None
-        return cls(call, lanes, in_lanes(place, np.int32, fill=size))
+    ) -> None:
+        """Find the function.
 
-    @cached_property
-    def _table(self) -> list[ctypes.c_void_p]:
-        return [
-            _pointer(a) for a in (self.lanes.index, self.lanes.data, self.lanes.rows, self.place)
-        ]
+        Args:
+            library: Of `compile_lanes`.
+            function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,).
+            blocks: The kernel's table in blocks of LANES, with 32-bit indices.
+            place: (E, k) where each entry is added.
+            size: Of the vector; what pads the last block is added behind it.
+        """
+        self._call = library[f"{function.name()}_sum"]
+        self._call.restype = None
+        self._arrays = *blocks, in_blocks(place, LANES, np.int32, fill=size)
 
     def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
         """Add the elements' entries to `out`.
@@ -195,24 +162,12 @@ class Summed:
             lam_f: Multiplier of f, for Hessians.
             lam_g: (ng,) multipliers of g, for Hessians.
         """
-        index, data, rows, place = self._table
+        index, data, rows, place = map(_pointer, self._arrays)
         lam = x if lam_g is None else lam_g
-        blocks, factor = ctypes.c_long(len(self.place)), ctypes.c_double(lam_f)
+        blocks, factor = ctypes.c_long(len(self._arrays[0])), ctypes.c_double(lam_f)
         first = blocks, _pointer(x), index, data, _pointer(theta), factor
-        self.call(*first, _pointer(lam), rows, place, _pointer(out))
+        self._call(*first, _pointer(lam), rows, place, _pointer(out))
 
 
 def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
-
-
-def in_lanes(
-    table: NDArray[Any], dtype: type = np.float64, fill: int | None = None
-) -> NDArray[Any]:
-    """(E, k) table as (B, k, LANES); the last row, or `fill`, in what is left over."""
-    extra = -len(table) % LANES
-    last = table[-1:] if fill is None else np.full_like(table[-1:], fill)
-    full: NDArray[Any] = np.concatenate([table, np.repeat(last, extra, axis=0)]).astype(dtype)
-    return np.ascontiguousarray(
-        full.reshape(len(full) // LANES, LANES, table.shape[1]).transpose(0, 2, 1)
-    )

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-
 import casadi as ca
 import numpy as np
 
@@ -16,18 +13,12 @@ from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import Gauge, MatrixLayout
+from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.superpixel import View, matrix_view
+from soup_nlp.model.superpixel import matrix_view
 
 MIN_SCALE = 1e-4
 """Lower bound of scales and offsets."""
-
-
-@cache
-def _views(gauge: Gauge) -> Callable[[ca.SX, dict[str, ca.SX], int], View]:
-    """Makes the view of a superpixel from its variables and the data row, by position."""
-    return lambda x, row, position: matrix_view(x, gauge, row[f"offset_{position}"])
 
 
 def build_matrix_nlp(
@@ -49,7 +40,7 @@ def build_matrix_nlp(
     b = Builder(form, layout.size)
     stride = layout.stride
     for name, element in elements(data, weights, layout).items():
-        b.add_norms(name, element, _views(form.gauge), stride)
+        b.add_norms(name, element, matrix_view, form.gauge, stride)
 
     _add_constraints(b, layout, data, form)
     x0 = layout.pack(soup)
@@ -67,7 +58,7 @@ def _add_constraints(b: Builder, layout: MatrixLayout, data: EnergyData, form: F
     n, stride = layout.count, layout.stride
     every = layout.of(np.arange(n))
     x = ca.SX.sym("x", stride)
-    v = matrix_view(x, form.gauge, ca.SX(1.0))
+    v = matrix_view(x, {"offset_0": ca.SX(1.0)}, 0, form.gauge)
     b.add_constraint("so3", x, terms.so3(v), every, lower=0.0, upper=0.0)
     b.add_constraint("normal", x, terms.unit_normal(v), every, lower=0.0, upper=0.0)
     count = data.rim_ray.shape[1]

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
-import casadi as ca
 import numpy as np
 from scipy import sparse
 
@@ -15,7 +14,7 @@ from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group, Hessian
 from soup_nlp.model.pattern import Pattern, hessian_pattern, jacobian_pattern
 from soup_nlp.model.sums import Sum, summed
-from soup_nlp.model.symbolic import Symbolic
+from soup_nlp.model.symbolic import Graph
 
 
 @dataclass(frozen=True)
@@ -129,40 +128,12 @@ class NLP:
         """Of the Hessian's upper triangle; places for every group."""
         return hessian_pattern(self.groups, self.nx, self.hessian_kind)
 
-    # --- CasADi's graph: what the exports write and `nlpsol` may differentiate ---
-
     @cached_property
-    def p(self) -> Float:
-        """(np,) parameters of the graph: theta, then the data of every group, by elements."""
-        return np.concatenate([self.thetas(), *(g.table.data.ravel() for g in self.groups)])
-
-    def with_theta(self, **values: float) -> Float:
-        """p with other theta entries."""
-        return np.concatenate([self.thetas(**values), self.p[len(self.theta) :]])
-
-    @cached_property
-    def _symbolic(self) -> Symbolic:
-        return Symbolic(self.groups, self.nx, self.ng, len(self.theta))
-
-    @property
-    def oracle(self) -> ca.Function:
-        """(x, p) -> f, g."""
-        return self._symbolic.oracle
-
-    @property
-    def grad_f(self) -> ca.Function:
-        """(x, p) -> f, gradient."""
-        return self._symbolic.grad_f
-
-    @cached_property
-    def jac_g(self) -> ca.Function:
-        """(x, p) -> g, Jacobian (ng x nx sparse)."""
-        return self._symbolic.jac_g(self.jacobian_pattern)
-
-    @cached_property
-    def hess_lag(self) -> ca.Function:
-        """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
-        return self._symbolic.hess_lag(self.hessian_pattern, self.hessian_kind)
+    def graph(self) -> Graph:
+        """The same functions as CasADi's graph: what the exports write and `nlpsol` may
+        differentiate."""
+        patterns = self.jacobian_pattern, self.hessian_pattern
+        return Graph(self.groups, self.thetas(), *patterns, self.hessian_kind)
 
     @property
     def nx(self) -> int:

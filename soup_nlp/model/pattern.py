@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from soup_nlp.arrays import Float, Int
-from soup_nlp.model.kernel import Group
+from soup_nlp.model.kernel import Group, nonzeros
 
 
 class Entries(NamedTuple):
@@ -89,7 +89,7 @@ def hessian_pattern(groups: Sequence[Group], nx: int, hessian: str) -> Pattern:
 def _jacobian_entries(groups: Sequence[Group]) -> Iterator[Entries]:
     for group in groups:
         if group.kernel.nc:
-            r, c = group.kernel.jacobian_pattern()
+            r, c = nonzeros(group.kernel.first_order()["jac"])
             yield Entries(group.table.rows[:, r], group.table.index[:, c])
 
 
@@ -97,5 +97,5 @@ def _hessian_entries(groups: Sequence[Group], hessian: str) -> Iterator[Entries]
     for group in groups:
         # half the bytes sort in half the time
         index = group.table.index.astype(np.int32)
-        one, two = (index[:, k] for k in group.kernel.hessian_pattern(hessian))
+        one, two = (index[:, k] for k in nonzeros(group.kernel.second_order(hessian)))
         yield Entries(np.minimum(one, two), np.maximum(one, two))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float
 from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group
-from soup_nlp.model.lanes import Lanes, NoCompilerError, Summed, compile_lanes
+from soup_nlp.model.lanes import LANES, NoCompilerError, Summed, compile_lanes
 from soup_nlp.model.operations import NAMES, OPERATIONS, instructions
 from soup_nlp.model.vectors import Vectors
 
@@ -87,11 +87,12 @@ def summed(
             unknown = {i.operation for i in instructions(f)} - OPERATIONS.keys() - _OTHERS
             if unknown:
                 raise ModelError("unknown operation", where=f.name(), found=NAMES[min(unknown)])
-        library, lanes = None, None
+        library, blocks = None, None
         if compiled and own_functions:
             try:
                 # one library per kernel: the cache then still holds the kernels that did not change
-                library, lanes = compile_lanes(list(own_functions.values())), Lanes.of(group.table)
+                library = compile_lanes(list(own_functions.values()))
+                blocks = group.table.blocks(LANES, np.int32)
             except NoCompilerError as error:
                 compiled = False
                 log.info(
@@ -100,10 +101,10 @@ def summed(
                     error,
                 )
         for key, f in own_functions.items():
-            term: Summed | Vectors
-            if library and lanes:
-                term = Summed.of(library, f, lanes, own_places[key], sums[key].size)
-            else:
-                term = Vectors(f, group.table, own_places[key])
-            sums[key].terms.append(term)
+            place, size = own_places[key], sums[key].size
+            sums[key].terms.append(
+                Summed(library, f, blocks, place, size)
+                if library and blocks
+                else Vectors(f, group.table, place, size)
+            )
     return sums

@@ -6,6 +6,7 @@ two gauges, or tangent coordinates about a base) says how its variables make one
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -87,27 +88,26 @@ class View:
         return self.R @ ray + self.t * ca.dot(self.m, ray)
 
 
-def matrix_view(x: ca.SX, gauge: str, offset: ca.SX) -> View:
+def matrix_view(x: ca.SX, row: Mapping[str, ca.SX], position: int, gauge: str) -> View:
     """View of the constrained NLP's variables of one superpixel.
 
     Args:
         x: (16x1) `lam n R t` for gauge "unit-offset", else (17x1) `lam n d R t`; R by
             columns; lam, d and t scaled by N, 1/N and 1/N so that numbers are near 1.
+        row: The data row of an element: "offset_0" and so on are d in gauge "unit-offset".
+        position: Of the superpixel in the element.
         gauge: "unit-offset" or "unit-translation".
-        offset: d of gauge "unit-offset", a constant of the superpixel.
     """
     lam, n = x[0], x[1:4]
     if gauge == "unit-offset":
-        d, rest = offset, x[4:]
+        d, rest = row[f"offset_{position}"], x[4:]
     else:
         d, rest = x[4], x[5:]
     t = rest[9:12]
     return View(lam=lam, m=-n / d, n=n, turn=ca.reshape(rest[0:9], 3, 3), t=t, drift=lam * t)
 
 
-def tangent_view(
-    x: ca.SX, anchor: ca.SX, radius: ca.SX, depth: ca.SX, R0: ca.SX, t0: ca.SX, chart: str = "depth"
-) -> View:
+def tangent_view(x: ca.SX, row: Mapping[str, ca.SX], position: int, chart: str) -> View:
     """View of the presolve's variables of one superpixel.
 
     `1 / Z(r) = (1 + s . (r - r_a) / h) / Z`, Z = lam Z0 the depth of the anchor; rotation
@@ -120,13 +120,15 @@ def tangent_view(
     Args:
         x: (9x1) `lam s w q`: relative scale, slopes (2), rotation (3), shift of the moved anchor
             / Z (3); chart "inverse-depth" has `rho = 1 / lam` and `rho s`.
-        anchor: (3x1) anchor ray r_a.
-        radius: h, ray units.
-        depth: Z0, depth of the anchor in the base.
-        R0: (9x1) base rotation by columns.
-        t0: (3x1) translation / Z0 in the base.
+        row: The data row of an element: "anchor_0" and so on are (3x1) anchor rays r_a, "radius_0"
+            h in ray units, "depth_0" the depths Z0 of the anchors in the base, "R0_0" (9x1) the
+            base's rotations by columns, "t0_0" (3x1) its translations / Z0.
+        position: Of the superpixel in the element.
         chart: "depth" or "inverse-depth".
     """
+    anchor, radius, depth, R0, t0 = (
+        row[f"{k}_{position}"] for k in ("anchor", "radius", "depth", "R0", "t0")
+    )
     lam, s, w, q = x[0], x[1:3], x[3:6], x[6:9]
     if chart == "inverse-depth":
         lam, s = 1 / lam, s / lam

@@ -13,19 +13,46 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.arrays import Float
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.pattern import Pattern
 
 
-class Symbolic:
-    """Functions of an NLP, made when first asked for; p has theta, then the data of every group."""
+class Graph:
+    """Functions of an NLP, made when first asked for.
 
-    def __init__(self, groups: Sequence[Group], nx: int, ng: int, thetas: int) -> None:
-        """For groups that are not empty."""
+    Attributes:
+        p: (np,) values of the parameters: theta, then the data of every group, by elements.
+    """
+
+    def __init__(
+        self,
+        groups: Sequence[Group],
+        theta: Float,
+        jacobian: Pattern,
+        hessian: Pattern,
+        hessian_kind: str,
+    ) -> None:
+        """For groups that are not empty, and the patterns of their derivatives.
+
+        Args:
+            groups: Kernels and tables.
+            theta: Values of the shared parameters.
+            jacobian: Of g's Jacobian (ng x nx).
+            hessian: Of the upper triangle of the Lagrangian's Hessian.
+            hessian_kind: One of kernel.HESSIANS.
+        """
         self._groups, self._first = groups, [g.kernel.first_order() for g in groups]
-        sizes = {"x": nx, "p": thetas + sum(g.table.data.size for g in groups), "lam_g": ng}
-        self._x, self._p, self._lam_g = (ca.MX.sym(k, size) for k, size in sizes.items())
-        self._lam_f, self._thetas = ca.MX.sym("lam_f"), thetas
+        self._jacobian, self._hessian, self._kind = jacobian, hessian, hessian_kind
+        self._thetas = len(theta)
+        self.p = np.concatenate([theta, *(g.table.data.ravel() for g in groups)])
+        ng, nx = jacobian.shape
+        sizes = {"x": nx, "p": len(self.p), "lam_g": ng, "lam_f": 1}
+        self._x, self._p, self._lam_g, self._lam_f = (ca.MX.sym(*size) for size in sizes.items())
+
+    def parameters(self, theta: Float) -> Float:
+        """p with other values of theta."""
+        return np.concatenate([theta, self.p[self._thetas :]])
 
     @cached_property
     def oracle(self) -> ca.Function:
@@ -41,23 +68,20 @@ class Symbolic:
             "nlp_grad_f", {"f": self._f, "grad_f_x": _sum(self._x.numel(), places, local)}
         )
 
-    def jac_g(self, pattern: Pattern) -> ca.Function:
-        """(x, p) -> g, Jacobian (ng x nx) of a pattern."""
-        jac = _matrix(pattern, self._local("jac", self._first))
+    @cached_property
+    def jac_g(self) -> ca.Function:
+        """(x, p) -> g, Jacobian (ng x nx sparse)."""
+        jac = _matrix(self._jacobian, self._local("jac", self._first))
         return self._function("nlp_jac_g", {"g": self._g, "jac_g_x": jac})
 
-    def hess_lag(self, pattern: Pattern, hessian: str) -> ca.Function:
-        """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
-
-        Args:
-            pattern: From `hessian_pattern`.
-            hessian: One of kernel.HESSIANS.
-        """
-        second = [g.kernel.second_order(hessian) for g in self._groups]
+    @cached_property
+    def hess_lag(self) -> ca.Function:
+        """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
+        second = [g.kernel.second_order(self._kind) for g in self._groups]
         local = self._local("hess", [{"hess": h} if h else {} for h in second])
         symbols = [self._x, self._p, self._lam_f, self._lam_g]
         names = ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
-        return ca.Function("nlp_hess_l", symbols, [_matrix(pattern, local)], *names)
+        return ca.Function("nlp_hess_l", symbols, [_matrix(self._hessian, local)], *names)
 
     @cached_property
     def _f(self) -> ca.MX:
@@ -88,7 +112,7 @@ class Symbolic:
                 rows = _list(group.table.rows)
                 lam_c = ca.reshape(self._lam_g[rows], -1, size) if rows else ca.MX(0, size)
                 given += [ca.repmat(self._lam_f, 1, size), lam_c]
-            out.append(ca.vec(own_functions[key].map(size)(*given)))
+            out.append(ca.vec(own_functions[key].map(size)(*given).nz[:]))
         return out
 
 

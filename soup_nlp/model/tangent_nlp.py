@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-
 import casadi as ca
 import numpy as np
 
@@ -17,18 +14,7 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Chart, TangentLayout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.superpixel import View, tangent_view
-
-
-@cache
-def _views(chart: Chart) -> Callable[[ca.SX, dict[str, ca.SX], int], View]:
-    """Makes the view of a superpixel from its coordinates and the data row, by position."""
-
-    def view(x: ca.SX, row: dict[str, ca.SX], a: int) -> View:
-        base = {k: row[f"{k}_{a}"] for k in ("anchor", "radius", "depth", "R0", "t0")}
-        return tangent_view(x, **base, chart=chart)
-
-    return view
+from soup_nlp.model.superpixel import tangent_view
 
 
 def build_tangent_nlp(
@@ -59,7 +45,7 @@ def build_tangent_nlp(
     chart = layout.chart
     b = Builder(form, 9 * n)
     for name, element in elements(data, weights, layout).items():
-        b.add_norms(f"t_{name}", element, _views(chart), 9)
+        b.add_norms(f"t_{name}", element, tangent_view, chart, 9)
     exact = base is not None or (not data.local_units and chart == "depth")
     _add_simplex(b, soup, layout, slanted=exact)
     # visibility as in the constrained NLP, divided by the anchor's facing 1 / |m| and in chart

@@ -6,7 +6,8 @@
 Each function is one element: an edge (a, b) of the K-NN graph, a sampled pixel, a pair (a, b) of
 neighbours, or a superpixel a. A term takes the views of its superpixels and its row of data, and
 returns norms; E is the sum of `weight * ((1 - leak) min(|vector|, sigma) + leak |vector|)` over
-all of them. `elements` has the rows, `oracle` the same energy in numpy.
+all of them. A row without "sigma" has no truncation; with "pixel", the size of a pixel, lengths are
+in the paper's unit instead of pixels. `elements` has the rows, `oracle` the same energy in numpy.
 """
 
 from __future__ import annotations
@@ -24,18 +25,16 @@ Row = Mapping[str, ca.SX]
 # --- the energy, equation 7 ----------------------------------------------------------------------
 
 
-def arap(
-    a: View, b: View, row: Row, eps: ca.SX, truncated: bool, at_anchors: bool, local: bool
-) -> list[Norm]:
+def arap(a: View, b: View, row: Row, eps: ca.SX, at_anchors: bool) -> list[Norm]:
     """E_arap of an edge, Eq. 1: rotation, translation and distance of the anchors."""
-    sigma, leak = (row["sigma"], row["leak"]) if truncated else (None, 0.0)
+    sigma, leak = row.get("sigma"), row["leak"]
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
     weight, unit = row["weight"], row["unit"]
     length_eps, angle_eps = eps, eps
-    if local:
-        unit = unit / _nearness(Xa, Xb)
-    else:
+    if "pixel" in row:
         length_eps, angle_eps = eps * row["pixel"], eps * row["angle"]
+    else:
+        unit = unit / _nearness(Xa, Xb)
     rotation = row["turn"] * ca.vec(a.turn_from(b))
     translation = a.drift_from(b)
     if at_anchors:
@@ -48,9 +47,7 @@ def arap(
     ]
 
 
-def reprojection(
-    a: View, row: Row, eps: ca.SX, places: Sequence[tuple[int, int]], truncated: bool
-) -> list[Norm]:
+def reprojection(a: View, row: Row, eps: ca.SX, places: Sequence[tuple[int, int]]) -> list[Norm]:
     """E_proj of one pixel, Eq. 3: distance of homography and flow target, pixels.
 
     `places` is where the first two rows of the next frame's intrinsics are not 0, column by column;
@@ -59,54 +56,41 @@ def reprojection(
     y = a.transfer(row["ray"])
     K = ca.SX(ca.Sparsity.triplet(2, 3, *map(list, zip(*places))), row["K"])
     error = K @ (y / y[2]) - row["target"]
-    return [Norm("reprojection", row["weight"], error, eps, row["sigma"] if truncated else None)]
+    return [Norm("reprojection", row["weight"], error, eps, row.get("sigma"))]
 
 
-def continuity(
-    a: View,
-    b: View,
-    row: Row,
-    eps: ca.SX,
-    samples: int,
-    ref_truncated: bool,
-    truncated: bool,
-    local: bool,
-) -> list[Norm]:
+def continuity(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     """E_cont of a neighbour pair, Eq. 4: boundary gaps in both frames."""
-    rays = [row["rays"][3 * j : 3 * j + 3] for j in range(samples)]
-    points = [(a.point(ray), b.point(ray)) for ray in rays]
+    points = [(a.point(ray), b.point(ray)) for ray in ca.vertsplit(row["rays"], 3)]
     before = ca.vertcat(*(Xa - Xb for Xa, Xb in points))
     after = ca.vertcat(*(a.next_gap(Xa, b, Xb) for Xa, Xb in points))
     f = row["factor"]
-    if local:
-        f = f * _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
-    else:
+    if "pixel" in row:
         eps = eps * row["pixel"]
-    sigma_ref = row["sigma_ref"] if ref_truncated else None
-    sigma = row["sigma"] if truncated else None
+    else:
+        f = f * _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
     return [
-        Norm("gap_ref", row["weight"], f * before, eps, sigma_ref),
-        Norm("gap_next", row["weight"], f * after, eps, sigma),
+        Norm("gap_ref", row["weight"], f * before, eps, row.get("sigma_ref")),
+        Norm("gap_next", row["weight"], f * after, eps, row.get("sigma")),
     ]
 
 
-def orientation(a: View, b: View, row: Row, eps: ca.SX, truncated: bool) -> list[Norm]:
+def orientation(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     """E_orient of a neighbour pair, Eq. 6.
 
     `1 - n_i . n_k = |n_i - n_k|^2 / 2` on the unit sphere; the square is convex off it too.
     """
-    sigma = row["sigma"] if truncated else None
-    return [Norm("turn", row["weight"], a.n - b.n, eps, sigma, kind="half_square")]
+    return [Norm("turn", row["weight"], a.n - b.n, eps, row.get("sigma"), kind="half_square")]
 
 
-def prior(a: View, b: View, row: Row, eps: ca.SX, with_relief: bool) -> list[Norm]:
+def prior(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     """E_prior of an edge: slope of the inverse depth between two anchors, relative to it.
 
-    With `with_relief`, a given difference `row["relief"]` costs nothing.
+    A given difference `row["relief"]` costs nothing.
     """
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
     change = (1 / Xa[2] - 1 / Xb[2]) / _nearness(Xa, Xb)
-    change = change - row["relief"] if with_relief else change
+    change = change - row["relief"] if "relief" in row else change
     return [Norm("slope", row["weight"], change / row["reach"], eps)]
 
 

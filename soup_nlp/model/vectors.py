@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
-from soup_nlp.model.kernel import Table
+from soup_nlp.model.kernel import Table, in_blocks
 from soup_nlp.model.operations import OPERATIONS, input_sizes, instructions
 
 BLOCK = 2048
@@ -26,13 +26,16 @@ BLOCK = 2048
 class Vectors:
     """One function of a kernel, summed over the kernel's table."""
 
-    def __init__(self, function: ca.Function, table: Table, place: NDArray[np.integer]) -> None:
+    def __init__(
+        self, function: ca.Function, table: Table, place: NDArray[np.integer], sums: int
+    ) -> None:
         """Translate the function.
 
         Args:
             function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,).
             table: The kernel's table, E elements.
             place: (E, k) where each entry is added.
+            sums: Size of the vector; what pads the last block is added behind it.
         """
         size = max(1, min(BLOCK, len(table)))
         count = input_sizes(function)
@@ -40,20 +43,7 @@ class Vectors:
         self._theta, self._lam_f = np.empty(count[2]), np.empty(1)
         self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
         self._function = function
-        starts = range(0, len(table), size)
-        # the last block is filled with its last element, whose entries are then left out
-        blocks = [np.minimum(np.arange(s, s + size), len(table) - 1) for s in starts]
-        self._full = len(table) - size * (len(blocks) - 1) if blocks else 0
-        self._blocks = [
-            (
-                np.ascontiguousarray(table.index[b].T),
-                np.ascontiguousarray(table.data[b].T),
-                np.ascontiguousarray(table.rows[b].T),
-            )
-            for b in blocks
-        ]
-        # entries in the order in which blocks give them
-        self._place = [np.ascontiguousarray(place[s : s + size].T).ravel() for s in starts]
+        self._blocks = list(zip(*table.blocks(size), in_blocks(place, size, np.int64, fill=sums)))
 
     @cached_property
     def _calls(self) -> list[tuple[Callable[..., Any], Any]]:
@@ -83,14 +73,12 @@ class Vectors:
     def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
         """Add the elements' entries to `out`; arguments as of `lanes.Summed.add`."""
         self._theta[:], self._lam_f[0] = theta[: len(self._theta)], lam_f
-        calls, last = self._calls, len(self._blocks) - 1
         with np.errstate(all="ignore"):
-            for k, (index, data, rows) in enumerate(self._blocks):
+            for index, data, rows, place in self._blocks:
                 np.take(x, index, out=self._x)
                 self._data[:] = data
                 if lam_g is not None:
                     np.take(lam_g, rows, out=self._lam_c)
-                for call, given in calls:
+                for call, given in self._calls:
                     call(*given)
-                entries = self._out if k < last else self._out[:, : self._full]
-                out += np.bincount(self._place[k], entries.ravel(), len(out))
+                out += np.bincount(place.ravel(), self._out.ravel(), len(out))

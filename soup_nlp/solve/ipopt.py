@@ -14,7 +14,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.functions import Functions, IterationCallback
+from soup_nlp.solve.functions import Functions, iteration_callback
 from soup_nlp.storage.progress import Progress, Watch, interruptible, raising
 
 # few bounds are active, so mu starts near its end (docs/solving.md)
@@ -79,13 +79,12 @@ class Stage:
     __repr__ = __str__
 
 
-class _Iterations(IterationCallback):
-    """CasADi's iteration callback: progress, limits, the best iterate."""
+class _Iterations:
+    """Iterations of one call of Ipopt: progress, limits, the best iterate."""
 
     def __init__(
         self, nlp: NLP, x0: Float, stage: str, watch: Watch, seconds: float, stagnation: float
     ) -> None:
-        super().__init__()
         self.stagnation, self.last_f, self.still = stagnation, np.inf, 0
         self.nlp, self.stage, self.watch = nlp, stage, watch
         self.signalled = threading.Event()
@@ -96,26 +95,26 @@ class _Iterations(IterationCallback):
         self.x0 = self.best_x = x0
         self.best_lam: tuple[Float, Float] | None = None
         self.reason = ""
-        self.start(f"watch_{nlp.name}", nlp.nx, nlp.ng, len(nlp.theta))
+        sizes = nlp.nx, nlp.ng, len(nlp.theta)
+        self.callback = iteration_callback(f"watch_{nlp.name}", *sizes, self.stop)
 
-    def eval(self, arg: list[ca.DM]) -> list[int]:
+    def stop(self, *outputs: Float) -> float:
+        """Whether to stop after this iteration; a callback must not raise."""
         try:
-            return [self._step(arg)]
+            self._step(*outputs)
         except Exception as error:
             self.reason = f"Callback_Failed: {error}"
-            return [1]
+        return float(bool(self.reason))
 
-    def _step(self, arg: list[ca.DM]) -> int:
-        nlp = self.nlp
-        x, f = np.asarray(arg[0]).ravel(), float(arg[1])
-        g = np.asarray(arg[2]).ravel()
+    def _step(self, x: Float, value: Float, g: Float, *multipliers: Float) -> None:
+        nlp, f = self.nlp, float(value[0])
         outside = np.maximum(nlp.lbg - g, g - nlp.ubg)
         infeasible = float(max(outside.max(initial=0.0), 0.0))
         # an exact penalty: retraction repairs a small violation, not a large one
         rank = f + 10.0 * infeasible * max(1.0, abs(f))
         if np.isfinite(f) and rank < self.best:
-            self.best, self.best_x, self.best_f = rank, x, f
-            self.best_lam = np.asarray(arg[3]).ravel(), np.asarray(arg[4]).ravel()
+            self.best, self.best_x, self.best_f = rank, x.copy(), f
+            self.best_lam = multipliers[0].copy(), multipliers[1].copy()
         now = time.perf_counter()
         if self.watch.listener:
             self.watch.listener(Progress(self.stage, self.count, f, infeasible, now - self.begin))
@@ -129,7 +128,6 @@ class _Iterations(IterationCallback):
             self.reason = "Interrupted"
         elif now > self.deadline:
             self.reason = "Time_Limit"
-        return int(bool(self.reason))
 
     def ended(self, stats: Mapping[str, Any], out: Mapping[str, Float]) -> Stage:
         """The record of the call: Ipopt's answer, or the best iterate where it did not converge.
@@ -172,8 +170,8 @@ class Ipopt:
         # CasADi does not keep a callback alive
         self.functions = Functions(nlp)
 
-    def _solver(self, callback: _Iterations, max_iter: int, tol: float) -> Any:
-        functions, log_file = self.functions, callback.watch.log_file
+    def _solver(self, iterations: _Iterations, max_iter: int, tol: float) -> Any:
+        functions, log_file = self.functions, iterations.watch.log_file
         ipopt: dict[str, Any] = {
             **DEFAULTS,
             "max_iter": max_iter,
@@ -190,7 +188,7 @@ class Ipopt:
             "grad_f": functions.grad_f,
             "jac_g": functions.jac_g,
             "hess_lag": functions.hess_lag,
-            "iteration_callback": callback,
+            "iteration_callback": iterations.callback,
             "print_time": False,
             "calc_lam_p": False,
             "calc_multipliers": False,
@@ -240,12 +238,12 @@ class Ipopt:
             KeyboardInterrupt: Ctrl-C, which ends the solve at the next iteration.
         """
         nlp = self.nlp
-        callback = _Iterations(nlp, x0, stage, watch or Watch(), seconds, stagnation)
-        solver = self._solver(callback, max_iter, tol)
+        iterations = _Iterations(nlp, x0, stage, watch or Watch(), seconds, stagnation)
+        solver = self._solver(iterations, max_iter, tol)
         given = {"p": nlp.thetas() if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
         bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
-        with interruptible(numbers=raising()) as callback.signalled:
+        with interruptible(numbers=raising()) as iterations.signalled:
             out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
-        if callback.signalled.is_set():
+        if iterations.signalled.is_set():
             raise KeyboardInterrupt
-        return callback.ended(solver.stats(), {k: np.asarray(v).ravel() for k, v in out.items()})
+        return iterations.ended(solver.stats(), {k: np.asarray(v).ravel() for k, v in out.items()})

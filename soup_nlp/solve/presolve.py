@@ -12,7 +12,8 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Chart, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart, majorant
@@ -96,7 +98,7 @@ class Presolve:
         """All stages, until one of them is stopped."""
         start, o = self.soup, self.o
         program = self._program(start)
-        self._majorant(program, o.presolve_eps)
+        self._run(program, [_Planned(f"majorant {eps:g}", eps) for eps in o.presolve_eps])
         if o.untruncated and np.isfinite(self.weights.sigma_arap) and not self._stopped():
             program = self._untruncated(start, program)
         if o.exact_iterations and not self._stopped():
@@ -127,49 +129,21 @@ class Presolve:
         """
         first, o = self.soup, self.o
         program = self._program(start, self.weights.replace(sigma_arap=np.inf))
-        self._majorant(program, list(UNTRUNCATED)[:1], "untruncated ", 10 * o.stagnation)
-        exact = replace(program, nlp=replace(program.nlp, hessian_kind="exact"))
-        solver = Ipopt(exact.nlp, {**KEEP, **o.ipopt})
-        for eps, share in UNTRUNCATED.items():
-            if self._stopped():
-                break
-            self._stage(
-                exact,
-                solver,
-                eps=eps,
-                max_iter=o.presolve_iterations,
-                stagnation=o.stagnation * share,
-                stage=f"untruncated exact {eps:g}",
-            )
+        widest = max(UNTRUNCATED)
+        self._run(program, [_Planned(f"majorant untruncated {widest:g}", widest, 10.0)])
+        exact = [
+            _Planned(f"untruncated exact {eps:g}", eps, share) for eps, share in UNTRUNCATED.items()
+        ]
+        self._run(program, exact, hessian="exact")
         if not self._stopped():
             other = self._program(self.soup)
-            other = replace(other, lam_x=exact.lam_x, lam_g=exact.lam_g)
-            self._majorant(other, o.presolve_eps[-2:], "truncated ")
+            other = replace(other, lam_x=program.lam_x, lam_g=program.lam_g)
+            last = o.presolve_eps[-2:]
+            self._run(other, [_Planned(f"majorant truncated {eps:g}", eps) for eps in last])
             if self._energy(self.soup) < self._energy(first):
                 return other
         self.soup = min(self.soup, first, key=self._energy)
         return before
-
-    def _majorant(
-        self,
-        program: _Program,
-        widths: Sequence[float],
-        kind: str = "",
-        stagnation: float | None = None,
-    ) -> None:
-        """Stages with theta = 0 of decreasing smoothing."""
-        o, solver = self.o, Ipopt(program.nlp, {**KEEP, **self.o.ipopt})
-        for eps in widths:
-            self._stage(
-                program,
-                solver,
-                eps=eps,
-                max_iter=o.presolve_iterations,
-                stagnation=o.stagnation if stagnation is None else stagnation,
-                stage=f"majorant {kind}{eps:g}",
-            )
-            if self._stopped():
-                break
 
     def _to_the_minimum(self, before: _Program) -> None:
         """Gauss-Newton stages with growing theta, then the exact Hessian, at the final smoothing.
@@ -185,49 +159,72 @@ class Presolve:
         program.lam_g = before.lam_g
         if program.layout.chart == "depth":
             program.lam_x = before.lam_x
-        solver = Ipopt(program.nlp, {**KEEP, "mu_init": 1e-6, **o.ipopt})
-        for theta, share in THETAS.items():
-            self._stage(
-                program,
-                solver,
-                eps=o.eps,
-                more={"theta": theta, "ridge": RIDGE},
-                max_iter=o.presolve_iterations,
-                stagnation=o.stagnation * share,
-                stage=f"Gauss-Newton {theta:g}",
-            )
-            if self._stopped():
-                return
-        solver = Ipopt(replace(program.nlp, hessian_kind="exact"), {**KEEP, **LAST, **o.ipopt})
-        limit = o.exact_iterations
-        stage = self._stage(program, solver, eps=o.eps, max_iter=limit, stage=EXACT)
-        self.rim = _rim(program.nlp, program.layout, stage)
+        growing = [
+            _Planned(f"Gauss-Newton {theta:g}", o.eps, share, {"theta": theta, "ridge": RIDGE})
+            for theta, share in THETAS.items()
+        ]
+        self._run(program, growing, options={"mu_init": 1e-6})
+        if not self._stopped():
+            last, limit = [_Planned(EXACT, o.eps, 0.0)], o.exact_iterations
+            self._run(program, last, hessian="exact", options=LAST, max_iter=limit)
+            self.rim = _rim(program)
 
-    def _stage(
+    def _run(
         self,
         program: _Program,
-        solver: Ipopt,
+        stages: Sequence[_Planned],
         *,
-        eps: float,
-        more: Mapping[str, float] | None = None,
-        **limits: Any,
-    ) -> Stage:
-        """Run a stage from where the program stands; `soup` is where it ends."""
-        stage = solver(
-            x0=program.x,
-            lam_x0=program.lam_x,
-            lam_g0=program.lam_g,
-            p=program.nlp.thetas(eps=eps, eps_pixel=eps, **(more or {})),
-            tol=self.o.presolve_tol,
-            seconds=max(1.0, self.deadline - time.perf_counter()),
-            watch=self.watch,
-            **limits,
-        )
-        program.x, program.lam_x, program.lam_g = stage.x, stage.lam_x, stage.lam_g
-        self.soup = program.layout.unpack(stage.x)
-        self.stages.append(stage)
-        self.watch.say(str(stage))
-        return stage
+        hessian: Hessian | None = None,
+        options: Mapping[str, Any] | None = None,
+        max_iter: int | None = None,
+    ) -> None:
+        """Run stages from where the program stands, until one is stopped; `soup` is the end.
+
+        Args:
+            program: Its point and multipliers move along.
+            stages: In their order.
+            hessian: Default the program's.
+            options: Of Ipopt, besides `KEEP`.
+            max_iter: Iteration limit of each; default `presolve_iterations`.
+        """
+        o, nlp = self.o, program.nlp
+        nlp = nlp if hessian is None else replace(nlp, hessian_kind=hessian)
+        solver = Ipopt(nlp, {**KEEP, **(options or {}), **o.ipopt})
+        for planned in stages:
+            if self.stages and self._stopped():
+                break
+            stage = solver(
+                x0=program.x,
+                lam_x0=program.lam_x,
+                lam_g0=program.lam_g,
+                p=nlp.thetas(eps=planned.eps, eps_pixel=planned.eps, **planned.theta),
+                tol=o.presolve_tol,
+                seconds=max(1.0, self.deadline - time.perf_counter()),
+                watch=self.watch,
+                max_iter=o.presolve_iterations if max_iter is None else max_iter,
+                stagnation=o.stagnation * planned.share,
+                stage=planned.name,
+            )
+            program.x, program.lam_x, program.lam_g = stage.x, stage.lam_x, stage.lam_g
+            self.soup = program.layout.unpack(stage.x)
+            self.stages.append(stage)
+            self.watch.say(str(stage))
+
+
+class _Planned(NamedTuple):
+    """A stage to run.
+
+    Attributes:
+        name: For progress and reports.
+        eps: Smoothing width.
+        share: Share of `stagnation` that ends it.
+        theta: Further parameters of the NLP.
+    """
+
+    name: str
+    eps: float
+    share: float = 1.0
+    theta: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass
@@ -249,8 +246,8 @@ class _Program:
     lam_g: Float
 
 
-def _rim(nlp: NLP, layout: TangentLayout, stage: Stage) -> Float:
+def _rim(program: _Program) -> Float:
     """(N, V) multipliers of rim visibility, its rows divided by the facing of the anchor."""
-    rows = next(g for g in nlp.groups if g.kernel.name == "t_visible").table.rows
-    multipliers = -stage.lam_g[rows]
-    return multipliers if layout.chart == "depth" else multipliers * stage.x[::9, None]
+    rows = next(g for g in program.nlp.groups if g.kernel.name == "t_visible").table.rows
+    multipliers = -program.lam_g[rows]
+    return multipliers if program.layout.chart == "depth" else multipliers * program.x[::9, None]

@@ -239,7 +239,7 @@ def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room, mon
 
 def _with_targets(nlp: NLP, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
     """Parameters of the NLP, and positions (E, 2) of the flow's targets among them."""
-    p = nlp.with_theta(eps=smoothing, eps_pixel=smoothing)
+    p = nlp.graph.parameters(nlp.thetas(eps=smoothing, eps_pixel=smoothing))
     offset = len(nlp.theta)
     for group in nlp.groups:
         rows, width = group.table.data.shape

@@ -168,7 +168,7 @@ def test_the_start_does_not_change_the_program():
         built[start] = build_instance(case, record, parse_name(name).formulation, start)
     first, layout, _ = built["hard"]
     for nlp, other, _ in built.values():
-        assert np.array_equal(nlp.p, first.p)
+        assert np.array_equal(nlp.graph.p, first.graph.p)
         assert np.array_equal(other.R0, layout.R0)
     # and the best known point is that of the matrices
     tangent, _, _ = build_instance(case, record, "tangent/smooth", "best")

@@ -20,7 +20,6 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment, split_components
-from soup_nlp.model import matrix, tangent_nlp
 from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
@@ -30,6 +29,7 @@ from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.reweighting import in_pixels
+from soup_nlp.model.superpixel import matrix_view, tangent_view
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit, Views
 
@@ -180,17 +180,14 @@ def exact_terms(
     x: Float, data: EnergyData, weights: Weights, layout: MatrixLayout | TangentLayout
 ) -> dict[str, float]:
     """Exact energy by term of a solver's vector, from the norms of the symbolic terms."""
-    if isinstance(layout, MatrixLayout):
-        view = matrix._views(layout.gauge)
-    else:
-        view = tangent_nlp._views(layout.chart)
+    matrix = isinstance(layout, MatrixLayout)
+    view, option = (matrix_view, layout.gauge) if matrix else (tangent_view, layout.chart)
     out = {}
     for name, element in elements(data, weights, layout).items():
         variables = ca.SX.sym("x", layout.stride * element.arity)
         row = {k: ca.SX.sym(k, count) for k, count in element.fields.items()}
-        views = [
-            view(part, row, a) for a, part in enumerate(ca.vertsplit(variables, layout.stride))
-        ]
+        parts = ca.vertsplit(variables, layout.stride)
+        views = [view(part, row, a, option) for a, part in enumerate(parts)]
         total = ca.SX(0)
         for n in element.norms(views, row, ca.SX(0), ca.SX(0)):
             square = ca.dot(n.vector, n.vector)

@@ -124,7 +124,7 @@ def test_sizes_are_those_of_the_formulation():
     # orientation has no epigraph (a square is smooth)
     assert slack.sizes()["variables"] == 16 * n + norms
     assert slack.sizes()["inequalities"] == 9 * n + norms
-    assert sizes["jacobian_nonzeros"] == nlp.nnzj == nlp.jac_g.nnz_out(1)
+    assert sizes["jacobian_nonzeros"] == nlp.nnzj == nlp.graph.jac_g.nnz_out(1)
 
 
 def test_the_print_shows_sizes_bound_kinds_and_sparsity():
@@ -157,7 +157,7 @@ def test_unknown_kinds_of_formulation_are_refused(wrong):
 def test_unknown_parameters_are_refused():
     nlp, _ = tiny().nlp(PAPER, form())
     with pytest.raises(ModelError, match="unknown parameter"):
-        nlp.with_theta(epsilon=1.0)
+        nlp.thetas(epsilon=1.0)
 
 
 def test_a_table_must_fit_its_kernel_and_be_finite():

@@ -15,7 +15,7 @@ from soup_nlp.model import compile as compiling
 from soup_nlp.model import vectors
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
-from soup_nlp.model.lanes import LANES, Lanes, Summed, compile_lanes
+from soup_nlp.model.lanes import LANES, Summed, compile_lanes
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
@@ -108,11 +108,12 @@ def test_the_functions_that_ipopt_takes_are_those_of_the_graph(case, compiled, n
     form = Formulation(compiled=compiled, norm=norm)
     nlp, _ = build_matrix_nlp(case.soup, case.data, case.weights, form)
     x, lam_f, lam_g = nlp.x0, 0.7, np.random.default_rng(3).normal(size=nlp.ng)
-    fast, theta, p = Functions(nlp), nlp.thetas(eps=0.05), nlp.with_theta(eps=0.05)
-    one, two = [fast.hess_lag(x, theta, lam_f, lam_g)], [nlp.hess_lag(x, p, lam_f, lam_g)]
+    fast, graph, theta = Functions(nlp), nlp.graph, nlp.thetas(eps=0.05)
+    p = graph.parameters(theta)
+    one, two = [fast.hess_lag(x, theta, lam_f, lam_g)], [graph.hess_lag(x, p, lam_f, lam_g)]
     for name in ("oracle", "grad_f", "jac_g"):
         one += getattr(fast, name)(x, theta)
-        two += getattr(nlp, name)(x, p)
+        two += getattr(graph, name)(x, p)
     for a, b in zip(one, two, strict=True):
         assert a.sparsity() == b.sparsity()
         close(a.nonzeros(), b.nonzeros())
@@ -154,9 +155,10 @@ def test_every_operation_has_casadis_value(every, block, monkeypatch):
     out = np.ones(4 * width + 1)
     if block:
         monkeypatch.setattr(vectors, "BLOCK", block)
-        term = vectors.Vectors(every, table, place)
+        term = vectors.Vectors(every, table, place, 4 * width)
     else:
-        term = Summed.of(compile_lanes([every]), every, Lanes.of(table), place, 4 * width)
+        blocks = table.blocks(LANES, np.int32)
+        term = Summed(compile_lanes([every]), every, blocks, place, 4 * width)
     term.add(out, x, np.zeros(0), 1.0, None)
     expected = np.array([np.asarray(every(*pair, [])).ravel() for pair in zip(x, data.ravel())])
     sums = 1 + expected[::2] + expected[1::2]

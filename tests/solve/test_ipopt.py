@@ -124,7 +124,7 @@ def test_chained_rosenbrock_reaches_the_ones():
 
 def test_hessian_of_an_unsorted_table_is_upper_triangular():
     nlp = rosenbrock(4)
-    assert nlp.hess_lag.sparsity_out(0).is_triu()
+    assert nlp.graph.hess_lag.sparsity_out(0).is_triu()
     x = np.array([0.3, -0.5, 0.7, 1.2])
     H = nlp.hessian(x, np.zeros(0)).toarray()
     expected = np.zeros((4, 4))

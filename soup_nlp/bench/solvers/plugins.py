@@ -28,7 +28,7 @@ from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
-from soup_nlp.solve.functions import Functions, IterationCallback
+from soup_nlp.solve.functions import Functions, iteration_callback
 from soup_nlp.solve.ipopt import DEFAULTS
 from soup_nlp.storage.system import end_with_parent
 
@@ -193,29 +193,26 @@ FIRST = ("nlp_grad_f", "nlp_jac")
 """Beginnings of the names of functions without multipliers."""
 
 
-class _Watch(IterationCallback):
-    """Stops a plug-in at a time of `clock`."""
-
-    def __init__(self, end: float) -> None:
-        super().__init__()
-        self.end, self.late = end, False
-
-    def eval(self, arg: list[ca.DM]) -> list[int]:
-        self.late = clock() > self.end
-        return [int(self.late)]
-
-
 def plugin(name: str, task: Task) -> Answer:
     """Solve with a plug-in of nlpsol and the derivatives of this package."""
     chosen = PLUGINS[name]
     library = chosen.library
     nlp = task.gauss_newton if chosen.hessian == "gauss-newton" else task.nlp
-    watch = _Watch(clock() + task.limits.seconds)
+    end = clock() + task.limits.seconds
+    ended: list[bool] = []
+
+    def late(*outputs: Float) -> float:
+        """Whether the time is over; then `ended` has an entry."""
+        if clock() > end:
+            ended.append(True)
+        return float(bool(ended))
+
     # parameters are replaced by numbers, since bonmin has no parameters
     x, functions = ca.MX.sym("x", nlp.nx), Functions(nlp)
     # these libraries differentiate f and g at set-up, in spite of cached derivatives
     symbolic = library in ("bonmin", "uno")
-    f, g = nlp.oracle(x, nlp.p) if symbolic else functions.oracle(x, nlp.thetas())
+    program = (nlp.graph.oracle, nlp.graph.p) if symbolic else (functions.oracle, nlp.thetas())
+    f, g = program[0](x, program[1])
     common: dict[str, Any] = {
         "print_time": False,
         "show_eval_warnings": False,
@@ -224,8 +221,7 @@ def plugin(name: str, task: Task) -> Answer:
         "cache": _derivatives(nlp, functions, CACHED[library]),
     }
     if library in CALLS_BACK:
-        watch.start("watch", nlp.nx, nlp.ng, 0)
-        common["iteration_callback"] = watch
+        common["iteration_callback"] = iteration_callback("watch", nlp.nx, nlp.ng, 0, late)
     problem = {"x": x, "f": f, "g": g}
     solver = ca.nlpsol("solver", library, problem, common | chosen.made_for(task.limits))
     out = solver(x0=nlp.x0, lbx=nlp.lbx, ubx=nlp.ubx, lbg=nlp.lbg, ubg=nlp.ubg)
@@ -235,8 +231,8 @@ def plugin(name: str, task: Task) -> Answer:
     return Answer(
         np.asarray(out["x"]).ravel(),
         np.asarray(out["lam_g"]).ravel(),
-        "Time_Limit" if watch.late else status,
-        claimed and not watch.late,
+        "Time_Limit" if ended else status,
+        claimed and not ended,
         int(stats.get("iter_count", -1)),
     )
 
