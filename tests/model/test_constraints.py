@@ -163,22 +163,6 @@ def test_every_row_and_every_bound_is_the_specified_one(gauge, norm):
         assert (lower, upper) == BOUNDS[kind_of(name)], name
 
 
-@pytest.mark.parametrize("entry", range(6))
-def test_each_row_of_so3_sees_its_own_entry(entry):
-    nlp, _ = tiny().nlp(PAPER, form())
-    i, k = ENTRIES[entry]
-    gram = np.eye(3)
-    gram[i, k] += 0.1
-    gram[k, i] = gram[i, k]
-    x, names = nlp.x0.copy(), nlp.x_names()
-    place = [names.index(f"R[4,{r},{c}]") for r in (1, 2, 3) for c in (1, 2, 3)]
-    x[place] = (x[place].reshape(3, 3) @ np.linalg.cholesky(gram).T).ravel()
-    expected = np.zeros((12, 6))
-    expected[4, entry] = 0.1
-    so3 = value(nlp, x)[1][rows(nlp, "so3")].reshape(12, 6)
-    np.testing.assert_allclose(so3, expected, atol=1e-12)
-
-
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_slack_variables_on_their_epigraph_are_the_smooth_norms(gauge):
     problem, w = tiny("pixels"), weights_for("pixels")

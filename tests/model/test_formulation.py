@@ -97,14 +97,17 @@ def test_names_are_unique_and_as_many_as_there_are_numbers(gauge, norm):
     assert {"so3", "normal", "visible", "simplex"} <= kinds
 
 
-def test_names_of_the_presolve():
+@pytest.mark.parametrize(
+    ("chart", "plane"), [("depth", ["lam", "s1", "s2"]), ("inverse-depth", ["rho", "g1", "g2"])]
+)
+def test_names_of_the_presolve(chart, plane):
     problem = tiny()
-    nlp, _ = build_tangent_nlp(problem.soup, problem.data, PAPER, form())
+    nlp, _ = build_tangent_nlp(problem.soup, problem.data, PAPER, form(), chart)
     assert len(set(nlp.x_names())) == nlp.nx == 9 * 12
     names = nlp.g_names()
     assert len(set(names)) == nlp.ng
     assert {re.sub(r"\[.*", "", name) for name in names} == {"simplex", "visible"}
-    assert nlp.x_names()[9:12] == ["lam[1]", "s1[1]", "s2[1]"]
+    assert nlp.x_names()[9:12] == [f"{k}[1]" for k in plane]
 
 
 def test_sizes_are_those_of_the_formulation():
@@ -180,21 +183,14 @@ def test_a_table_must_fit_its_kernel_and_be_finite():
 
 @pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("norm", NORMS)
-def test_the_same_soup_has_the_same_objective_in_every_gauge(norm, units):
-    problem, found = tiny(units), []
-    for gauge in GAUGES:
-        nlp, _ = problem.nlp(weights_for(units), form(gauge=gauge, norm=norm))
-        found.append(value(nlp, nlp.x0)[0])
+def test_the_same_soup_has_the_same_objective_in_all_variables(norm, units):
+    problem, weights = tiny(units), weights_for(units)
+    nlps = [problem.nlp(weights, form(gauge=gauge, norm=norm))[0] for gauge in GAUGES]
+    nlps.append(build_tangent_nlp(problem.soup, problem.data, weights, form(norm=norm))[0])
+    found = [value(nlp, nlp.x0)[0] for nlp in nlps]
     assert found[0] > 0
-    np.testing.assert_allclose(found, found[0], rtol=1e-12)
-
-
-@pytest.mark.parametrize("units", UNITS)
-def test_the_presolve_has_the_same_objective_as_the_constrained_nlp(units):
-    problem = tiny(units)
-    one, _ = problem.nlp(weights_for(units), form())
-    two, _ = build_tangent_nlp(problem.soup, problem.data, weights_for(units), form())
-    assert value(two, two.x0)[0] == pytest.approx(value(one, one.x0)[0], rel=1e-11)
+    np.testing.assert_allclose(found[:-1], found[0], rtol=1e-12)
+    assert found[-1] == pytest.approx(found[0], rel=1e-11)
 
 
 def test_the_length_unit_weighs_distances_by_share():
@@ -209,16 +205,3 @@ def test_the_length_unit_weighs_distances_by_share():
     # with equal shares the unit would be the mean distance, which is another one
     soup = layout.unpack(nlp.x0[: layout.size])
     assert abs(float(np.mean(soup.distance)) - 1) > 0.01
-
-
-def test_the_presolve_starts_feasible_on_inverse_depth_too():
-    problem = tiny("pixels")
-    own = problem.soup, problem.data, weights_for("pixels"), form()
-    nlp, layout = build_tangent_nlp(*own, chart="inverse-depth")
-    assert nlp.x_names()[:3] == layout.names()[:3] == ["rho[0]", "g1[0]", "g2[0]"]
-    # away from the base of the chart, where rho is 1 and 1 / rho too
-    x = nlp.x0.copy()
-    x[::9] *= np.linspace(0.8, 1.25, layout.count)
-    row = nlp.g_names().index("simplex[0]")
-    share = problem.soup.normalised(layout.share).lam
-    assert nlp.constraints(x)[row] == pytest.approx((share / x[::9]).sum(), rel=1e-12)

@@ -21,7 +21,6 @@ from helpers_model import (
     wiggle,
 )
 
-from soup_nlp.model import compile as compiling
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
@@ -142,30 +141,6 @@ def test_derivatives_equal_finite_differences(coordinates, norm, units, at_ancho
     assert_derivatives(nlp, wiggle(nlp, layout.size, 3, 0.05), 4)
 
 
-@pytest.mark.parametrize("gauge", GAUGES)
-def test_every_entry_of_jacobian_and_hessian(gauge):
-    """Column by column, with the name of the entry that disagrees."""
-    nlp, layout = program(gauge, "smooth", "pixels", True)
-    x = wiggle(nlp, layout.size, 7, 0.03)
-    lam_g = np.random.default_rng(8).normal(size=nlp.ng)
-    J, H = nlp.jacobian(x).toarray(), nlp.hessian(x, lam_g).toarray()
-    names, rows = nlp.x_names(), nlp.g_names()
-    scale = 1 + np.abs(H).max()
-
-    def both(y: np.ndarray) -> np.ndarray:
-        """Constraints, then the gradient of the Lagrangian."""
-        return np.append(nlp.constraints(y), lagrangian_gradient(nlp, y, 1.0, lam_g))
-
-    for j in range(0, nlp.nx, 3):
-        v = np.zeros(nlp.nx)
-        v[j] = 1.0
-        column, slope = np.split(directional(both, x, v), [nlp.ng])
-        wrong = np.flatnonzero(np.abs(column - J[:, j]) > 1e-8)
-        assert not len(wrong), f"d {rows[wrong[0]]} / d {names[j]}"
-        wrong = np.flatnonzero(np.abs(slope - H[:, j]) > 1e-8 * scale)
-        assert not len(wrong), f"d2 / d {names[wrong[0]]} d {names[j]}"
-
-
 # --- kinds of Hessian ----------------------------------------------------------------------------
 
 
@@ -231,26 +206,3 @@ def test_theta_is_the_share_of_curvature_left_out():
     assert np.abs(whole - less).max() > 1e-3 * scale
     np.testing.assert_allclose(half, (whole + less) / 2, atol=1e-12 * scale)
     assert np.linalg.eigvalsh(whole - less)[0] >= -1e-12 * scale
-
-
-# --- machine code --------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
-@pytest.mark.parametrize(
-    ("coordinates", "norm", "kind"),
-    [("unit-translation", "epigraph", "exact"), ("tangent", "smooth", "gauss-newton")],
-)
-def test_machine_code_equals_numpy(coordinates, norm, kind):
-    slow, layout = program(coordinates, norm, "pixels", False, hessian=kind)
-    fast, _ = program(coordinates, norm, "pixels", False, hessian=kind, compiled=True)
-    x, lam_g = wiggle(slow, layout.size, 1, 0.05), np.random.default_rng(0).normal(size=slow.ng)
-    for nlp_numbers in (
-        lambda nlp: nlp.value(x),
-        lambda nlp: nlp.constraints(x),
-        lambda nlp: nlp.gradient(x),
-        lambda nlp: nlp.jacobian(x).toarray(),
-        lambda nlp: nlp.hessian(x, lam_g).toarray(),
-    ):
-        one, two = nlp_numbers(fast), nlp_numbers(slow)
-        np.testing.assert_allclose(one, two, rtol=1e-12, atol=1e-12 * np.abs(two).max())

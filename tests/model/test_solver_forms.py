@@ -153,13 +153,6 @@ def test_the_epigraph_at_its_optimum_is_the_smooth_form(units):
     np.testing.assert_allclose(one.x0, optimal_slacks(one), rtol=1e-12)
 
 
-def test_orientation_can_do_without_truncation():
-    problem, weights = tiny(), PAPER.replace(sigma_orient=np.inf)
-    nlp, _ = problem.nlp(weights, form())
-    exact = oracle.energy(problem.soup, problem.data, weights)["orient"]
-    assert by_term(nlp, nlp.x0)["orient"] == pytest.approx(exact, rel=1e-12)
-
-
 @pytest.mark.parametrize("name", TERMS)
 def test_a_weight_scales_its_term_alone(name):
     nlp, _ = tiny().nlp(PAPER, form())

@@ -21,7 +21,6 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
-from soup_nlp.solve.ipopt import Ipopt
 
 pytestmark = pytest.mark.slow
 
@@ -176,12 +175,6 @@ def test_lengths_are_checked_before_machine_code_reads():
         nlp.value(np.zeros(2))
     with pytest.raises(ValueError, match="lam_g has 1 entries, expected 5"):
         nlp.hessian(np.zeros(6), np.zeros(1))
-
-
-def test_ipopt_converges_with_it():
-    stage = Ipopt(squares(9))(x0=np.full(10, 0.7), tol=1e-8)
-    assert stage.converged
-    assert stage.objective == pytest.approx(0.0, abs=1e-6)
 
 
 # --- the cache, and where there is no compiler ---------------------------------------------------

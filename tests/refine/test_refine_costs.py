@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_model import Tiny, random_soup, weights_for, with_graph
+from helpers_model import Tiny, random_soup, weights_for
 
-from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.refine.costs import PairCosts, feasible, unary_costs
@@ -60,35 +59,6 @@ def test_costs_of_chosen_labels_are_the_exact_energy(units, at_anchors, truncate
         # the delivered soup has the same energy, because E does not depend on the scale
         delivered = oracle.energy(p.soup(labels, tiny.data.share), tiny.data, weights)["total"]
         assert delivered == pytest.approx(exact, rel=1e-12)
-
-
-def test_every_entry_is_the_energy_of_its_pair():
-    tiny = Tiny("pixels")
-    weights = weights_for("pixels", truncated=False)
-    n = len(tiny.soup)
-    near = Particles.of(tiny.soup)
-    steps = (0.0, 1e-9, 1e-6, 1e-3)
-    rng = np.random.default_rng(0)
-    turn = rng.normal(size=(n, 1, 3))
-    p = near.joined(
-        *(
-            Particles(near.n, near.D * (1 + s), rotation.exp(s * turn) @ near.R, near.T * (1 - s))
-            for s in steps
-        )
-    )
-    costs = PairCosts(tiny.data, weights)
-    table = costs.tables(p)
-    w = weights.replace(proj=0.0)
-    for e in (0, len(costs.edges) // 2, len(costs.edges) - 1):
-        i, k = costs.edges[e]
-        rows = ([r] if r >= 0 else [] for r in (costs.rows["edges"][e], costs.rows["pairs"][e]))
-        data = with_graph(tiny.data, *rows)
-        for a in range(p.shape[1]):
-            for b in range(p.shape[1]):
-                labels = np.zeros(n, int)
-                labels[i], labels[k] = a, b
-                exact = oracle.energy(chosen(p, labels), data, w)["total"]
-                assert table[e, a, b] == pytest.approx(exact, rel=1e-9, abs=1e-12 * table.max())
 
 
 def test_blocks_and_single_precision_change_no_digit_that_matters(monkeypatch):

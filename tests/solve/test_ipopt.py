@@ -110,18 +110,6 @@ def test_a_multiplier_of_the_wrong_sign_is_no_optimum():
     assert max(residual.values()) >= 1
 
 
-def test_chained_rosenbrock_reaches_the_ones():
-    stage = solve(rosenbrock(10))
-    assert stage.converged
-    np.testing.assert_allclose(stage.x, 1.0, atol=1e-6)
-    assert stage.objective == pytest.approx(0, abs=1e-10)
-    residual = optimality(rosenbrock(10), stage.x, stage.lam_x, stage.lam_g)
-    assert residual == {
-        "dual_infeasibility": pytest.approx(0, abs=1e-6),
-        "complementarity": 0.0,
-    }
-
-
 def test_hessian_of_an_unsorted_table_is_upper_triangular():
     nlp = rosenbrock(4)
     assert nlp.graph.hess_lag.sparsity_out(0).is_triu()

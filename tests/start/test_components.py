@@ -18,7 +18,6 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import (
-    across_components,
     at_occlusions,
     in_pixels,
     over_ground,
@@ -57,23 +56,6 @@ def world():
         T / lam[:, None],
     )
     return seg, soup, component, build_energy_data(seg, flow, K, K, 4)
-
-
-def test_edges_of_two_components_weigh_less(world):
-    seg, _, component, data = world
-    i, k = seg.edges.T
-    across = component[i] != component[k]
-    assert across.any()
-    assert not across.all()
-    less = across_components(data, component, 0.1)
-    np.testing.assert_allclose(less.edge_weight[across], 0.1 * seg.edge_weight[across], rtol=1e-15)
-    np.testing.assert_array_equal(less.edge_weight[~across], seg.edge_weight[~across])
-    np.testing.assert_array_equal(
-        across_components(data, component, 1.0).edge_weight, seg.edge_weight
-    )
-    np.testing.assert_array_equal(
-        across_components(data, 0 * component, 0.1).edge_weight, seg.edge_weight
-    )
 
 
 def test_the_prior_holds_the_relief_over_the_ground(world):
