@@ -244,9 +244,9 @@ def _with_targets(nlp: NLP, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
     for group in nlp.groups:
         rows, width = group.table.data.shape
         if group.kernel.name == "t_proj":
-            # weight, truncation, ray (3), target (2)
-            at = offset + width * np.arange(rows)[:, None] + [5, 6]
-            return p, at
+            names = [group.kernel.row[k].name() for k in range(width)]
+            columns = [k for k, name in enumerate(names) if name.startswith("target")]
+            return p, offset + width * np.arange(rows)[:, None] + columns
         offset += rows * width
     raise AssertionError("no re-projection")
 

@@ -98,7 +98,8 @@ def test_casadi_and_hdf5_agree_with_the_nlp(exported):
         close(oracle(x0, p)[1], file["at_start/g"][:])
         stored = file["at_start/hess_lag/value"][:]
         assert file["x_names"].asstr()[0] == "lam[0]"
-        for name in ("p", "x0", "lbx", "ubx", "lbg", "ubg"):
+        assert np.array_equal(p, nlp.graph.p)
+        for name in ("x0", "lbx", "ubx", "lbg", "ubg"):
             assert np.array_equal(file[name][:], getattr(nlp, name))
         row, column, value, shape = (
             file[f"at_start/information/{name}"][:] for name in ("row", "column", "value", "shape")

@@ -147,20 +147,19 @@ def test_planes_of_neighbours_keep_the_motion_or_the_image_of_the_anchor():
     np.testing.assert_allclose(p.T[:, 1::2], np.repeat(T, 2, axis=1), rtol=1e-12)
 
 
-@pytest.mark.parametrize("total", [0, 1, 7, 49])
-def test_proposals_are_split_by_shares(total):
+@pytest.mark.parametrize(
+    ("total", "near"), [(0, 20), (1, 20), (7, 20), (49, 20), (49, 0), (49, 3), (49, 7)]
+)
+def test_proposals_are_split_by_shares_and_limited_by_neighbours(total, near):
+    """Random steps replace the proposals of too few neighbours."""
     shares = {**WALKS, **NEIGHBOURS}
-    split = counts(shares, total, near=20)
+    split = counts(shares, total, near)
     assert sum(split.values()) == total
+    if near < 20:
+        assert {split[kind] for kind in NEIGHBOURS} == {near}
+        return
     for kind, count in split.items():
         assert abs(count - total * shares[kind] / sum(shares.values())) <= 1
-
-
-@pytest.mark.parametrize("near", [0, 3, 7])
-def test_random_steps_replace_proposals_of_too_few_neighbours(near):
-    split = counts({**WALKS, **NEIGHBOURS}, 49, near)
-    assert sum(split.values()) == 49
-    assert {split[kind] for kind in NEIGHBOURS} == {near}
 
 
 def test_neighbours_come_nearest_first():
