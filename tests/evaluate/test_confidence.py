@@ -222,8 +222,8 @@ def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room, mon
     for k in range(draws):
         p = parameters.copy()
         p[targets] += rng.normal(0, noise, targets.shape)
-        y = x - newton @ np.asarray(nlp.grad_f(x, p)[1]).ravel()
-        y -= newton @ np.asarray(nlp.grad_f(y, p)[1]).ravel()
+        y = x - newton @ np.asarray(nlp.graph.grad_f(x, p)[1]).ravel()
+        y -= newton @ np.asarray(nlp.graph.grad_f(y, p)[1]).ravel()
         spread[k] = -np.log(y[::9] / x[::9])
     at = layout.unpack(x)
     S = fixed_mean(information(at, data, weights, FORM).matrix.toarray())
