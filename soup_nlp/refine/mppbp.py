@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -147,43 +147,36 @@ def length_slope(soup: Soup, data: EnergyData, weights: Weights) -> float:
     return (down - up) / (2 * h)
 
 
+@dataclass
 class Rounds:
     """The rounds of a refinement.
 
     Attributes:
-        best: Soup of the lowest energy so far.
+        best: Soup of the lowest energy so far; at first the soup to begin with.
         energy: Its energy by term, see `objective`.
-        done: Rounds that have ended.
-
-    Args:
-        best: The soup to begin with.
-        energy: Its energy.
         data: Numbers of the energy.
         weights: Its constants.
         options: Rounds, particles, limits.
         photo: Photometric term; None for the flow alone.
         visibility: (N, V, 3) rays where visibility is imposed, and the least facing there.
         seed: Seed of all draws.
+        done: Rounds that have ended.
     """
 
-    def __init__(
-        self,
-        best: Soup,
-        energy: Mapping[str, float],
-        data: EnergyData,
-        weights: Weights,
-        options: RefineOptions,
-        photo: Photometric | None,
-        visibility: tuple[Float, float],
-        seed: int,
-    ) -> None:
-        self.best, self.energy = best, energy
-        self.data, self.weights, self.options, self.photo = data, weights, options, photo
-        self.visibility = visibility
-        self.pairs = PairCosts(data, weights)
-        near = neighbours(self.pairs.edges, data.anchor_ray)
-        self.proposer = Proposer(data, near, seed)
-        self.done: list[Round] = []
+    best: Soup
+    energy: Mapping[str, float]
+    data: EnergyData
+    weights: Weights
+    options: RefineOptions
+    photo: Photometric | None
+    visibility: tuple[Float, float]
+    seed: int
+    done: list[Round] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.pairs = PairCosts(self.data, self.weights)
+        near = neighbours(self.pairs.edges, self.data.anchor_ray)
+        self.proposer = Proposer(self.data, near, self.seed)
 
     def run(self, watch: Watch, deadline: float) -> str:
         """Run all rounds until a time of `time.perf_counter`; returns the status of `Refined`."""

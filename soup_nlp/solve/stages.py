@@ -17,7 +17,6 @@ from soup_nlp.model.compile import compiler_seconds
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.ipopt import Ipopt, Stage
@@ -26,7 +25,6 @@ from soup_nlp.solve.presolve import EXACT, STOPPED, Presolve
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.storage.progress import Watch
 
-_ENDS = ("start", "presolve", "constrained NLP")
 SAME = 1 + 1e-6
 """Ratio of exact energies up to which they are the same."""
 
@@ -159,19 +157,21 @@ class _Solve:
         # far from its minimum the presolve may have raised the exact energy
         worse = not near and self.energy(presolved) > self.energy(self.start)
         soup = self.start if worse else presolved
-        nlp, layout = self.constrained(soup)
+        form = self.form.replace(eps=self.o.eps, eps_pixel=self.o.eps)
+        nlp, layout = build_matrix_nlp(soup, self.data, self.weights, form)
         self.watch.say(str(nlp))
         first: dict[str, Any] = {"x0": nlp.x0}
         if self.o.exact_iterations and near and not worse:
             first |= warm_start(nlp, self.data, soup, rim)
         stage = self.ipopt(nlp, first, far)
-        candidates = {"constrained NLP": layout.unpack(stage.x), "presolve": presolved}
+        candidates = {"start": self.start, "presolve": presolved}
         if not self.o.presolve:
             del candidates["presolve"]
-        candidates["start"] = self.start
+        candidates["constrained NLP"] = layout.unpack(stage.x)
         ends = {k: s.normalised(self.data.share).retracted() for k, s in candidates.items()}
         admissible = self.admissible(ends)
-        delivered = min(admissible, key=lambda k: self.energy(admissible[k]))
+        # the later one of equals
+        delivered = min(reversed(admissible), key=lambda k: self.energy(admissible[k]))
         last = admissible.get("constrained NLP")
         # energies at one minimum differ by what the smoothing hides
         if (
@@ -198,34 +198,26 @@ class _Solve:
             cpu_seconds=self.laps.cpu,
             delivered=delivered,
             far=far,
-            ends={k: self.energy(ends[k]) for k in _ENDS if k in ends},
+            ends={k: self.energy(s) for k, s in ends.items()},
         )
 
     def energy(self, soup: Soup) -> float:
         """Exact energy."""
         return oracle.energy(soup, self.data, self.weights)["total"]
 
-    def early(self) -> float:
-        """Time at which all stages but the last end."""
-        return self.laps.begin + 0.7 * self.o.max_seconds
-
     def presolve(self) -> tuple[Soup, Float]:
         """Soup and multipliers of rim visibility of the presolve; the start where it is off."""
         soup, rim = self.start, np.zeros(0)
         if self.o.presolve:
-            first = Presolve(
-                soup, self.data, self.weights, self.form, self.o, self.watch, self.early()
-            )
+            # the last stage has the rest of the time
+            end = self.laps.begin + 0.7 * self.o.max_seconds
+            energy = self.data, self.weights, self.form
+            first = Presolve(soup, *energy, self.o, self.watch, end)
             first.run()
             self.stages.extend(first.stages)
             soup, rim = first.soup, first.rim
         self.laps.end("presolve")
         return soup, rim
-
-    def constrained(self, soup: Soup) -> tuple[NLP, MatrixLayout]:
-        """The constrained NLP about a soup, at the last smoothing."""
-        form = self.form.replace(eps=self.o.eps, eps_pixel=self.o.eps)
-        return build_matrix_nlp(soup, self.data, self.weights, form)
 
     def ipopt(self, nlp: NLP, first: dict[str, Any], far: bool) -> Stage:
         """The last stage, from a point with multipliers if there are any."""
@@ -247,7 +239,8 @@ class _Solve:
             watch=self.watch,
         )
         self.laps.end("solve")
-        self._ended(stage)
+        self.stages.append(stage)
+        self.watch.say(str(stage))
         return stage
 
     def admissible(self, ends: Mapping[str, Soup]) -> dict[str, Soup]:
@@ -259,10 +252,6 @@ class _Solve:
         rays = data.visibility_ray(self.form.depth_ratio)
         tilted = tilt_to_camera(self.start, data.anchor_ray, rays, facing)
         return {"start": tilted.normalised(data.share).retracted()}
-
-    def _ended(self, stage: Stage) -> None:
-        self.stages.append(stage)
-        self.watch.say(str(stage))
 
 
 def _multipliers(nlp: NLP, stage: Stage) -> dict[str, Float]:
