@@ -27,8 +27,9 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.choice import LEAST_NOISE
-from soup_nlp.start.components import FIXED, TIES, displacement, log_pace
+from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.start.given_depth import Given
+from soup_nlp.start.pace import displacement, log_pace
 from soup_nlp.start.propose import Start
 
 log = logging.getLogger(__name__)
@@ -227,7 +228,7 @@ def scale_by_contact(
         variances: Marginal variances of the components' scales.
         start: Components and the origin of each scale.
         sizes: (N,) pixels of every superpixel.
-        far: (N,) displacement relative to the camera (`start.components.displacement`).
+        far: (N,) displacement relative to the camera (`start.pace.displacement`).
         given_depth: A depth prior.
     """
     placed = start.tie == TIES.index("occlusion")

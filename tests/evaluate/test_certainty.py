@@ -9,7 +9,8 @@ import pytest
 
 from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR, scale_by_contact
 from soup_nlp.report.findings import GUESSES, certainty, certainty_lines, guess_reason
-from soup_nlp.start.components import FIXED, TIES, displacement
+from soup_nlp.start.components import FIXED, TIES
+from soup_nlp.start.pace import displacement
 
 
 def unsure(run, component_variance=None):

@@ -24,14 +24,9 @@ from soup_nlp.model.reweighting import (
 )
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
-from soup_nlp.start import components as components_module
-from soup_nlp.start.components import (
-    TOO_FAST,
-    contact_scales,
-    depth_from_inside,
-    nearer_where_fast,
-    order_in_front,
-)
+from soup_nlp.start import pace as pace_module
+from soup_nlp.start.components import TOO_FAST, contact_scales, depth_from_inside
+from soup_nlp.start.pace import nearer_where_fast, order_in_front
 from soup_nlp.start.propose import SeededStart, propose
 from soup_nlp.start.views import FlowFit
 
@@ -301,7 +296,7 @@ def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, mon
     shipped = cut_errors(case, case.soup)
     with monkeypatch.context() as context:
         seen = np.zeros(len(case.segmentation), bool)
-        context.setattr(components_module, "without_support", lambda _, label, __: (label, seen))
+        context.setattr(pace_module, "without_support", lambda _, label, __: (label, seen))
         options = SeededStart(**dict(problem.start), seed=problem.seed)
         data = case.segmentation, case.pair.flow, pair.K_ref, pair.K_next
         contact = cut_errors(case, propose(FlowFit.of(*data, options)).soup)
