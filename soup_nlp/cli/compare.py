@@ -20,7 +20,6 @@ from soup_nlp.cli import options
 from soup_nlp.cli.options import option, out_option
 from soup_nlp.config.problem import load_problem, title
 from soup_nlp.errors import ConfigError
-from soup_nlp.export.artefact import parse_formulations
 from soup_nlp.export.verify import Limits
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.files import write_text
@@ -55,7 +54,6 @@ def compare(
         raise ConfigError("no solver is named", where="--solvers", found=solvers)
     for name in names:
         runner.find_solver(name)
-    parse_formulations(None, coordinates)
     limits = Limits(seconds, iterations)
     # prepare all problems first: a wrong file must not stop after hours of runs
     sets = [path for path in problems if runner.is_family(path)]

@@ -112,12 +112,12 @@ def without_support(flow: FlowFit, label: Int, fixed: Mask) -> tuple[Int, Mask]:
 
 
 def log_pace(far: Float, label: Int, scene: int | None = None) -> Float:
-    """(C,) log ratio of the median displacement of every component to that of one of them.
+    """(C,) log ratio of the median displacement of every component to that of the scene.
 
     Args:
         far: (N,) displacement relative to the camera (`displacement`).
         label: (N,) index of the component.
-        scene: Index of that one; the largest one if None.
+        scene: Index of the component to which the others are compared; the largest if None.
     """
     median = np.array([np.median(far[label == c]) for c in range(int(label.max()) + 1)])
     median = np.maximum(median, LEAST_DISPLACEMENT)

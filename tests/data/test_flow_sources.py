@@ -79,6 +79,12 @@ def test_pictures_without_black_bars_are_whole(pair):
     # dark in one of the frames only
     assert content(night, pair.image_next) == whole
     assert content(night, night) == (slice(30, 96), slice(0, 160))
+    night[:32] = 0
+    assert content(night, night) == (slice(32, 96), slice(0, 160))
+    # too little would be left; frames of two sizes
+    night[:33] = 0
+    assert content(night, night) == whole
+    assert content(night[1:], night)[0] == slice(0, 95)
 
 
 @pytest.fixture(scope="module")

@@ -200,7 +200,7 @@ class SintelInput(SceneFrames):
             flow = folder.read(read_flow, f"flow/{names[0]}.flo")
             invalid = folder.read(read_mask, f"invalid/{names[0]}.png")
         if flow is not None and invalid is not None:
-            where = folder.path / "invalid" / names[0]
+            where = folder.path / f"invalid/{names[0]}.png"
             check_size("mask and flow", invalid.shape, flow.shape, where)
             flow[invalid] = np.nan
         truth = Truth(depths[0], depths[1], flow)

@@ -226,7 +226,11 @@ def is_network(source: str) -> bool:
 
 
 def content(image_ref: Image, image_next: Image) -> tuple[slice, slice]:
-    """Rows and columns between the black bars that both images have along their borders."""
+    """Rows and columns between the black bars that both images have along their borders.
+
+    All rows and columns if less than `LEAST_CONTENT` is left, as of black images, or if the images
+    differ in size.
+    """
     whole = slice(0, image_ref.shape[0]), slice(0, image_ref.shape[1])
     if image_ref.shape != image_next.shape:
         return whole
@@ -249,9 +253,10 @@ def flow_between_bars(match: FlowSource, image_ref: Image, image_next: Image) ->
     flow = match(first, second)
     if first.shape == image_ref.shape:
         return flow
-    uv, confidence = np.zeros((*image_ref.shape[:2], 2), np.float32), np.zeros(image_ref.shape[:2])
+    size = image_ref.shape[:2]
+    uv, confidence = np.zeros((*size, 2), np.float32), np.zeros(size, np.float32)
     uv[inside], confidence[inside] = flow.uv, flow.confidence
-    return Flow(uv, confidence.astype(np.float32), flow.source)
+    return Flow(uv, confidence, flow.source)
 
 
 def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
