@@ -81,6 +81,9 @@ def test_pictures_without_black_bars_are_whole(pair):
     assert content(night, night) == (slice(30, 96), slice(0, 160))
     night[:32] = 0
     assert content(night, night) == (slice(32, 96), slice(0, 160))
+    lamps = pair.image_ref // 16
+    lamps[8:80:8, 20:140:8] = 200
+    assert content(lamps, lamps) == whole
     # too little would be left; frames of two sizes
     night[:33] = 0
     assert content(night, night) == whole

@@ -48,6 +48,8 @@ BLACK = 24
 """Largest grey level of a black bar: black of limited range is 16, and its coding has errors."""
 LEAST_CONTENT = 64
 """Least side of the picture between black bars, pixels."""
+LEAST_LIGHT = 0.5
+"""Least share of that picture that is lighter than a bar: at night its dark parts are no bars."""
 
 
 def load_flow(path: PathLike) -> Flow:
@@ -228,8 +230,8 @@ def is_network(source: str) -> bool:
 def content(image_ref: Image, image_next: Image) -> tuple[slice, slice]:
     """Rows and columns between the black bars that both images have along their borders.
 
-    All rows and columns if less than `LEAST_CONTENT` is left, as of black images, or if the images
-    differ in size.
+    All rows and columns if what is left is too small (`LEAST_CONTENT`) or itself mostly black
+    (`LEAST_LIGHT`), or if the images differ in size.
     """
     whole = slice(0, image_ref.shape[0]), slice(0, image_ref.shape[1])
     if image_ref.shape != image_next.shape:
@@ -237,9 +239,10 @@ def content(image_ref: Image, image_next: Image) -> tuple[slice, slice]:
     light = np.maximum(image_ref, image_next).max(axis=2) > BLACK
     lines = (np.flatnonzero(light.any(axis=1 - axis)) for axis in (0, 1))
     inside = [slice(line[0], line[-1] + 1) if len(line) else slice(0, 0) for line in lines]
+    rows, columns = inside
     if min(side.stop - side.start for side in inside) < LEAST_CONTENT:
         return whole
-    return inside[0], inside[1]
+    return (rows, columns) if light[rows, columns].mean() >= LEAST_LIGHT else whole
 
 
 def flow_between_bars(match: FlowSource, image_ref: Image, image_next: Image) -> Flow:
