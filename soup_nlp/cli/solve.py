@@ -210,7 +210,7 @@ def solve_problem(
             # for input that cannot be used the message is enough
             if not isinstance(error, ConfigError | DataError):
                 with suppress(SoupError):
-                    write_failure(folder, "\n".join(log.lines) + "\n", ipopt_log)
+                    write_failure(folder, "\n".join(log.lines) + "\n", ipopt_log, overwrite)
             raise
         # files are written completely even after an interruption
         interrupt.deferred = True

@@ -56,7 +56,7 @@ def values(name: str, soup: Soup, data: EnergyData, weights: Weights) -> Float:
     return np.asarray(np.abs(getattr(data, term.weight)) * cost)
 
 
-def ends_of(soup: Soup, data: EnergyData, graph: Graph) -> Ends:
+def ends_of(soup: Soup, data: EnergyData, graph: GraphName) -> Ends:
     """Both superpixels of every edge or pair, in the states of a soup."""
     n, D, R, T = (a[:, None] for a in (soup.n, soup.distance, soup.R, soup.translation))
     unit = float(np.sum(data.share * soup.distance))
@@ -131,7 +131,7 @@ class States:
         return depths.astype(self.dtype), points.astype(self.dtype)
 
 
-Graph = Literal["edges", "pairs"]
+GraphName = Literal["edges", "pairs"]
 """The K-NN graph and the graph of neighbours, fields of `EnergyData`."""
 
 
@@ -139,7 +139,12 @@ class Ends:
     """Both superpixels i, k of edges or neighbour pairs, in every pair of their states."""
 
     def __init__(
-        self, states: States, data: EnergyData, graph: Graph, unit: float, rows: Int | None = None
+        self,
+        states: States,
+        data: EnergyData,
+        graph: GraphName,
+        unit: float,
+        rows: Int | None = None,
     ) -> None:
         """Take rows of a graph.
 
@@ -311,7 +316,7 @@ class PairTerm(NamedTuple):
         cost: (b, L, L) its values, without that weight.
     """
 
-    graph: Graph
+    graph: GraphName
     weight: str
     cost: Callable[[Ends, EnergyData, Weights], AnyFloat]
 

@@ -120,6 +120,7 @@ def with_order(
     """
     z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
     step = np.where(order > 0, z[0] / z[1], z[1] / z[0]) - 1
+    # the largest step decides, also where it is 0
     step = np.clip(step, LEAST_STEP, most[data.pairs].max(axis=1))
     return replace(data, order_weight=weight * order, order_step=step)
 

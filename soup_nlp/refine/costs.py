@@ -11,7 +11,7 @@ import numpy as np
 from soup_nlp.arrays import AnyFloat, Float, Int, Mask
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.oracle import PAIR_TERMS, Ends, Graph, States, reprojection
+from soup_nlp.model.oracle import PAIR_TERMS, Ends, GraphName, States, reprojection
 from soup_nlp.refine.particles import Particles
 
 BLOCK_BYTES = 1 << 18  # one of the half dozen buffers of a block of edges
@@ -67,7 +67,7 @@ class PairCosts:
     def __init__(self, data: EnergyData, weights: Weights) -> None:
         self.data, self.weights = data, weights
         n = len(data)
-        graphs: dict[Graph, Int] = {"edges": data.edges, "pairs": data.pairs}
+        graphs: dict[GraphName, Int] = {"edges": data.edges, "pairs": data.pairs}
         keys = {name: e[:, 0] * n + e[:, 1] for name, e in graphs.items()}
         key = np.union1d(*keys.values())
         self.edges = np.stack([key // n, key % n], axis=1).astype(np.int64)

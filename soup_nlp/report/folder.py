@@ -64,7 +64,7 @@ def prepare_folder(
     overwrite: bool = False,
     subject: str = "",
 ) -> Path:
-    """Make the folder of a result and check that it can be written.
+    """Check that a result can be written into a folder, before anything is computed.
 
     Args:
         folder: The folder.
@@ -175,11 +175,21 @@ def _attributes(run: Run, config: str) -> dict[str, Any]:
     }
 
 
-def write_failure(folder: Path, log: str, ipopt_log: Path) -> None:
-    """Write the log of a failed solve, followed by that of Ipopt; an earlier result is kept."""
+def write_failure(folder: Path, log: str, ipopt_log: Path, overwrite: bool = False) -> None:
+    """Write the log of a failed solve, followed by that of Ipopt; an earlier result is kept.
+
+    Args:
+        folder: Prepared folder.
+        log: The log.
+        ipopt_log: Log file of Ipopt; may be missing.
+        overwrite: Overwrite a log that the program did not make.
+
+    Raises:
+        DataError: the log cannot be written, or would overwrite one of the user.
+    """
     with suppress(OSError):
         log += ipopt_log.read_text(encoding="utf-8", errors="replace")
-    with staged(folder) as new:
+    with staged(folder, overwrite=overwrite) as new:
         write_text(new / FAILED, log)
 
 

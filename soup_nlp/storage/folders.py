@@ -1,4 +1,4 @@
-"""Output folders: all files of a command appear at once, and no file of the user is overwritten.
+"""Output folders: all files of a command appear at once; those of the user are kept.
 
 A command first checks the names that it will write (`claim`). Later it writes its files into a
 hidden folder in the target (`staged`). One rename marks that folder as complete; its files are then
@@ -6,8 +6,9 @@ renamed to their places. After a kill, a later call finishes the renaming (`reco
 folder makes processes that write into the same folder wait for each other.
 
 The hidden file MARK lists the files in a folder that the program made, with their SHA-256. A file
-that is not listed, or that was changed, belongs to the user. The mark also has the subject of the
-result, such as the frames that were solved.
+that is not listed, or that was changed, belongs to the user: it is never removed, and overwritten
+only with `overwrite`. The mark also has the subject of the result, such as the frames that were
+solved.
 """
 
 from __future__ import annotations
@@ -135,7 +136,9 @@ def claim(
             )
         for name in foreign:
             if _is_blocked(target, name):
-                raise DataError("cannot write a file over a folder or link", where=target / name)
+                raise DataError(
+                    "cannot write over a folder, or below a file or link", where=target / name
+                )
     return Path(folder)
 
 

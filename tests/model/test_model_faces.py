@@ -141,6 +141,24 @@ def test_derivatives_equal_finite_differences(coordinates, norm, units, at_ancho
     assert_derivatives(nlp, wiggle(nlp, layout.size, 3, 0.05), 4)
 
 
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_columns_of_jacobian_and_hessian(gauge):
+    """Small entries of long rows, which rounding along dense directions hides."""
+    nlp, layout = program(gauge, "smooth", "pixels", True)
+    x = wiggle(nlp, layout.size, 7, 0.03)
+    lam_g = np.random.default_rng(8).normal(size=nlp.ng)
+    J, H = nlp.jacobian(x).toarray(), nlp.hessian(x, lam_g).toarray()
+    for j in range(0, nlp.nx, 3):
+        v, name = np.eye(nlp.nx)[j], f"d / d {nlp.x_names()[j]}"
+        np.testing.assert_allclose(
+            directional(nlp.constraints, x, v), J[:, j], atol=1e-8, rtol=0, err_msg=name
+        )
+        slope = directional(lambda y: lagrangian_gradient(nlp, y, 1.0, lam_g), x, v)
+        np.testing.assert_allclose(
+            slope, H[:, j], atol=1e-8 * (1 + np.abs(H).max()), rtol=0, err_msg=name
+        )
+
+
 # --- kinds of Hessian ----------------------------------------------------------------------------
 
 

@@ -101,10 +101,12 @@ def test_tables_of_every_size(elements):
         assert found == pytest.approx(theta / 3 * nlp.value(nlp.x0), rel=1e-14)
 
 
-@pytest.mark.parametrize("norm", ["smooth", "epigraph"])
+@pytest.mark.parametrize(
+    ("gauge", "norm"), [("unit-offset", "smooth"), ("unit-translation", "epigraph")]
+)
 @pytest.mark.parametrize("compiled", [True, False])
-def test_the_functions_that_ipopt_takes_are_those_of_the_graph(case, compiled, norm):
-    form = Formulation(compiled=compiled, norm=norm)
+def test_the_functions_that_ipopt_takes_are_those_of_the_graph(case, compiled, gauge, norm):
+    form = Formulation(compiled=compiled, gauge=gauge, norm=norm)
     nlp, _ = build_matrix_nlp(case.soup, case.data, case.weights, form)
     x, lam_f, lam_g = nlp.x0, 0.7, np.random.default_rng(3).normal(size=nlp.ng)
     fast, graph, theta = Functions(nlp), nlp.graph, nlp.thetas(eps=0.05)

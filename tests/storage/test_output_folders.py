@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
+from soup_nlp.report.folder import write_failure
 from soup_nlp.storage import folders
 from soup_nlp.storage.folders import MARK, claim, digest_of, files_in, mark_of, recover, staged
 from soup_nlp.storage.system import deferred_signals, scratch
@@ -417,6 +418,16 @@ def test_a_file_that_cannot_be_written_ends_in_an_error(tmp_path):
     assert content(target) == {"a": "1"}
     assert os.listdir(tmp_path) == ["out"]
     assert json.loads((target / MARK).read_text())["files"].keys() == {"a"}
+
+
+def test_the_log_of_a_failure_overwrites_one_of_the_user_only_where_allowed(tmp_path):
+    log, missing = tmp_path / "failed.log", tmp_path / "ipopt.log"
+    log.write_text("mine")
+    with pytest.raises(DataError, match="would be overwritten"):
+        write_failure(tmp_path, "failed\n", missing)
+    assert log.read_text() == "mine"
+    write_failure(tmp_path, "failed\n", missing, overwrite=True)
+    assert content(tmp_path) == {"failed.log": "failed\n"}
 
 
 @pytest.mark.parametrize(
