@@ -297,8 +297,8 @@ def certainty(run: Run) -> dict[str, float]:
 
     Returns:
         "determined": share with a sigma of log depth of at most `MOST_SIGMA`; the sum of "flow"
-        (pixels of the largest component), "contact" and "outline" (pixels of other components, by
-        the source of their scale), and with a depth prior "given" (depth or scale are the
+        (pixels of the largest component), "contact" (of components whose scale a contact below
+        gives) and "outline" (of all others), and with a depth prior "given" (depth or scale are the
         prior's). "guess": the rest; the sum of "rest" (the camera is at rest or
         only turns), "fixed" (stands still in the image though the camera moves, such as the bonnet
         of its car), "unseen" (no usable flow, or hidden in the next frame), "flat" (of a
