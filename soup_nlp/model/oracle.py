@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -32,14 +32,21 @@ def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
     Returns:
         "total" and every one of `data.terms`, which include their factors.
     """
+    ends = ends_of(soup, data)
     terms = {
-        name: getattr(weights, name) * float(values(name, soup, data, weights).sum())
+        name: getattr(weights, name) * float(values(name, soup, data, weights, ends).sum())
         for name in data.terms
     }
     return {"total": sum(terms.values()), **terms}
 
 
-def values(name: str, soup: Soup, data: EnergyData, weights: Weights) -> Float:
+def values(
+    name: str,
+    soup: Soup,
+    data: EnergyData,
+    weights: Weights,
+    ends: Mapping[GraphName, Ends] | None = None,
+) -> Float:
     """A term of every superpixel ("proj", (N,)), edge (E,) or neighbour pair (P,), without factor.
 
     Args:
@@ -47,25 +54,26 @@ def values(name: str, soup: Soup, data: EnergyData, weights: Weights) -> Float:
         soup: State.
         data: Pixels, graphs and weights of the pair.
         weights: Truncations.
+        ends: `ends_of` the soup where it is known.
     """
     if name == "proj":
         H = soup.R - soup.t[:, :, None] * soup.n[:, None, :] / soup.d[:, None, None]
         return reprojection(H[:, None], data, weights)[0][:, 0]
     term = PAIR_TERMS[name]
-    cost = term.cost(ends_of(soup, data, term.graph), data, weights)[:, 0, 0]
+    cost = term.cost((ends or ends_of(soup, data))[term.graph], weights)[:, 0, 0]
     return np.asarray(np.abs(getattr(data, term.weight)) * cost)
 
 
-def ends_of(soup: Soup, data: EnergyData, graph: GraphName) -> Ends:
-    """Both superpixels of every edge or pair, in the states of a soup."""
+def ends_of(soup: Soup, data: EnergyData) -> dict[GraphName, Ends]:
+    """Both superpixels of every edge and every neighbour pair, in the states of a soup."""
     n, D, R, T = (a[:, None] for a in (soup.n, soup.distance, soup.R, soup.translation))
-    unit = float(np.sum(data.share * soup.distance))
-    return Ends(States(n, D, R, T, data.anchor_ray), data, graph, unit)
+    states, unit = States(n, D, R, T, data.anchor_ray), float(np.sum(data.share * soup.distance))
+    return {graph: Ends(states, data, graph, unit) for graph in get_args(GraphName)}
 
 
 def relief(soup: Soup, data: EnergyData) -> Float:
     """(E,) difference of the inverse depths of an edge's anchors, relative to the nearer one."""
-    return np.asarray(ends_of(soup, data, "edges").relief[:, 0, 0])
+    return np.asarray(ends_of(soup, data)["edges"].relief[:, 0, 0])
 
 
 # --- superpixels and pairs of them in L states each ----------------------------------------------
@@ -150,18 +158,18 @@ class Ends:
 
         Args:
             states: Of all superpixels.
-            data: Graphs.
+            data: Graphs, and the numbers of their rows.
             graph: The one whose rows are taken.
             unit: The scene's length unit `sum_i c_i D_i` where lengths are not local.
             rows: (b,) rows of it; default all.
         """
-        self.states, self.local, self.unit = states, data.local_units, unit
+        self.states, self.data, self.unit = states, data, unit
         every = getattr(data, graph)
         self.rows = np.arange(len(every)) if rows is None else rows
         self.i, self.k = every[self.rows].T
 
     def column(self, array: Float) -> AnyFloat:
-        """Values of the rows, (b, 1, 1)."""
+        """Values of the rows, (b, 1, 1), of an array of the graph."""
         return array[self.rows].astype(self.states.dtype)[:, None, None]
 
     def distance(self, name: str) -> AnyFloat:
@@ -176,8 +184,13 @@ class Ends:
         return np.sqrt(np.sqrt(a[self.i][:, :, None] + a[self.k][:, None, :]))
 
     def per_length(self, unit: Float) -> AnyFloat:
-        """One over the length unit of every row, a share `unit` of the depth or of the scene's."""
-        if self.local:
+        """(b, L, L) or (b, 1, 1) one over the length unit of every row.
+
+        Args:
+            unit: `edge_unit` or `pair_unit` of the data, a share of the anchors' depth where
+                lengths are local, else of the scene's unit.
+        """
+        if self.data.local_units:
             return self.nearness * self.column(1 / unit)
         return self.column(1 / (unit * self.unit))
 
@@ -199,9 +212,11 @@ class Ends:
         gap -= rk[..., None, :] * s.Z[i][:, :, None]
         return np.sqrt(np.einsum("cbij,cbij->bij", gap, gap)) / 2
 
-    def boundary_gaps(self, ray: Float) -> tuple[AnyFloat, AnyFloat]:
-        """(b, L, L) gaps of the shared boundary, rays (P, B, 3), in the first and second frame."""
-        (zi, Yi), (zk, Yk) = (self.states.boundary(j, ray[self.rows]) for j in (self.i, self.k))
+    @property
+    def boundary_gaps(self) -> tuple[AnyFloat, AnyFloat]:
+        """(b, L, L) gaps of the shared boundary in the first and in the second frame."""
+        ray = self.data.boundary_ray[self.rows]
+        (zi, Yi), (zk, Yk) = (self.states.boundary(j, ray) for j in (self.i, self.k))
         # both points lie on one ray r: their distance is |r| times the difference of their depths
         return _distance(zi, zk), _distance(Yi, Yk)
 
@@ -246,13 +261,13 @@ def reprojection(
     return np.einsum("nls,ns->nl", np.where(used, error, 0.0), confidence), ahead
 
 
-def arap(e: Ends, data: EnergyData, weights: Weights) -> AnyFloat:
+def arap(e: Ends, weights: Weights) -> AnyFloat:
     """E_arap of an edge, Eq. 1; an edge carries both its directions."""
-    per_length = e.per_length(data.edge_unit)
+    per_length = e.per_length(e.data.edge_unit)
     parts = (
-        e.column(data.rotation_scale) * e.distance("R"),
-        # how far the two motions carry the anchors apart, mean of both anchors; or their origin
-        per_length * (e.anchor_gap if data.arap_at_anchors else e.distance("T")),
+        e.column(e.data.rotation_scale) * e.distance("R"),
+        # how far the two motions carry the mean of both anchors apart, or the camera's centre
+        per_length * (e.anchor_gap if e.data.arap_at_anchors else e.distance("T")),
         per_length * np.abs(e.distance("X") - e.distance("Y")),
     )
     leak, total = weights.leak_arap, np.zeros(1, e.states.dtype)
@@ -261,21 +276,20 @@ def arap(e: Ends, data: EnergyData, weights: Weights) -> AnyFloat:
     return total
 
 
-def continuity(e: Ends, data: EnergyData, weights: Weights) -> AnyFloat:
+def continuity(e: Ends, weights: Weights) -> AnyFloat:
     """E_cont of a neighbour pair, Eq. 4: gaps of the shared boundary in both frames."""
-    before, after = e.boundary_gaps(data.boundary_ray)
-    scale = e.column(data.pair_factor) * e.per_length(data.pair_unit)
-    return np.minimum(scale * before, weights.sigma_cont_ref) + np.minimum(
-        scale * after, weights.sigma_cont
-    )
+    before, after = e.boundary_gaps
+    scale = e.column(e.data.pair_factor) * e.per_length(e.data.pair_unit)
+    cut = np.minimum(scale * before, weights.sigma_cont_ref)
+    return cut + np.minimum(scale * after, weights.sigma_cont)
 
 
-def orientation(e: Ends, data: EnergyData, weights: Weights) -> AnyFloat:
+def orientation(e: Ends, weights: Weights) -> AnyFloat:
     """E_orient of a neighbour pair: `rho_n(1 - n_i . n_k)`; unit normals: `|n_i - n_k|^2 / 2`."""
     return np.minimum(e.distance("n") ** 2 / 2, weights.sigma_orient)
 
 
-def prior(e: Ends, data: EnergyData, weights: Weights) -> AnyFloat:
+def prior(e: Ends, weights: Weights) -> AnyFloat:
     """E_prior of an edge: slope of the inverse depth between its anchors, relative to it.
 
     `|(1 / Z_i - 1 / Z_k) / m - relief| / |r_i - r_k|` with anchor rays r and m the mean of both
@@ -283,26 +297,26 @@ def prior(e: Ends, data: EnergyData, weights: Weights) -> AnyFloat:
     """
     ray = e.states.anchor_ray
     reach = np.linalg.norm(ray[e.i] - ray[e.k], axis=1).astype(e.states.dtype)
-    return np.abs(e.relief - e.column(data.prior_relief)) / reach[:, None, None]
+    return np.abs(e.relief - e.column(e.data.prior_relief)) / reach[:, None, None]
 
 
-def depth(e: Ends, data: EnergyData, weights: Weights) -> AnyFloat:
+def depth(e: Ends, weights: Weights) -> AnyFloat:
     """E_depth of an edge: `|log(Z_i / Z_k) - change|` of the depths Z of its anchors."""
     log = np.log(e.states.inverse)
-    return np.abs(log[e.k][:, None, :] - log[e.i][:, :, None] - e.column(data.depth_change))
+    return np.abs(log[e.k][:, None, :] - log[e.i][:, :, None] - e.column(e.data.depth_change))
 
 
-def order(e: Ends, data: EnergyData, weights: Weights) -> AnyFloat:
+def order(e: Ends, weights: Weights) -> AnyFloat:
     """E_order of a neighbour pair: smooth hinge of the inverse depth that the covering superpixel
     f lacks on the boundary before the covered one b.
 
     `(x + sqrt(x^2 + HINGE^2)) / 2` with `x = ((1 + step) / Z_b - 1 / Z_f) / m` and m the mean of
     both anchors' inverse depths that is near the larger.
     """
-    ray, sign = data.boundary_ray[e.rows].mean(axis=1)[:, None], np.sign(data.order_weight)
+    ray, sign = e.data.boundary_ray[e.rows].mean(axis=1)[:, None], np.sign(e.data.order_weight)
     i, k = (e.states.inverse_along(j, ray)[0].astype(e.states.dtype) for j in (e.i, e.k))
     # the inverse depth of the covered side is enlarged by the step
-    grown = [e.column(np.where(sign * side > 0, 1 + data.order_step, 1.0)) for side in (1, -1)]
+    grown = [e.column(np.where(sign * side > 0, 1 + e.data.order_step, 1.0)) for side in (1, -1)]
     lack = e.column(sign) * (i[:, :, None] * grown[0] - k[:, None, :] * grown[1]) / e.nearness
     return (lack + np.hypot(lack, HINGE)) / 2
 
@@ -318,7 +332,7 @@ class PairTerm(NamedTuple):
 
     graph: GraphName
     weight: str
-    cost: Callable[[Ends, EnergyData, Weights], AnyFloat]
+    cost: Callable[[Ends, Weights], AnyFloat]
 
 
 PAIR_TERMS: Mapping[str, PairTerm] = {

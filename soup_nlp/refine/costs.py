@@ -91,14 +91,15 @@ class PairCosts:
         step = max(1, BLOCK_BYTES // (out.itemsize * labels * labels))
         for graph, rows in self.rows.items():
             present = np.flatnonzero(rows >= 0)
+            terms = [
+                (term, getattr(self.weights, name) * np.abs(getattr(data, term.weight)))
+                for name, term in PAIR_TERMS.items()
+                if term.graph == graph
+            ]
             for a in range(0, len(present), step):
                 at = present[a : a + step]
                 ends = Ends(states, data, graph, unit, rows[at])
-                for name in data.terms:
-                    term = PAIR_TERMS.get(name)
-                    if term and term.graph == graph:
-                        weight = np.abs(getattr(data, term.weight)) * getattr(self.weights, name)
-                        if weight[rows[at]].any():
-                            cost = term.cost(ends, data, self.weights)
-                            out[at] += ends.column(weight) * cost
+                for term, weight in terms:
+                    if weight[rows[at]].any():
+                        out[at] += ends.column(weight) * term.cost(ends, self.weights)
         return out

@@ -62,13 +62,16 @@ def test_costs_of_chosen_labels_are_the_exact_energy(units, at_anchors, truncate
 
 
 def test_blocks_and_single_precision_change_no_digit_that_matters(monkeypatch):
-    tiny = Tiny("pixels")
-    costs = PairCosts(tiny.data, weights_for("pixels"))
+    tiny, weights = Tiny("pixels"), weights_for("pixels")
+    costs = PairCosts(tiny.data, weights)
     p = cloud(tiny, 5)
-    whole = costs.tables(p)
+    whole, (unary, ahead) = costs.tables(p), unary_costs(p, tiny.data, weights)
     monkeypatch.setattr("soup_nlp.refine.costs.BLOCK_BYTES", 1)
     monkeypatch.setattr("soup_nlp.refine.costs.UNARY_BYTES", 1)
-    assert np.array_equal(costs.tables(p), whole)
+    np.testing.assert_allclose(costs.tables(p), whole, rtol=1e-12, atol=1e-13 * whole.max())
+    in_blocks = unary_costs(p, tiny.data, weights)
+    np.testing.assert_allclose(in_blocks[0], unary, rtol=1e-12)
+    np.testing.assert_array_equal(in_blocks[1], ahead)
     single = costs.tables(p, dtype=np.float32)
     assert single.dtype == np.float32
     assert np.allclose(single, whole, rtol=1e-6, atol=1e-6 * whole.max())

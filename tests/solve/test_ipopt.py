@@ -198,6 +198,14 @@ def test_the_iteration_limit_keeps_the_best_iterate():
         f.append(stage.objective)
     assert (np.diff(f) <= 0).all()
     assert f[-1] < start
+    # without the limit it reaches the ones
+    stage = solve(nlp)
+    assert stage.converged
+    np.testing.assert_allclose(stage.x, 1.0, atol=1e-6)
+    assert stage.objective == pytest.approx(0, abs=1e-10)
+    residual = optimality(nlp, stage.x, stage.lam_x, stage.lam_g)
+    assert residual["dual_infeasibility"] <= 1e-6
+    assert residual["complementarity"] == 0
 
 
 def test_the_time_limit_stops_and_keeps_the_best_iterate():
