@@ -1,11 +1,11 @@
-"""Reading of HDF5 files, which follows no link and checks sizes before it allocates memory."""
+"""Reading of HDF5 files, which rejects links and checks sizes before it allocates memory."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TypeAlias
+from typing import Any, NoReturn, TypeAlias
 
 import h5py
 import numpy as np
@@ -31,8 +31,8 @@ def read_h5(path: PathLike) -> ReadTree:
     """All arrays of a result file, as nested dicts of numpy arrays (text as str or object arrays).
 
     Raises:
-        DataError: the file is missing, damaged or not HDF5, holds a type that no result has, or
-            does not fit into memory.
+        DataError: the file is missing, damaged or not HDF5, holds a link or a type that no result
+            has, or does not fit into memory.
     """
     with _opened(path) as file:
         items = _items(file)
@@ -54,34 +54,45 @@ def read_h5(path: PathLike) -> ReadTree:
 
 
 def _items(file: h5py.File) -> list[tuple[str, h5py.Group | h5py.Dataset]]:
-    """Names, groups and arrays of an open file; every object once, and no link is followed.
+    """Names, groups and arrays of an open file, which must be a tree without links.
 
     Raises:
-        DataError: there is an object that no result has.
+        DataError: there is an object that no result has, a soft or external link, or an object
+            under two names.
     """
-    items = []
+    items: list[tuple[str, h5py.Group | h5py.Dataset]] = []
+    links: dict[str, type] = {}
+
+    def refuse(name: str, actual: str) -> NoReturn:
+        raise DataError(
+            "result holds what no result has",
+            where=f"{file.filename}, {name}",
+            found=actual,
+            expected=f"numbers or text under one name, in at most {DEEPEST} levels of groups",
+        )
+
+    def see_link(name: str, link: Any) -> None:
+        # an exception raised here becomes a SystemError in h5py
+        links[name] = type(link)
 
     def see(name: str, item: Any) -> None:
-        wrong = None
         if name.count("/") > DEEPEST:
-            wrong = "groups within groups"
-        elif not isinstance(item, h5py.Group | h5py.Dataset):
-            wrong = type(item).__name__
-        elif isinstance(item, h5py.Dataset):
+            refuse(name, "groups within groups")
+        if not isinstance(item, h5py.Group | h5py.Dataset):
+            refuse(name, type(item).__name__)
+        if isinstance(item, h5py.Dataset):
             if item.shape is None or item.external or item.is_virtual:
-                wrong = "an array without values of its own"
-            elif item.dtype.kind not in "fiub" and not h5py.check_string_dtype(item.dtype):
-                wrong = f"type {item.dtype}"
-        if wrong:
-            raise DataError(
-                "result holds what no result has",
-                where=f"{file.filename}, {name}",
-                found=wrong,
-                expected=f"numbers or text, in at most {DEEPEST} levels of groups",
-            )
+                refuse(name, "an array without values of its own")
+            if item.dtype.kind not in "fiub" and not h5py.check_string_dtype(item.dtype):
+                refuse(name, f"type {item.dtype}")
         items.append((name, item))
 
+    # neither visit follows a soft or external link, and `see` gets every object once
     file.visititems(see)
+    file.visititems_links(see_link)
+    for name in sorted(links.keys() - {name for name, _ in items}):
+        hard = links[name] is h5py.HardLink
+        refuse(name, "an object under two names" if hard else links[name].__name__)
     return items
 
 
