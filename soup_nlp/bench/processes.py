@@ -20,6 +20,7 @@ from typing import Any
 import psutil
 
 from soup_nlp.errors import SolverError, SoupError
+from soup_nlp.storage.rows import one_thread
 from soup_nlp.storage.system import end_with_parent
 from soup_nlp.storage.versions import code_version, versions
 
@@ -53,7 +54,9 @@ def isolated(
     memory: int,
     cpu_seconds: float | None = None,
 ) -> ProcessResult:
-    """Call a function in a process of its own; a crash becomes a result as well.
+    """Call a function in a process of its own with one thread; a crash becomes a result as well.
+
+    A library that this process has loaded keeps its number of threads.
 
     Args:
         work: Function without arguments; its return value must pickle.
@@ -75,7 +78,8 @@ def isolated(
     begin = time.perf_counter()
     context = multiprocessing.get_context("fork")
     process = context.Process(target=_child, args=(work, target, memory, cpu_seconds))
-    process.start()
+    with one_thread():
+        process.start()
     late = True
     try:
         process.join(seconds + GRACE)

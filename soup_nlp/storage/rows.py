@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,20 @@ Row = dict[str, Any]
 Say = Callable[[int, int, Row], None]
 
 ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"), "1"
-)
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
+     "OPENCV_FOR_THREADS_NUM"), "1",
+)  # fmt: skip
 """Environment of a worker process."""
+DIED = "the process died (out of memory, or a crash of native code)"
+"""Reason of a row whose process ended without one."""
+
+
+def one_thread() -> AbstractContextManager[Any]:
+    """Give one thread to processes that begin and libraries that are loaded in the block.
+
+    Libraries read their number of threads when they are loaded.
+    """
+    return mock.patch.dict(os.environ, ONE_THREAD)
 
 
 @dataclass(frozen=True)
@@ -208,19 +219,20 @@ def _measured(todo: Mapping[str, Job], workers: int, fresh: bool) -> Iterator[tu
         )
         futures: dict[Future[Row], str] = {}
         try:
-            # the processes begin here
-            with mock.patch.dict(os.environ, ONE_THREAD), suppress(BrokenProcessPool):
-                for name in again:
-                    futures[pool.submit(left[name].work)] = name
-            for future in as_completed(futures):
-                try:
-                    result = future.result()
-                except BrokenProcessPool:
-                    if len(names) > 1:
-                        continue
-                    result = failure("the process died (out of memory, or a crash of native code)")
-                del left[futures[future]]
-                yield futures[future], result
+            # a fresh pool begins a process whenever one has ended
+            with one_thread():
+                with suppress(BrokenProcessPool):
+                    for name in again:
+                        futures[pool.submit(left[name].work)] = name
+                for future in as_completed(futures):
+                    try:
+                        result = future.result()
+                    except BrokenProcessPool:
+                        if len(names) > 1:
+                            continue
+                        result = failure(DIED)
+                    del left[futures[future]]
+                    yield futures[future], result
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
             for child in set(multiprocessing.active_children()) - before:

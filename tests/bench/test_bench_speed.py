@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_rows import square
+from helpers_rows import square, threads
 
 from soup_nlp.bench.processes import machine
 from soup_nlp.bench.speed import (
@@ -24,7 +24,7 @@ from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.bench.tables import cost_cells, cost_page
 from soup_nlp.cli.main import main
 from soup_nlp.solve.solver_options import SolverOptions
-from soup_nlp.storage.rows import Job, attempt, measure_all, read_rows
+from soup_nlp.storage.rows import ONE_THREAD, Job, attempt, measure_all, read_rows
 
 pytestmark = pytest.mark.slow
 
@@ -80,12 +80,16 @@ def test_the_plan_has_every_run_once_small_ones_first():
 def test_rows_of_new_processes(tmp_path, monkeypatch):
     # the children must find the module of the function
     monkeypatch.setenv("PYTHONPATH", str(Path(square.__code__.co_filename).parent), os.pathsep)
+    for name in ONE_THREAD:
+        monkeypatch.delenv(name, raising=False)
     numbers = {2: False, 3: False, 4: True}
     works = [partial(attempt, partial(square, n, breaks=b)) for n, b in numbers.items()]
     jobs = [Job({"key": k}, work) for k, work in enumerate(works)]
     *rows, failed_row = measure_all(jobs, tmp_path / "rows.jsonl", fresh=True)
     assert [row["square"] for row in rows] == [4, 9]
     assert len({os.getpid(), *(row["process"] for row in rows)}) == 3
+    assert [row["threads"] for row in rows] == [["1"] * 4] * 2
+    assert threads() == [None] * 4
     assert all(row["peak_bytes"] > 1e6 for row in rows)
     assert "out of numbers" in failed_row["error"]
     assert {"processor", "cores", "memory", "code"} <= machine().keys()

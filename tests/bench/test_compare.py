@@ -13,15 +13,18 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers_model import PAPER, Tiny
+from helpers_rows import threads
 
 from soup_nlp.bench.processes import isolated
 from soup_nlp.bench.solvers import runner
+from soup_nlp.bench.solvers.page import frame_of_runs, page
 from soup_nlp.bench.solvers.plugins import PLUGINS, Answer, Task
 from soup_nlp.bench.solvers.runner import available, compare, executable, find_solver, reference
-from soup_nlp.errors import SolverError
+from soup_nlp.errors import DataError, SolverError
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.storage.rows import ONE_THREAD, read_rows
 
 pytestmark = pytest.mark.slow
 
@@ -96,6 +99,17 @@ def test_a_function_returns_from_its_process(tmp_path):
     assert ended.value[0] != os.getpid()
     assert ended.value[1].tolist() == [0, 1, 2]
     assert ended.peak_bytes > 0
+
+
+def test_processes_and_plugins_have_one_thread(tmp_path, monkeypatch):
+    for name in ONE_THREAD:
+        monkeypatch.delenv(name, raising=False)
+    assert isolated(threads, tmp_path, 20, MANY).value == ["1"] * 4
+    seen = []
+    monkeypatch.setattr(ca, "has_nlpsol", lambda library: seen.append(threads()))
+    available()
+    assert seen == [["1"] * 4] * len(PLUGINS)
+    assert threads() == [None] * 4
 
 
 def test_crashes_and_errors_are_answers(tmp_path):
@@ -248,6 +262,29 @@ def test_runs_resume_and_a_cut_line_is_run_again(task, tmp_path, stub):
     # other limits, other runs
     assert go("a", with_task=replace(task, limits=replace(task.limits, tol=1e-3))) == 1
     assert calls == ["a", "b", "c", "c", "a"]
+
+
+def test_an_error_is_a_row_and_the_other_runs_go_on(exact, task, tmp_path, stub):
+    stub(lambda solved_task: exact)
+
+    def broken() -> Task:
+        raise DataError("pair cannot be prepared", where="image", found="nothing")
+
+    def compared(*tasks: Callable[[], Task]) -> list:
+        labelled = [({**LABEL, "problem": f"p{k}"}, make) for k, make in enumerate(tasks)]
+        folders = tmp_path / "r.jsonl", tmp_path / "s"
+        return compare(labelled, ["a"], task.limits, *folders, lambda line: None)
+
+    bad, good = compared(broken, lambda: task)
+    assert "pair cannot be prepared" in bad["error"]
+    assert bad["status"] == "DataError: pair cannot be prepared, where: image, found: nothing"
+    assert (bad["claimed"], bad["verified"]) == (False, False)
+    assert good["verified"]
+    frame = frame_of_runs([bad, good])
+    assert "pair cannot be prepared" in page(frame.assign(code="1"))
+    # an error is no measurement
+    assert [row["how"] for row in compared(lambda: task, lambda: task)] == ["returned"] * 2
+    assert [row["how"] for row in read_rows(tmp_path / "r.jsonl")] == ["raised"] + ["returned"] * 2
 
 
 def test_rows_are_told_after_every_run_and_names_before(exact, task, tmp_path, stub):

@@ -49,7 +49,7 @@ from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.files import read_json
-from soup_nlp.storage.rows import Job, Row, measure_all
+from soup_nlp.storage.rows import Job, Row, failure, measure_all, one_thread, reason
 from soup_nlp.storage.versions import versions
 
 Label = Mapping[str, Any]
@@ -95,9 +95,10 @@ def package(task: Task) -> Answer:
 
 def available() -> dict[str, Solver]:
     """Installed solvers by name."""
-    out: dict[str, Solver] = {
-        name: partial(plugin, name) for name, row in PLUGINS.items() if ca.has_nlpsol(row.library)
-    }
+    # the query loads the plug-ins, and their BLAS reads its number of threads when it is loaded
+    with one_thread():
+        names = [name for name, row in PLUGINS.items() if ca.has_nlpsol(row.library)]
+    out: dict[str, Solver] = {name: partial(plugin, name) for name in names}
     command = find_program("pounce")
     if command:
         out["pounce"] = partial(pounce, command)
@@ -168,38 +169,52 @@ def timed(solver: Solver, task: Task, folder: Path) -> tuple[Answer, float]:
     return solver(task), clock() - begin
 
 
-def run_row(task: Task, label: Label, solver: str, folder: Path) -> Row:
+def run_row(make: Callable[[], Task], label: Label, solver: str, folder: Path) -> Row:
     """Run a solver in a process of its own, verify its answer, and make the row.
 
+    An exception, of `make` for example, becomes a row with "error", which no later run takes as
+    measured.
+
     Args:
-        task: The task.
+        make: Makes the task.
         label: Entries that identify the task, and "energy_limit".
         solver: Name of the solver.
         folder: Empty scratch folder.
     """
+    row: Row = {
+        **label,
+        "claimed": False,
+        "verified": False,
+        "iterations": -1,
+        "versions": versions(),
+        "machine": f"{platform.system()} {platform.machine()}, {processor()}",
+    }
+    try:
+        return row | _ended(make(), float(label["energy_limit"]), solver, folder)
+    except Exception as error:
+        failed = failure(f"{type(error).__name__}: {error}")
+        return row | failed | {"how": "raised", "status": reason(failed), "peak_bytes": 0}
+
+
+def _ended(task: Task, energy_limit: float, solver: str, folder: Path) -> Row:
+    """Entries of a row on how the run of a solver ended, and on its answer."""
     work, limits = partial(timed, find_solver(solver), task, folder), task.limits
     wall = WALL_PER_CPU * limits.seconds
     ended = isolated(work, folder, wall, limits.memory, cpu_seconds=limits.seconds)
     row: Row = {
-        **label,
         "n": task.nlp.nx,
         "m": task.nlp.ng,
         "how": ended.how,
         "status": str(ended.value or ended.how),
-        "claimed": False,
-        "verified": False,
-        "iterations": -1,
         "seconds": ended.cpu_seconds,
         "wall_seconds": ended.seconds,
         "cpu_seconds": ended.cpu_seconds,
         "peak_bytes": ended.peak_bytes,
         "energy_start": oracle.energy(task.soup, task.data, task.weights)["total"],
-        "versions": versions(),
-        "machine": f"{platform.system()} {platform.machine()}, {processor()}",
     }
     if ended.how == "returned":
         answer, seconds = ended.value
-        row |= _verified(task, answer, seconds, float(label["energy_limit"]))
+        row |= _verified(task, answer, seconds, energy_limit)
     return row
 
 
@@ -257,7 +272,7 @@ def compare(
         # the name of a solver may be a path
         folder = scratch / re.sub(r"[^\w-]+", "_", solver)
         folder.mkdir(parents=True, exist_ok=True)
-        return run_row(make(), label, solver, folder)
+        return run_row(make, label, solver, folder)
 
     jobs = []
     for label, make in tasks:
