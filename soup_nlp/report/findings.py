@@ -21,6 +21,10 @@ SHARES = {
     "flow": "by flow and parallax",
     "contact": "with the scale of a contact",
     "outline": "with the scale of an outline",
+    "cut_off": "with a lower end that is hidden, so that its motion places it as well",
+    "fast": "nearer than its contact, at which it would move too far",
+    "covering": "with a guessed place in front of what it covers",
+    "free": "without contact to anything that has a scale",
     "given": "by the given depth",
     "rest": "the camera only turns or stands still",
     "fixed": "stands still in the image while the camera moves",
@@ -30,6 +34,22 @@ SHARES = {
     "weak": "little information",
 }
 """Words for the shares of `certainty`."""
+ORIGINS = {
+    "reference": ("flow", "the largest, which defines the scale"),
+    "contact below": ("contact", "its scale from what it stands on"),
+    "outline": ("outline", "its scale from what is around it"),
+    "cut off below": ("cut_off", "its lower end hidden: its scale from contact and motion"),
+    "nothing": ("free", "its scale unknown: nothing that has a scale touches it"),
+    "ground": ("contact", "lifted to the ground"),
+    "fixed in the image": ("outline", "still in the image though the camera moves"),
+    "given depth": ("given", "its scale from the given depth"),
+    "occlusion": ("covering", "placed by a guess in front of what it covers"),
+    "too fast": ("fast", "nearer than its contact, at which it would move too far"),
+}
+"""By what gives a component its scale (`components.TIES`): the share of its determined pixels in
+`certainty`, and words for the component."""
+DETERMINED = tuple(dict.fromkeys(name for name, _ in ORIGINS.values()))
+"""Shares that are determined."""
 GUESSES = ("rest", "fixed", "unseen", "flat", "scale", "weak")
 """Shares that are a guess."""
 USABLE = 0.8
@@ -57,7 +77,7 @@ def certainty_lines(shares: Mapping[str, float]) -> list[str]:
         lines.append(
             f"{shares['determined']:.0%} of the image is determined, half of it to"
             f" {shares['median_sigma']:.1%} (1 sigma):"
-            f" {_parts(shares, ('flow', 'contact', 'outline', 'given'))}"
+            f" {_parts(shares, DETERMINED)}"
         )
     return lines + ([guess_words(shares)] if shares["guess"] >= 0.005 else [])
 
@@ -297,14 +317,13 @@ def certainty(run: Run) -> dict[str, float]:
 
     Returns:
         "determined": share with a sigma of log depth of at most `MOST_SIGMA`; the sum of "flow"
-        (pixels of the largest component), "contact" (of components whose scale a contact below
-        gives) and "outline" (of all others), and with a depth prior "given" (depth or scale are the
-        prior's). "guess": the rest; the sum of "rest" (the camera is at rest or
-        only turns), "fixed" (stands still in the image though the camera moves, such as the bonnet
-        of its car), "unseen" (no usable flow, or hidden in the next frame), "flat" (of a
-        component without evidence of depth, see `Evidence.guess`), "scale" (of a component whose
-        scale alone is as uncertain as that) and "weak" (anything else). "median_sigma": median of
-        the determined pixels.
+        (pixels of the largest component), the shares in `ORIGINS` of what gives the other
+        components their scales, and with a depth prior "given" (depth or scale are the prior's).
+        "guess": the rest; the sum of "rest" (the camera is at rest or only turns), "fixed" (stands
+        still in the image though the camera moves, such as the bonnet of its car), "unseen" (no
+        usable flow, or hidden in the next frame), "flat" (of a component without evidence of depth,
+        see `Evidence.guess`), "scale" (of a component whose scale alone is as uncertain as that)
+        and "weak" (anything else). "median_sigma": median of the determined pixels.
     """
     sigma = run.confidence.sigma
     labels, start = run.segmentation.labels, run.start
@@ -325,13 +344,15 @@ def certainty(run: Run) -> dict[str, float]:
         return float(mask.mean())
 
     given = np.zeros(len(start.soup), bool) if run.given is None else run.given.held
-    by_flow = sure & ~given[labels]
+    origin = np.array([DETERMINED.index(ORIGINS[name][0]) for name in TIES])[tie]
+    # the prior's pixels, whatever gives their component its scale
+    origin = np.where(given[labels], DETERMINED.index("given"), origin)
+    parts = {name: share(sure & (origin == k)) for k, name in enumerate(DETERMINED)}
+    if run.given is None:
+        del parts["given"]
     return {
         "determined": share(sure),
-        "flow": share(by_flow & (tie == TIES.index("reference"))),
-        "contact": share(by_flow & (tie == TIES.index("contact below"))),
-        "outline": share(by_flow & (tie > TIES.index("contact below"))),
-        **({} if run.given is None else {"given": share(sure & given[labels])}),
+        **parts,
         "guess": share(~sure),
         **{name: share(mask) for name, mask in guess.items()},
         "weak": share(left),

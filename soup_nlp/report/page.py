@@ -22,7 +22,7 @@ from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, triangles
 from soup_nlp.report.colour import component_colours
-from soup_nlp.report.findings import limits
+from soup_nlp.report.findings import ORIGINS, limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.result import Result
 from soup_nlp.start.components import TIES
@@ -219,7 +219,7 @@ def make_scene(result: Result) -> dict[str, Any]:
             pivot p and shift s; at time t a point X is at exp(t w) (X - p) + p + t s.
         "motionCamera": (N, 9) the same relative to the camera.
         "guess": (N,) the depth comes from neighbours.
-        "component": (N,) what moves as one. "tie": (N,) index in "ties", the source of its scale.
+        "component": (N,) what moves as one. "tie": (N,) index in "origins", words on its scale.
         "seen": (h, w) pixels that are visible in the next frame.
         "sigma": (h, w) standard deviation of log depth, 0 to 254 for 0 to 0.5; 255 where unknown.
         "surface": bits of the (h - 1, w - 1) cells of four pixels without a jump of the depth.
@@ -264,7 +264,7 @@ def make_scene(result: Result) -> dict[str, Any]:
         "far": far,
         "deepest": deepest,
         "unit": result.length,
-        "ties": TIES,
+        "origins": [ORIGINS[name][1] for name in TIES],
     }
 
 

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR, scale_by_contact
-from soup_nlp.report.findings import GUESSES, certainty, certainty_lines, guess_reason
+from soup_nlp.report.findings import (
+    DETERMINED,
+    GUESSES,
+    ORIGINS,
+    certainty,
+    certainty_lines,
+    guess_reason,
+)
 from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.start.pace import displacement
 
@@ -32,9 +40,8 @@ def unsure(run, component_variance=None):
 def test_shares_add_up(small_run):
     shares = certainty(small_run)
     assert shares["determined"] + shares["guess"] == pytest.approx(1.0)
-    assert sum(shares[k] for k in ("flow", "contact", "outline")) == pytest.approx(
-        shares["determined"]
-    )
+    parts = [shares[k] for k in DETERMINED if k in shares]
+    assert sum(parts) == pytest.approx(shares["determined"])
     assert sum(shares[k] for k in GUESSES) == pytest.approx(shares["guess"])
     assert shares["median_sigma"] < MOST_SIGMA
 
@@ -56,6 +63,38 @@ def test_a_scale_that_contact_hardly_determines_is_named(small_run):
     assert loose["scale"] + loose["weak"] == pytest.approx(firm["scale"] + firm["weak"])
     (line,) = certainty_lines(loose)
     assert "with a scale that contact hardly determines" in line
+
+
+SAID = {
+    "reference": "by flow and parallax",
+    "contact below": "with the scale of a contact",
+    "outline": "with the scale of an outline",
+    "cut off below": "with a lower end that is hidden",
+    "nothing": "without contact to anything that has a scale",
+    "ground": "with the scale of a contact",
+    "fixed in the image": "with the scale of an outline",
+    "given depth": "by the given depth",
+    "occlusion": "in front of what it covers",
+    "too fast": "nearer than its contact, at which it would move too far",
+}
+
+
+@pytest.mark.parametrize("name", TIES)
+def test_what_gives_a_component_its_scale_is_said(name, small_run):
+    start, sure = small_run.start, small_run.confidence
+    certain = replace(sure, sigma=np.full_like(sure.sigma, 0.1))
+    tied = replace(start, tie=np.full_like(start.tie, TIES.index(name)))
+    given = None
+    if name == "given depth":
+        given = SimpleNamespace(held=np.ones(len(tied.soup), bool))
+    (line,) = certainty_lines(
+        certainty(replace(small_run, start=tied, confidence=certain, given=given))
+    )
+    assert line.startswith("100% of the image is determined, half of it to 10.0% (1 sigma): 100% ")
+    assert SAID[name] in line
+    # the page has words for every component, too
+    assert ORIGINS.keys() == set(TIES)
+    assert ORIGINS[name][1] != name
 
 
 def test_a_camera_at_rest_is_the_reason_of_every_guess(small_run):

@@ -384,7 +384,7 @@ function pick(x, y) {
 function tell(p) {
   if (p < 0) { $("picked").textContent = "No point is shown there."; return; }
   const i = labels[p], spread = sigma[p] < 255 ? `${(sigma[p] / 5.1).toFixed(sigma[p] < 26 ? 1 : 0)} %` : "50 % or unknown";
-  const part = component[i] ? `component ${component[i]}, its scale from: ${scene.ties[tie[i]]}` : "the static scene";
+  const part = component[i] ? `component ${component[i]}, ${scene.origins[tie[i]]}` : "the static scene";
   const source = guess[i] ? "depth taken from neighbours" : sigma[p] > 127 ? "a guess: little information" : "flow and parallax";
   $("picked").textContent = `pixel (${(p % w) * scene.step}, ${Math.floor(p / w) * scene.step}): depth`
     + ` ${position.getZ(p).toPrecision(4)} ${scene.unit}, sigma ${spread}; superpixel ${i}, ${part}; ${source}`;
