@@ -7,10 +7,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, NoReturn
+from typing import Annotated, Any
 
 import pandas as pd
-import typer
 
 from soup_nlp.bench import search as searching
 from soup_nlp.bench import speed as timing
@@ -35,6 +34,7 @@ Only = Annotated[Words, option("Only pairs whose name holds this word.")]
 Width = Annotated[int, option("Columns of rendered scenes.", min=64, max=MAX_SIDE)]
 Seeds = Annotated[str, option("Seeds of rendered scenes, such as 0,1,2.")]
 AnyCode = Annotated[bool, option("Also take stored rows of other code versions.")]
+Running = dict[str, Any]
 SIZES: Mapping[str, Any] = {"min": 2, "max": MAX_SUPERPIXELS}
 
 
@@ -43,51 +43,39 @@ def mre_of(row: Row) -> str:
     return f"MRE {show(row['metrics'].get(row['presets'][0], {}).get('solution', {}).get('mre'))}"
 
 
-class Study(NamedTuple):
-    """Rows to be measured, and the page that is made of them.
-
-    Attributes:
-        page: Name of the page; its rows are in a .jsonl beside it.
-        measured: Measures the rows into a file and returns their frame.
-        write: Writes the page of a frame, and its pictures beside it.
-        files: Further files that `write` may write.
-        line: Text of a row for the progress line.
-    """
-
-    page: str
-    measured: Callable[[Path, MeasureRows], pd.DataFrame]
-    write: Callable[[Path, pd.DataFrame], None]
-    files: Sequence[str] = ()
-    line: Callable[[Row], str] = mre_of
-
-
 def _run(
-    studies: Sequence[Study], out: Path, quiet: bool, overwrite: bool, **running: Any
-) -> NoReturn:
-    """Measure studies, write their pages into a folder and print them; 1 if a row failed.
+    page: Path,
+    measured: Callable[[Path, MeasureRows], pd.DataFrame],
+    write: Callable[[Path, pd.DataFrame], None],
+    quiet: bool,
+    overwrite: bool,
+    files: Sequence[str] = (),
+    line: Callable[[Row], str] = mre_of,
+    **running: Any,
+) -> int:
+    """Measure the rows of a study, write its page and print it; returns 1 if a row failed.
 
     Args:
-        studies: The studies, in order.
-        out: Folder of the pages.
+        page: The page; its rows are in a .jsonl beside it.
+        measured: Measures the rows into a file and returns their frame.
+        write: Writes the page of a frame, and its pictures beside it.
         quiet: Print no progress.
         overwrite: Also over files of the user.
+        files: Further files that `write` may write.
+        line: Text of a row for the progress line.
         running: Further options of `measure_all`.
     """
-    # check all names before the first study is measured
-    claim(out, [name for study in studies for name in (study.page, *study.files)], overwrite)
-    good = True
-    for study in studies:
-        page, say = out / study.page, options.RowProgress(quiet, study.line)
-        measure_rows, rows = partial(measure_all, say=say, **running), page.with_suffix(".jsonl")
-        with options.resumable("the rows that were measured are kept", rows):
-            frame = study.measured(rows, measure_rows)
-        with staged(out, overwrite=overwrite) as new:
-            study.write(new / page.name, frame)
-            written = [name for name in (page.name, *study.files) if (new / name).is_file()]
-        print(page.read_text(encoding="utf-8"))
-        print(f"files       {out}/: {', '.join(written)}")
-        good = good and bool(frame["ok"].eq(True).all())
-    raise typer.Exit(int(not good))
+    out = claim(page.parent, [page.name, *files], overwrite)
+    measure_rows = partial(measure_all, say=options.RowProgress(quiet, line), **running)
+    rows = page.with_suffix(".jsonl")
+    with options.resumable("the rows that were measured are kept", rows):
+        frame = measured(rows, measure_rows)
+    with staged(out, overwrite=overwrite) as new:
+        write(new / page.name, frame)
+        written = [name for name in (page.name, *files) if (new / name).is_file()]
+    print(page.read_text(encoding="utf-8"))
+    print(f"files       {out}/: {', '.join(written)}")
+    return int(not frame["ok"].eq(True).all())
 
 
 def _text(page_of: Callable[[pd.DataFrame], str]) -> Callable[[Path, pd.DataFrame], None]:
@@ -128,7 +116,7 @@ def accuracy(
     any_code: AnyCode = False,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
-) -> None:
+) -> int:
     """Depth against truth on a suite of pairs; interrupted runs can be continued."""
     if not suite:
         print("\n".join(f"{entry.name:<14} {entry.text}" for entry in SUITES.values()))
@@ -136,25 +124,27 @@ def accuracy(
     if name and len(suite) > 1:
         raise ConfigError("one name for several suites", where="--name", found=", ".join(suite))
     wanted, changes = _wanted(flow, width, seeds, only), tuple(overrides or ())
-    studies = []
-    for each in dict.fromkeys(suite):
-        cells = [Cell(item, changes) for item in list_suite(each, data, wanted, _say(quiet))]
+    suites = {each: list_suite(each, data, wanted, _say(quiet)) for each in suite}
+    # check the names of all pages before the first suite is measured
+    pages = {each: out / f"{name or each}.md" for each in suites}
+    pictures = {each: page.with_suffix(".png").name for each, page in pages.items()}
+    claim(out, [*(page.name for page in pages.values()), *pictures.values()], overwrite)
+    running: Running = {"workers": workers, "any_code": any_code}
+    codes = []
+    for each, items in suites.items():
         note = f"Suite `{each}`: {SUITES[each].text}. Overrides of every pair: "
         note += f"{', '.join(f'`{o}`' for o in changes) or 'none'}."
-        measured = partial(measure_cells, cells, measure_pair)
-        files = [f"{name or each}.png"]
-        write = partial(write_suite, note=note)
-        studies.append(Study(f"{name or each}.md", measured, write, files))
-    _run(studies, out, quiet, overwrite, workers=workers, any_code=any_code)
+        measured = partial(measure_cells, [Cell(item, changes) for item in items], measure_pair)
+        write, files = partial(write_suite, note=note), [pictures[each]]
+        codes.append(_run(pages[each], measured, write, quiet, overwrite, files, **running))
+    return max(codes)
 
 
 def search(
     suite: Suites = None,
     data: options.Data = None,
     out: options.Out = Path("out/bench/accuracy"),
-    params: Annotated[
-        Words, option("KEY=log|linear|int:LOW:HIGH instead; may be repeated.", "--param")
-    ] = None,
+    params: Annotated[Words, option("KEY=log|linear|int:LOW:HIGH instead.", "--param")] = None,
     trials: Annotated[int, option("Configurations beside the default.", min=1)] = 24,
     seeds: Seeds = "0,1",
     overrides: options.Set = None,
@@ -165,7 +155,7 @@ def search(
     any_code: AnyCode = False,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
-) -> None:
+) -> int:
     """Search for better defaults and check them on the families that did not choose them."""
     suites, texts = suite or ["rendered"], params or searching.DEFAULT_SPACE
     wanted, space = _wanted(flow, width, seeds, only), searching.parse_space(texts)
@@ -175,8 +165,8 @@ def search(
     changes, command = tuple(overrides or ()), _command("search", data, settings)
     measured = partial(searching.search, space, items, trials=trials, overrides=changes)
     write = _text(partial(searching.search_page, space=texts, command=command))
-    studies = [Study("search.md", measured, write)]
-    _run(studies, out, quiet, overwrite, workers=workers, any_code=any_code)
+    running: Running = {"workers": workers, "any_code": any_code}
+    return _run(out / "search.md", measured, write, quiet, overwrite, **running)
 
 
 def paper(
@@ -190,9 +180,10 @@ def paper(
     any_code: AnyCode = False,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
-) -> None:
+) -> int:
     """The paper's tables and figures by `preset: paper` and the defaults; can be continued."""
     changes = tuple(overrides or ())
+    # checked here, too, since finding the pairs takes long
     claim(out, FILES, overwrite)
     plan = make_plan(data, out, superpixels, analysis, limit, changes)
     for line in pairs_found(plan):
@@ -204,29 +195,23 @@ def paper(
     measured = partial(measure_cells, list(plan.drop_duplicates("key")["cell"]), measure_paper)
     command = _command("paper", data, settings)
     write = partial(write_paper, plan=plan, command=command, note=note)
-    studies = [Study(FILES[0], measured, write, FILES[1:])]
-    _run(studies, out, quiet, overwrite, workers=workers, any_code=any_code)
+    running: Running = {"workers": workers, "any_code": any_code}
+    return _run(out / FILES[0], measured, write, quiet, overwrite, FILES[1:], **running)
 
 
 def speed(
-    scenes: Annotated[
-        str, option("Rendered scenes and motorcycle, comma separated.")
-    ] = "street,room,motorcycle",
-    sizes: Annotated[
-        str, option("Superpixels N.", "--superpixels", "--sizes")
-    ] = "250,500,1000,2000",
+    scenes: Annotated[str, option("Rendered scenes, motorcycle.")] = "street,room,motorcycle",
+    sizes: Annotated[str, option("N.", "--superpixels", "--sizes")] = "250,500,1000,2000",
     neighbours: Annotated[str, option("K of the K-NN graph.")] = "10,15,20",
     seeds: Seeds = "0,1",
-    pairs: Annotated[
-        str, option("Pairs of the suite shared, comma separated words of their names.")
-    ] = "",
+    pairs: Annotated[str, option("Words of names of pairs of the suite shared.")] = "",
     data: options.Data = None,
     width: Width = 1024,
     overrides: options.Set = None,
     out: options.Out = Path("out/bench/speed"),
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
-) -> None:
+) -> int:
     """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
     chosen, known_scenes = options.listed(scenes), [*RENDERED, MOTORCYCLE.name]
     if not chosen or set(chosen) - set(known_scenes):
@@ -240,18 +225,18 @@ def speed(
     k = options.numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS)
     cells = timing.speed_cells(items, n, k, overrides or [])
     measured = partial(measure_cells, cells, timing.measure_speed)
-    study = Study("table.md", measured, _text(timing.speed_page), line=timing.progress_line)
-    _run([study], out, quiet, overwrite, fresh=True)
+    page, write, line = out / "table.md", _text(timing.speed_page), timing.progress_line
+    return _run(page, measured, write, quiet, overwrite, line=line, fresh=True)
 
 
 def cost(
     out: options.Out = Path("out/bench/speed"),
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
-) -> None:
+) -> int:
     """Time and memory of whole solves over N and image size, each in a process of its own."""
     measured = partial(measure_cells, cost_cells(), measure_pair)
-    _run([Study("cost.md", measured, _text(cost_page))], out, quiet, overwrite, fresh=True)
+    return _run(out / "cost.md", measured, _text(cost_page), quiet, overwrite, fresh=True)
 
 
 def chain(
@@ -261,7 +246,7 @@ def chain(
     out: options.Out = Path("out/bench/accuracy"),
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
-) -> None:
+) -> int:
     """What one scale costs on rendered sequences, and on kitti_tracking in the --data folder."""
     all_sequences = sequences(data)
     chosen = [i for i in all_sequences if not only or any(word in i.name for word in only)]
@@ -270,11 +255,5 @@ def chain(
         raise ConfigError("no sequence is left", where="--only", expected=names)
     cells = [Cell(item, tuple(overrides or ())) for item in chosen]
     measured = partial(measure_cells, cells, measure_chain)
-    line = lambda row: f"cost of one scale {show(row['cost'], '+.2%')}"  # noqa: E731
-    _run(
-        [Study("chain.md", measured, _text(chain_page), line=line)],
-        out,
-        quiet,
-        overwrite,
-        fresh=True,
-    )
+    page, write, line = out / "chain.md", _text(chain_page), lambda row: show(row["cost"], "+.2%")
+    return _run(page, measured, write, quiet, overwrite, line=line, fresh=True)

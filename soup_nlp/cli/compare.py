@@ -41,7 +41,7 @@ def compare(
     out: Annotated[Path | None, out_option("out/solvers-NAMES")] = None,
     overrides: options.Set = None,
     overwrite: options.Overwrite = False,
-) -> None:
+) -> int:
     """Run real solvers on problems, verify their claims, write table and profiles."""
     if not (seconds > 0 and iterations > 0):
         raise ConfigError(
@@ -86,4 +86,4 @@ def compare(
     print("\n".join(conclusion(frame_of_runs(rows))))
     print(f"files       {out}/: {', '.join(written)}, runs.jsonl")
     verified = sum(bool(r["verified"]) for r in rows)
-    options.finish(bool(verified), f"{verified} of {len(rows)} runs are verified")
+    return options.finish(bool(verified), f"{verified} of {len(rows)} runs are verified")

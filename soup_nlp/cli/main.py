@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import ast
-import errno
 import os
 import re
 import signal
@@ -24,8 +23,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from soup_nlp.errors import ConfigError, DataError, SoupError, StoppedError, printable
-from soup_nlp.storage.system import handling
+from soup_nlp.errors import ConfigError, SoupError, StoppedError, printable
+from soup_nlp.storage.system import handling, prepare_streams, refusal
 from soup_nlp.storage.versions import __version__, versions
 
 BUG = 70
@@ -34,12 +33,6 @@ ABORTED = 130
 """Exit code of a command that Ctrl-C ended without a result, as in shells."""
 BROKEN_PIPE = 141
 """Exit code after a broken pipe, as in shells."""
-
-SYSTEM = (
-    *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM),
-    *(errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EMFILE),
-)
-"""Errors of the operating system that are not bugs of the program."""
 
 
 def print_warning(
@@ -51,23 +44,6 @@ def print_warning(
 
     if issubclass(category, DataWarning):
         print(f"warning: {message}", file=sys.stderr)
-
-
-def refusal(error: Exception) -> DataError | None:
-    """DataError for a lack of memory, files or disk space; None for other errors."""
-    # messages of native code and of OpenCV; Python and NumPy raise MemoryError
-    words = ("bad_alloc", "Insufficient memory")
-    if isinstance(error, MemoryError) or any(word in str(error) for word in words):
-        return DataError(
-            "the machine has not enough memory for this",
-            found=error,
-            hint="smaller images, or fewer superpixels, neighbours or particles",
-        )
-    if isinstance(error, FileNotFoundError) and error.filename is None:
-        return DataError("the working folder does not exist any more", hint="cd to another one")
-    if isinstance(error, OSError) and error.errno in SYSTEM:
-        return DataError("the system refuses a file", where=error.filename, found=error.strerror)
-    return None
 
 
 def report_bug(error: BaseException) -> int:
@@ -100,26 +76,6 @@ def refuse_odd(words: Sequence[str]) -> None:
             raise ConfigError("an argument is empty", where=word or "command line", found=words)
         if any(unicodedata.category(c) == "Cc" and c not in "\n\t" for c in word):
             raise ConfigError("an argument holds control characters", found=word)
-
-
-def prepare_streams() -> None:
-    """Print characters that a stream cannot encode as escapes, and open closed streams.
-
-    A stream that was closed before the start (`>&-`) is connected to the null device. Otherwise the
-    next opened file would get its number, and native code would print into that file.
-    """
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            # gets the lowest free number
-            os.open(os.devnull, os.O_RDWR)
-    sys.stdout = sys.stdout or os.fdopen(1, "w")
-    sys.stderr = sys.stderr or os.fdopen(2, "w")
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            with suppress(OSError, ValueError):
-                stream.reconfigure(errors="backslashreplace")
 
 
 COMMANDS: Mapping[str, str] = {
@@ -161,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         with as_ctrl_c, warnings.catch_warnings():
             refuse_odd(words)
             warnings.showwarning = print_warning
-            code = int(_root()(args=words, standalone_mode=False) or 0)
+            code = int(root(args=words, standalone_mode=False) or 0)
             # the command line library turns a KeyboardInterrupt into this code
             if code == ABORTED:
                 raise KeyboardInterrupt
@@ -222,12 +178,6 @@ class LazyGroup(_Flags, TyperGroup):
 
 
 @cache
-def _root() -> Any:
-    """The command line, built once in a process."""
-    return typer.main.get_command(app)
-
-
-@cache
 def _load(name: str, home: str) -> Any:
     """The command of a module and function such as "solve:solve"."""
     module, _, function = home.partition(":")
@@ -251,7 +201,7 @@ def first_line(home: str) -> str:
     return _functions(module)[function]
 
 
-def _group(text: str, commands: Mapping[str, str], **options: Any) -> typer.Typer:
+def _group(text: str, commands: Mapping[str, str]) -> typer.Typer:
     """A group of commands that are imported later."""
     group = typer.Typer(
         cls=LazyGroup,
@@ -259,7 +209,6 @@ def _group(text: str, commands: Mapping[str, str], **options: Any) -> typer.Type
         pretty_exceptions_enable=False,
         help=text,
         context_settings={"help_option_names": ["-h", "--help"]},
-        **options,
     )
     for name, home in commands.items():
         # the command itself is imported when it is called
@@ -286,3 +235,7 @@ def program(
     ] = False,
 ) -> None:
     """Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program."""
+
+
+root: Any = typer.main.get_command(app)
+"""The command line as a function of words."""

@@ -7,11 +7,12 @@ import logging
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -23,7 +24,7 @@ from soup_nlp.config.problem import Problem as ProblemFile
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, StoppedError
 from soup_nlp.schema.limits import MAX_SEED
-from soup_nlp.storage.files import as_path, is_file
+from soup_nlp.storage.files import as_path
 from soup_nlp.storage.progress import Progress
 from soup_nlp.storage.rows import Row, failed, reason
 
@@ -43,6 +44,7 @@ def out_option(default: str) -> Any:
     return in_output(f"Output folder; default {default}.", "--out", "-o")
 
 
+Text = str | None
 Words = list[str] | None
 CAMERA = "fx,fy,cx,cy in pixels, or a file; default K.txt of a sequence, EXIF, a guess."
 Intrinsics = Annotated[str | None, in_input(CAMERA)]
@@ -75,14 +77,15 @@ Superpixels = Annotated[
     list[int] | None, option("Number of superpixels, 50 to 2000; may be repeated.")
 ]
 Data = Annotated[Path | None, option("Root folder of the dataset.")]
-DEPTH_SCALE = "Values per unit of length of {} (KITTI 256); default 1000."
+DEPTH_SCALE = "Values per unit of length of a true depth in .png (KITTI 256); default 1000."
+DepthScale = Annotated[float | None, option(DEPTH_SCALE)]
 Workers = Annotated[int, option("Processes of this machine.", min=1)]
 
 
-def finish(good: bool, reason_text: str) -> NoReturn:
-    """Print the exit code of a command with its reason, and end with it."""
+def finish(good: bool, reason_text: str) -> int:
+    """Print the exit code of a command with its reason; returns the code."""
     print(f"exit code   {int(not good)}: {reason_text}")
-    raise typer.Exit(int(not good))
+    return int(not good)
 
 
 def changed(
@@ -126,28 +129,20 @@ def listed(text: str) -> list[str]:
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
-def camera(text: str | None, where: str) -> list[float] | str | None:
-    """Value of the key `intrinsics`: four numbers, or the name of a file; None without a text.
+def sizes(
+    superpixels: int | None, neighbours: int | None, max_size: float | None
+) -> dict[str, object]:
+    """Keys of the options that `solve` and `chain` share."""
+    segmentation = {"superpixels": superpixels, "neighbours": neighbours}
+    return {f"segmentation.{k}": v for k, v in segmentation.items()} | {"max_size": max_size}
 
-    Raises:
-        ConfigError: the text is neither.
-    """
-    if text is None:
-        return None
+
+def camera(text: str | None) -> list[float] | str | None:
+    """Value of the key `intrinsics`: numbers, or the name of a file; None without a text."""
     try:
-        values = [float(x) for x in text.split(",")]
+        return text if text is None else [float(x) for x in text.split(",")]
     except ValueError:
-        values = []
-    if not values and is_file(as_path(text, "camera file", home=True)):
         return text
-    if len(values) != 4:
-        raise ConfigError(
-            "camera is neither four numbers nor a file",
-            where=where,
-            found=text,
-            expected="fx,fy,cx,cy or a text file of 4 or 9 numbers",
-        )
-    return values
 
 
 @contextmanager
@@ -235,6 +230,19 @@ class SolveLog(logging.Handler):
         self._logger.removeHandler(self)
         self._logger.setLevel(self._level)
 
+    @property
+    def listeners(self) -> dict[str, Any]:
+        """What `pipeline.run` reports to."""
+        return {"listener": self.iteration, "log": self.say, "on_stage": self.stage}
+
+    @contextmanager
+    def warnings(self) -> Iterator[None]:
+        """Context in which warnings about the input become lines; those of libraries do not."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", DataWarning)
+            warnings.showwarning = self._warn
+            yield
+
     def say(self, line: str) -> None:
         """Add a line to the log; the last line of a stage is its result."""
         self.lines.append(line)
@@ -262,10 +270,7 @@ class SolveLog(logging.Handler):
         words = f"{progress.stage}, iteration {progress.iteration}"
         self._bars.update(self._task, completed=self._done + part, it=words)
 
-    def warn(
-        self, message: Warning | str, category: type[Warning], *_: object, **__: object
-    ) -> None:
-        """Print a warning about the input; warnings of libraries are not printed."""
+    def _warn(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         if issubclass(category, DataWarning):
             self._announce_once(f"warning: {message}")
 

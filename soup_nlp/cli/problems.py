@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import option
+from soup_nlp.cli.options import Words, option
 from soup_nlp.config.presets import PRESETS, dump_preset
-from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems
+from soup_nlp.config.problem import description, dump_problem, load_problem, shipped_problems
 from soup_nlp.errors import ConfigError, DataError, printable
 from soup_nlp.export.artefact import (
     EXPORT_FILES,
@@ -24,7 +24,7 @@ from soup_nlp.export.artefact import (
 from soup_nlp.family.instances import SCENES, SIZES, STANDARD, STARTS, select
 from soup_nlp.family.write import write_family
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.storage.files import MOST_YAML, is_folder, read_text
+from soup_nlp.storage.files import is_folder
 from soup_nlp.storage.folders import claim, default_folder, staged
 
 
@@ -32,7 +32,7 @@ def show(
     problem: Annotated[Path | None, typer.Argument(help=options.PROBLEM)] = None,
     overrides: options.Set = None,
     preset: options.PresetName = None,
-    all_options: Annotated[bool, option("Every option, also the unusual ones.", "--all")] = False,
+    all_options: Annotated[bool, option("Every key, also the unusual ones.", "--all")] = False,
 ) -> None:
     """Print the merged problem and its hash; without a problem, the options of a preset."""
     if problem is None:
@@ -51,30 +51,18 @@ def show(
 
 
 def list_(
-    folder: Annotated[
-        Path | None, typer.Argument(help="Folder of problem files instead of the package's own.")
-    ] = None,
+    folder: Annotated[Path | None, typer.Argument(help="Folder of other problem files.")] = None,
 ) -> None:
     """Print the problems that come with the package, or of a folder."""
     if folder is not None and not is_folder(folder):
         raise ConfigError("no such folder", where=folder, hint="soup-nlp list without a folder")
     files = {str(p): p for p in sorted(folder.glob("*.yaml"))} if folder else shipped_problems()
     for name, path in files.items():
-        print(f"{printable(name):<14} {_first_line(path)}")
+        print(f"{printable(name):<14} {description(path)}")
     if folder is None:
         print("\nsoup-nlp solve NAME; templates take --set input.root=DIR, folder input.path=DIR")
     elif not files:
         print(f"no problem files (*.yaml) in {printable(str(folder))}")
-
-
-def _first_line(path: Path) -> str:
-    """The comment in the first line of a problem file."""
-    try:
-        text = read_text(path, "problem file", most=MOST_YAML)
-    except DataError as error:
-        return f"({error.what})"
-    first = text.partition("\n")[0]
-    return printable(first.removeprefix("#").strip(), 200) if first[:1] == "#" else ""
 
 
 def export(
@@ -83,17 +71,9 @@ def export(
     formulation: options.Formulations = None,
     coordinates: options.Coordinates = "matrix",
     superpixels: options.Superpixels = None,
-    format_: Annotated[
-        list[str] | None,
-        option(f"{', '.join(FORMATS)} (casadi has h5); may be repeated.", "--format"),
-    ] = None,
+    format_: Annotated[Words, option(f"{', '.join(FORMATS)}; may be repeated.", "--format")] = None,
     presolve: options.Presolve = True,
-    suffixes: Annotated[
-        bool,
-        option(
-            "Write suffixes kind, superpixel, scaling_factor (not read by CasADi).", "--suffixes"
-        ),
-    ] = False,
+    suffixes: Annotated[bool, option("Write suffixes; CasADi reads none.", "--suffixes")] = False,
     overrides: options.Set = None,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
@@ -149,9 +129,7 @@ def _list(values: tuple[object, ...]) -> str:
 
 
 def family(
-    out: Annotated[
-        Path, typer.Argument(help="Folder of the set; new, empty or of an earlier one.")
-    ],
+    out: Annotated[Path, typer.Argument(help="Folder of the set, new or of an earlier one.")],
     sizes: Annotated[str, option(f"Superpixels, of {_list(SIZES)}.")] = QUICK,
     scenes: Annotated[str, option("Rendered scenes.")] = _list(SCENES),
     formulation: options.Formulations = None,
@@ -160,7 +138,7 @@ def family(
         str, option("easy (presolved), hard (initialisation), cold (constant depth).")
     ] = _list(STARTS),
     overwrite: options.Overwrite = False,
-) -> None:
+) -> int:
     """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
     wanted = options.numbers(sizes, "--sizes")
     forms = ["/".join(form.values()) for form in parse_formulations(formulation, coordinates)]
@@ -178,4 +156,4 @@ def family(
     differing = [e["name"] for e in entries if e["published"] is False]
     if differing:
         print(f"{len(differing)} are not the published bytes: please report processor and versions")
-    raise typer.Exit(1 if differing else 0)
+    return 1 if differing else 0

@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import in_output, option, out_option
+from soup_nlp.cli.options import option, out_option
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.errors import ConfigError, DataError, ExportError
 from soup_nlp.evaluate.metrics import Scale
@@ -25,7 +25,7 @@ from soup_nlp.report.folder import convert as convert_folder
 from soup_nlp.report.folder import prepare_folder, renew_page, write_folder
 from soup_nlp.report.formats import FORMATS
 from soup_nlp.report.result import PAGE
-from soup_nlp.report.verdict import accuracy, protocol
+from soup_nlp.report.verdict import accuracy, sectioned
 from soup_nlp.sequence.folder import (
     CHAIN_PAGE,
     check_chain,
@@ -44,7 +44,7 @@ def check(
     export_: Annotated[
         Path | None, option("Exported folder of a .sol; default where the .sol lies.", "--export")
     ] = None,
-) -> None:
+) -> int:
     """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
     if is_chain(folder):
         claims = list(check_chain(folder))
@@ -54,29 +54,25 @@ def check(
         report = check_folder(folder)
         print(report)
         good, claim = report.ok, "claim"
-    elif folder.stem.startswith("SOUP-") and export_ is None:
-        verdict = check_sol(folder)
-        print(table_text(verdict.kinds))
-        print(verdict)
-        good, claim = all(k.ok for k in verdict.kinds), "constraint"
     else:
-        imported = import_sol(export_ or folder.parent, folder)
-        rows = sol_table(imported)
-        print(table_text(rows))
-        print(foreign_verdict(imported))
-        good, claim = all(r.ok for r in rows), "constraint"
+        if folder.stem.startswith("SOUP-") and export_ is None:
+            verdict = check_sol(folder)
+            rows, text = verdict.kinds, str(verdict)
+        else:
+            imported = import_sol(export_ or folder.parent, folder)
+            rows, text = sol_table(imported), foreign_verdict(imported)
+        print(f"{table_text(rows)}\n{text}")
+        good, claim = all(row.ok for row in rows), "constraint"
     conclusion = f"every {claim} holds" if good else f"a {claim} does not hold"
-    options.finish(good, conclusion)
+    return options.finish(good, conclusion)
 
 
 def evaluate(
     folder: options.Folder,
-    depth: Annotated[
-        Path, option("True depth: .dpt, .npy, .pfm, 16-bit .png; of a chain their folder.")
-    ],
+    depth: Annotated[Path, option("True depth, .dpt .npy .pfm .png; of a chain their folder.")],
     scale: Annotated[Scale, option("Rule of the one global scale.")] = "median",
     cap: Annotated[float | None, option("Drop truth beyond this depth.")] = None,
-    depth_scale: Annotated[float | None, option(options.DEPTH_SCALE.format("a .png"))] = None,
+    depth_scale: options.DepthScale = None,
 ) -> None:
     """Score a result against a truth file."""
     if is_chain(folder):
@@ -91,18 +87,15 @@ def evaluate(
         print("\n".join(score_lines(score(read_chain(folder)[0], truths))))
         return
     scores = evaluate_folder(folder, depth, scale=scale, cap=cap, depth_scale=depth_scale)
-    print(protocol(scores), *accuracy(scores), sep="\n")
+    print("\n".join(accuracy(scores)))
 
 
 def import_(
     folder: Annotated[Path, typer.Argument(help="Exported folder.")],
     sol: Annotated[Path, typer.Argument(help="The solver's .sol file.")],
-    out: Annotated[
-        Path | None,
-        in_output("Result folder; default DIR/result, or DIR/result-SOL.", "--out", "-o"),
-    ] = None,
+    out: Annotated[Path | None, out_option("DIR/result, or DIR/result-SOL")] = None,
     overwrite: options.Overwrite = False,
-) -> None:
+) -> int:
     """Make a result folder of a foreign solver's answer: depth maps, points, residuals."""
     imported = import_sol(folder, sol)
     run, s = imported.run, imported.run.solution
@@ -114,47 +107,25 @@ def import_(
             hint=f"soup-nlp check {sol} says what is wrong with it",
         )
     # answers of several solvers do not replace each other
-    name = "result" if sol.stem == "soup" else f"result-{sol.stem}"
-    target = out or folder / name
+    target = out or folder / ("result" if sol.stem == "soup" else f"result-{sol.stem}")
     prepare_folder(target, run.problem.input_paths(), overwrite, run.problem.subject)
     text = foreign_verdict(imported)
-    log = f"{imported.sol.message}\n{text}\n"
-    write_folder(target, run, log, text, overwrite=overwrite)
-    print(text)
-    print(f"files       {target}/")
-    print(f"next        soup-nlp check {target}")
-    options.finish(s.converged, f"the answer is {'' if s.converged else 'not '}verified")
+    write_folder(target, run, f"{imported.sol.message}\n{text}\n", text, overwrite=overwrite)
+    print(f"{text}\nfiles       {target}/\nnext        soup-nlp check {target}")
+    return options.finish(s.converged, f"the answer is {'' if s.converged else 'not '}verified")
 
 
 def foreign_verdict(imported: Imported) -> str:
-    """Message of the solver, and whether recomputed energy and residuals confirm its claim."""
-    s, sol = imported.run.solution, imported.sol
-    word = "verified" if s.converged else "not verified" if sol.solved else "no success claimed"
-    start = imported.manifest["exact_energy_at_start"]["total"]
-    headline = sol.headline or "no message"
-    terms = "  ".join(f"{k} {v:.5g}" for k, v in s.energy.items() if k != "total")
-    lines = [
-        f"solver      {headline} ({sol.status}, code {sol.code}): {word}",
-        # start of the solver, which after a presolve is not the proposal
-        f"energy      start {start:.6g}  solution {s.energy['total']:.6g}",
-        f"{'':<12}of the solution: {terms}",
-        "residuals   " + "  ".join(f"{k} {v:.1e}" for k, v in s.residuals.items()),
-    ]
-    if imported.run.metrics:
-        lines.append(f"accuracy    {protocol(imported.run.metrics)}")
-        lines += [" " * 12 + line for line in accuracy(imported.run.metrics)]
-    return "\n".join(lines)
+    """Verdict on the answer of a foreign solver, and its scores."""
+    scores = sectioned({"accuracy": accuracy(imported.run.metrics)})
+    return f"{imported}\n{scores}".rstrip()
 
 
 def view(
     folder: options.Folder,
-    serve: Annotated[
-        int | None, option("Serve the folder to this machine at a port instead; 0 chooses one.")
-    ] = None,
+    serve: Annotated[int | None, option("Serve the folder at this port; 0 chooses one.")] = None,
     renew: Annotated[bool, option("Generate the page again.", "--renew")] = False,
-    no_open: Annotated[
-        bool, option("Do not open a browser, print the address.", "--no-open")
-    ] = False,
+    no_open: Annotated[bool, option("Print the address, open no browser.", "--no-open")] = False,
 ) -> None:
     """Open the page of a result in a browser, or serve it."""
     page, renewed = (CHAIN_PAGE, renew_chain_page) if is_chain(folder) else (PAGE, renew_page)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -14,17 +13,14 @@ from typing import Annotated, Any
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import in_input, in_method, in_output, option
+from soup_nlp.cli.options import Text, in_input, in_method, in_output, option
 from soup_nlp.config.problem import Problem, load_problem, make_problem, title
 from soup_nlp.data.flow.sources import is_path
-from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SoupError
-from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run as run_problem
-from soup_nlp.report.findings import certainty, guess_reason
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.result import PAGE
-from soup_nlp.report.verdict import missed, verdict
+from soup_nlp.report.verdict import exit_code, verdict
 from soup_nlp.sequence.folder import CHAIN, SINGLE
 from soup_nlp.sequence.frames import IMAGES, Frames
 from soup_nlp.sequence.score import chain_lines
@@ -42,51 +38,32 @@ def solve(
     source: Annotated[
         list[Path] | None, typer.Argument(metavar="PROBLEM | REF NEXT", help=SOURCE)
     ] = None,
-    ref: Annotated[str | None, in_input("Reference image.")] = None,
-    next_: Annotated[str | None, in_input("Next image.", "--next")] = None,
     intrinsics: options.Intrinsics = None,
     fov: options.Fov = None,
-    intrinsics_next: Annotated[
-        str | None, in_input("Camera of the next frame, if it differs.")
-    ] = None,
-    depth: Annotated[str | None, in_input("True depth of the reference frame, to score.")] = None,
+    depth: Annotated[Text, in_input("True depth of the reference frame, to score.")] = None,
     undistort: options.Undistort = False,
     flow: Annotated[
-        str | None, in_flow("File (.flo, KITTI .png, .npy, .onnx) or name; default DIS.")
+        Text, in_flow("File (.flo, KITTI .png, .npy, .onnx) or name; else DIS.")
     ] = None,
-    flow_backward: Annotated[
-        str | None, in_flow("Flow from next to ref; the consistency is the confidence.")
-    ] = None,
-    flow_confidence: Annotated[
-        str | None, in_flow("Confidence of --flow: .npy in [0, 1], or a grey picture.")
-    ] = None,
-    depth_prior: Annotated[
-        str | None, in_prior("Depth of ref from elsewhere: .npy, .pfm, .png, .onnx.")
-    ] = None,
+    flow_backward: Annotated[Text, in_flow("Flow from next to ref; gives the confidence.")] = None,
+    flow_confidence: Annotated[Text, in_flow(".npy in [0, 1], or a grey picture.")] = None,
+    depth_prior: Annotated[Text, in_prior("Depth of ref: .npy, .pfm, .png, .onnx.")] = None,
     depth_prior_kind: Annotated[
-        str | None, in_prior("metric, relative, inverse, ordinal; default: by the flow.")
+        Text, in_prior("metric, relative, inverse, ordinal; default: by the flow.")
     ] = None,
     superpixels: options.Wanted = None,
     neighbours: options.Neighbours = None,
     max_size: options.MaxSize = None,
     overrides: options.Set = None,
     preset: options.PresetName = None,
-    no_refine: Annotated[
-        bool, in_method("The NLP alone, as refine.enabled=false.", "--no-refine")
-    ] = False,
-    no_nlp: Annotated[
-        bool, in_method("Refine the start, as refine.from_start=true.", "--no-nlp")
-    ] = False,
+    no_refine: Annotated[bool, in_method("Leave out the refinement.", "--no-refine")] = False,
+    no_nlp: Annotated[bool, in_method("Refine the initialisation, no NLP.", "--no-nlp")] = False,
     out: Annotated[Path | None, options.out_option("out/NAME")] = None,
     overwrite: options.Overwrite = False,
-    json_: Annotated[
-        bool, in_output("Print summary.json instead of the verdict.", "--json")
-    ] = False,
+    json_: Annotated[bool, in_output("Print summary.json, not the verdict.", "--json")] = False,
     quiet: options.Quiet = False,
-    verbose: Annotated[
-        bool, in_output("Print every stage and round, and more on the solver.", "--verbose", "-v")
-    ] = False,
-) -> None:
+    verbose: Annotated[bool, in_output("Print more on the solver.", "--verbose", "-v")] = False,
+) -> int:
     """Solve a pair of frames and write a result folder."""
     if no_refine and no_nlp:
         raise ConfigError(
@@ -94,15 +71,12 @@ def solve(
             found="--no-nlp and --no-refine",
             expected="one of them at most",
         )
+    source_of_flow = options.located(flow, "flow") if flow and is_path(flow) else json.dumps(flow)
     keys = {
-        "segmentation.superpixels": superpixels,
-        "segmentation.neighbours": neighbours,
-        "max_size": max_size,
+        **options.sizes(superpixels, neighbours, max_size),
         "refine.enabled": "false" if no_refine else None,
         "refine.from_start": "true" if no_nlp else None,
-        "flow.source": options.located(flow, "flow")
-        if flow and is_path(flow)
-        else flow and json.dumps(flow),
+        "flow.source": source_of_flow if flow else None,
         "flow.backward": options.located(flow_backward, "flow"),
         "flow.confidence": options.located(flow_confidence, "confidence of the flow"),
         "depth_prior.source": options.located(depth_prior, "depth prior"),
@@ -110,10 +84,7 @@ def solve(
     }
     changes = options.changed(preset, overrides, keys)
     pair_options = {
-        "ref": ref,
-        "next": next_,
-        "intrinsics": options.camera(intrinsics, "--intrinsics"),
-        "intrinsics_next": options.camera(intrinsics_next, "--intrinsics-next"),
+        "intrinsics": options.camera(intrinsics),
         "fov": fov,
         "depth": depth,
         "undistort": undistort or None,
@@ -128,16 +99,15 @@ def solve(
     limit = None if changes else chosen.expected.mre_at_most
     folder = out or default_folder(chosen.name, chosen.subject)
     log = options.SolveLog(quiet, verbose, chosen)
-    raise typer.Exit(solve_problem(chosen, folder, log, limit, json_, overwrite))
+    return solve_problem(chosen, folder, log, limit, json_, overwrite)
 
 
 def _from_file(problem: Path, pair: Mapping[str, Any], changes: Sequence[str]) -> Problem:
     """The problem of a file, which must come without options of a pair."""
     if pair:
-        options_text = ", ".join(f"--{key.replace('_', '-')}" for key in pair)
         raise ConfigError(
             "a problem file names its own pair",
-            found=f"{problem} and {options_text}",
+            found=f"{problem} and {', '.join(f'--{key}' for key in pair)}",
             expected="a problem file, or the options of a pair",
             hint="--set input.KEY=VALUE changes the input of a problem file",
         )
@@ -145,31 +115,21 @@ def _from_file(problem: Path, pair: Mapping[str, Any], changes: Sequence[str]) -
 
 
 def _from_images(words: Sequence[Path], pair: Mapping[str, Any], changes: Sequence[str]) -> Problem:
-    """The problem of two images, which are words or the options --ref and --next."""
-    named = {key: pair[key] for key in ("ref", "next") if key in pair}
-    images = [word for word in words if word.suffix.lower() in IMAGES or is_file(word)]
-    if len(images) == len(words) == 2 and not named:
-        named = {"ref": str(words[0]), "next": str(words[1])}
-    elif words or len(named) == 1:
-        words_found = [*map(str, words), *(f"--{key} {image}" for key, image in named.items())]
+    """The problem of two images."""
+    if len(words) != 2 or not all(w.suffix.lower() in IMAGES or is_file(w) for w in words):
+        hint = "soup-nlp demo solves two pairs that come with the package"
         raise ConfigError(
             "a pair is two images",
-            found=", ".join(words_found),
+            found=", ".join(map(str, words)) or "no image and no problem",
             expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
-            hint="soup-nlp chain solves more than two frames" if len(words) > 2 else None,
+            hint="soup-nlp chain solves more than two frames" if len(words) > 2 else hint,
         )
-    if not named:
-        raise ConfigError(
-            "nothing to solve",
-            found="no image and no problem",
-            expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
-            hint="soup-nlp demo, or soup-nlp solve motorcycle --out out/motorcycle",
-        )
-    reference = as_path(named["ref"], "reference image", home=True).absolute()
-    name = "-".join([reference.parent.name, reference.stem, Path(named["next"]).stem]).lstrip("-")
+    ref, following = words
+    reference = as_path(ref, "reference image", home=True).absolute()
+    name = "-".join([reference.parent.name, reference.stem, following.stem]).lstrip("-")
     raw = {
         "name": title(name),
-        "input": {"kind": "files", **pair, **named},
+        "input": {"kind": "files", **pair, "ref": str(ref), "next": str(following)},
         "base": str(Path.cwd()),
     }
     return make_problem(raw, changes, where="command line")
@@ -190,19 +150,10 @@ def solve_problem(
     """
     folder = prepare_folder(out, chosen.input_paths(), overwrite, chosen.subject)
     interrupt = interruptible(log.interrupted)
-    with interrupt as stop, warnings.catch_warnings(), log, scratch() as temporary:
+    with interrupt as stop, log.warnings(), log, scratch() as temporary:
         ipopt_log = temporary / "ipopt.log"
-        warnings.simplefilter("always", DataWarning)
-        warnings.showwarning = log.warn
         try:
-            run = run_problem(
-                chosen,
-                listener=log.iteration,
-                stop=stop,
-                log=log.say,
-                on_stage=log.stage,
-                ipopt_log=str(ipopt_log),
-            )
+            run = run_problem(chosen, stop=stop, ipopt_log=str(ipopt_log), **log.listeners)
             if interrupt.aborted:
                 raise KeyboardInterrupt
         except BaseException as error:
@@ -215,37 +166,16 @@ def solve_problem(
         # files are written completely even after an interruption
         interrupt.deferred = True
 
-        code, why = exit_code(run, mre_at_most)
-
-        verdicts = []
-
         def log_text(files: list[str]) -> str:
             log.stage("files")
-            for details in (log.verbose, True):
-                text = verdict(run, folder, files, mre_at_most, details)
-                verdicts.append(f"{text}\nexit code   {code}: {why}")
-            log.lines.append(verdicts[-1])
-            return "\n".join(log.lines) + "\n"
+            return "\n".join([*log.lines, verdict(run, folder, files, mre_at_most), ""])
 
-        write_folder(folder, run, log_text, ipopt_log=ipopt_log, overwrite=overwrite)
-    summary = folder / "summary.json"
-    print(summary.read_text(encoding="utf-8") if as_json else verdicts[0])
-    return code
-
-
-def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
-    """Exit code of a solve and its reason; `mre_at_most` is the largest MRE that is expected."""
-    refined = run.refined is not None and run.refined.status == "interrupted"
-    if refined or run.solution.status == "Interrupted":
-        return 1, "interrupted; the best iterate is written"
-    if not run.solved:
-        return 1, f"the NLP did not converge ({run.solution.status}); the best iterate is written"
-    if not run.good:
-        why = guess_reason(certainty(run))
-        return 1, f"{run.confidence.guessed:.0%} of the image is a guess: {why}"
-    if mre_at_most is not None and missed(run):
-        return 1, f"the MRE is above the expected {mre_at_most:g}"
-    return 0, "solved, and at most half of the image is a guess"
+        files = write_folder(folder, run, log_text, ipopt_log=ipopt_log, overwrite=overwrite)
+    if as_json:
+        print((folder / "summary.json").read_text(encoding="utf-8"))
+    else:
+        print(verdict(run, folder, files, mre_at_most, log.verbose))
+    return exit_code(run, mre_at_most)[0]
 
 
 PAIRS = {
@@ -259,7 +189,7 @@ def demo(
     out: options.Out = Path("out/demo"),
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
-) -> None:
+) -> int:
     """Solve a real pair and a rendered street in which cars move."""
     codes = []
     for name, text in PAIRS.items():
@@ -269,7 +199,7 @@ def demo(
         codes.append(solve_problem(problem, out / name, log, limit, overwrite=overwrite))
     pages = " and ".join(str(out / name / PAGE) for name in PAIRS)
     print(f"\nopen        {pages} in a browser")
-    raise typer.Exit(max(codes))
+    return max(codes)
 
 
 def chain(
@@ -280,18 +210,10 @@ def chain(
     intrinsics: options.Intrinsics = None,
     fov: options.Fov = None,
     undistort: options.Undistort = False,
-    stride: Annotated[
-        str, option("Take every n-th frame; auto: the next with enough parallax.")
-    ] = "1",
-    frames: Annotated[
-        int | None, option("Largest number of frames; 10 of a scene by default.", min=2)
-    ] = None,
-    two_frame: Annotated[
-        bool, option("Solve frames k and k + 2 too, for more links.", "--two-frame")
-    ] = False,
-    depth_scale: Annotated[
-        float | None, option(options.DEPTH_SCALE.format("true depth_*.png"))
-    ] = None,
+    stride: Annotated[str, option("Every n-th frame; auto: those with enough parallax.")] = "1",
+    frames: Annotated[int | None, option("At most so many; 10 of a scene.", min=2)] = None,
+    two_frame: Annotated[bool, option("Solve frames k and k + 2, too.", "--two-frame")] = False,
+    depth_scale: options.DepthScale = None,
     preset: options.PresetName = None,
     overrides: options.Set = None,
     superpixels: options.Wanted = None,
@@ -307,24 +229,18 @@ def chain(
     out = out or default_folder(f"chain-{name}", subject)
 
     def begin(sequence: Frames, pairs: int) -> None:
-        count = len(sequence)
         names = ", ".join(Path(file).name for file in sequence.names)
         spacing = f", far enough apart: {names}" if stride == AUTO else ""
         if not quiet:
-            print(f"{count} frames{spacing}; {pairs} pairs to solve", file=sys.stderr)
+            print(f"{len(sequence)} frames{spacing}; {pairs} pairs to solve", file=sys.stderr)
 
-    short = {
-        "segmentation.superpixels": superpixels,
-        "segmentation.neighbours": neighbours,
-        "max_size": max_size,
-    }
+    short = options.sizes(superpixels, neighbours, max_size)
     kept = options.resumable("the pairs that were finished are kept", f"{out}/pairs")
-    with kept, warnings.catch_warnings():
-        warnings.showwarning = options.SolveLog(quiet).warn
+    with kept, options.SolveLog(quiet).warnings():
         done = solve_chain(
             frames_of,
             out,
-            intrinsics=options.camera(intrinsics, "--intrinsics"),
+            intrinsics=options.camera(intrinsics),
             fov=fov,
             undistort=undistort,
             stride=stride,

@@ -27,7 +27,7 @@ from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
 from soup_nlp.schema.section import Keys, Positive, Samples, Section, Seed, Share, explain, nearest
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.start.start_options import StartOptions
-from soup_nlp.storage.files import as_path, is_file, read_text
+from soup_nlp.storage.files import MOST_YAML, as_path, is_file, read_text
 
 LONGEST_NAME = 100
 """Characters of a problem's name."""
@@ -193,6 +193,16 @@ def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
     raw.setdefault("name", title(path.stem))
     raw.setdefault("base", str(base))
     return make_problem(raw, overrides, where=str(path), lines=lines)
+
+
+def description(path: Path) -> str:
+    """The comment in the first line of a problem file."""
+    try:
+        text = read_text(path, "problem file", error=ConfigError, most=MOST_YAML)
+    except ConfigError as error:
+        return f"({error.what})"
+    first = text.partition("\n")[0]
+    return printable(first.removeprefix("#").strip(), 200) if first[:1] == "#" else ""
 
 
 def _find(path: Path) -> tuple[Path, Path]:

@@ -54,6 +54,20 @@ class Imported:
     manifest: Mapping[str, Any]
     violations: Mapping[str, Float]
 
+    def __str__(self) -> str:
+        """Message of the solver, and whether recomputed energy and residuals confirm its claim."""
+        s, sol = self.run.solution, self.sol
+        word = "verified" if s.converged else "not verified" if sol.solved else "no success claimed"
+        terms = "  ".join(f"{k} {v:.5g}" for k, v in s.energy.items() if k != "total")
+        # start of the solver, which after a presolve is not the proposal
+        start = self.manifest["exact_energy_at_start"]["total"]
+        return (
+            f"solver      {sol.headline or 'no message'} ({sol.status}, code {sol.code}): {word}\n"
+            f"energy      start {start:.6g}  solution {s.energy['total']:.6g}\n"
+            f"{'':<12}of the solution: {terms}\n"
+            f"residuals   {'  '.join(f'{k} {v:.1e}' for k, v in s.residuals.items())}"
+        )
+
 
 def import_sol(folder: str | Path, sol: str | Path) -> Imported:
     """Read a .sol file for an exported problem and recompute energy and residuals.

@@ -10,7 +10,14 @@ import numpy as np
 from soup_nlp.evaluate.metrics import DepthMetrics, skill
 from soup_nlp.evaluate.scoring import SURE
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import certainty, certainty_lines, flow_words, found_words, hints
+from soup_nlp.report.findings import (
+    certainty,
+    certainty_lines,
+    flow_words,
+    found_words,
+    guess_reason,
+    hints,
+)
 from soup_nlp.report.result import PAGE
 
 STATUS = {
@@ -52,10 +59,27 @@ def verdict(
     limit: float | None = None,
     details: bool = True,
 ) -> str:
-    """Facts, files and next command; see `facts`."""
+    """Facts, files, next command and exit code; see `facts`."""
     look = [f"look        soup-nlp view {folder}"] if PAGE in files else []
     lines = [f"files       {folder}/: {', '.join(files)}", *look]
-    return "\n".join([facts(run, limit, details), *lines, f"next        soup-nlp check {folder}"])
+    lines.append(f"next        soup-nlp check {folder}")
+    code, why = exit_code(run, limit)
+    return "\n".join([facts(run, limit, details), *lines, f"exit code   {code}: {why}"])
+
+
+def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
+    """Exit code of a solve and its reason; `mre_at_most` is the largest MRE that is expected."""
+    refined = run.refined is not None and run.refined.status == "interrupted"
+    if refined or run.solution.status == "Interrupted":
+        return 1, "interrupted; the best iterate is written"
+    if not run.solved:
+        return 1, f"the NLP did not converge ({run.solution.status}); the best iterate is written"
+    if not run.good:
+        why = guess_reason(certainty(run))
+        return 1, f"{run.confidence.guessed:.0%} of the image is a guess: {why}"
+    if mre_at_most is not None and missed(run):
+        return 1, f"the MRE is above the expected {mre_at_most:g}"
+    return 0, "solved, and at most half of the image is a guess"
 
 
 def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
@@ -76,7 +100,7 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
         "found": found_words(run),
         "certainty": certainty_lines(shares),
         "try": hints(flow.uv, flow.confidence, shares, *by_camera),
-        "accuracy": [protocol(run.metrics), *accuracy(run.metrics)] if run.metrics else [],
+        "accuracy": accuracy(run.metrics),
         "expected": [f"MRE at most {limit:g}: {'missed' if missed(run) else 'met'}"]
         if limit is not None and "solution" in run.metrics
         else [],
@@ -186,23 +210,21 @@ def _energies(run: Run) -> list[str]:
     return lines
 
 
-def protocol(metrics: Mapping[str, DepthMetrics]) -> str:
-    """Scale rule and cap of the scores, in words."""
+def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
+    """Scale rule and cap of the scores, then their table; empty without scores.
+
+    The next frame is listed where only that one has a truth, without skill.
+    """
+    if not metrics:
+        return []
     first = next(iter(metrics.values()))
     cap = "no depth cap" if first.cap is None else f"depth cap {first.cap:g}"
     rule = "no scale" if first.scale_rule == "none" else f"one global {first.scale_rule} scale each"
     frame = "reference" if "constant" in metrics else "next"
-    return f"depth of the {frame} frame, {rule}, {cap}"
-
-
-def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
-    """Table of the scores; the next frame is listed where only that one has a truth.
-
-    Skill is blank for the next frame.
-    """
+    lines = [f"depth of the {frame} frame, {rule}, {cap}"]
     worst = metrics["constant"].mre if "constant" in metrics else np.nan
     order = ["solution", *SURE, "nlp", "start", "rigid", "constant"]
-    lines = [f"{'':<17}{'MRE':>8}{'median':>9}{'skill':>8}{'coverage':>10}"]
+    lines.append(f"{'':<17}{'MRE':>8}{'median':>9}{'skill':>8}{'coverage':>10}")
     for name in order if "constant" in metrics else [*order, "solution_next"]:
         if (m := metrics.get(name)) is not None:
             gain = np.nan if name == "solution_next" else skill(m.mre, worst)

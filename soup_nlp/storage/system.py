@@ -1,8 +1,9 @@
-"""Functions of the operating system: memory, signals, end with the parent, temporary folders."""
+"""The operating system: memory, its errors, streams, signals, processes, temporary folders."""
 
 from __future__ import annotations
 
 import ctypes
+import errno
 import os
 import re
 import shutil
@@ -22,6 +23,11 @@ from soup_nlp.errors import DataError
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 """Files with the memory limit of a container."""
+REFUSALS = (
+    *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM),
+    *(errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EMFILE),
+)
+"""Errors of the operating system that are not bugs of the program."""
 
 
 def require_memory(size: float, what: str, where: object = None, hint: str | None = None) -> None:
@@ -47,6 +53,43 @@ def require_memory(size: float, what: str, where: object = None, hint: str | Non
             expected=f"at most {usable / 1e9:.3g} GB, which are free",
             hint=hint,
         )
+
+
+def refusal(error: Exception) -> DataError | None:
+    """DataError for a lack of memory, files or disk space; None for other errors."""
+    # messages of native code and of OpenCV; Python and NumPy raise MemoryError
+    words = ("bad_alloc", "Insufficient memory")
+    if isinstance(error, MemoryError) or any(word in str(error) for word in words):
+        return DataError(
+            "the machine has not enough memory for this",
+            found=error,
+            hint="smaller images, or fewer superpixels, neighbours or particles",
+        )
+    if isinstance(error, FileNotFoundError) and error.filename is None:
+        return DataError("the working folder does not exist any more", hint="cd to another one")
+    if isinstance(error, OSError) and error.errno in REFUSALS:
+        return DataError("the system refuses a file", where=error.filename, found=error.strerror)
+    return None
+
+
+def prepare_streams() -> None:
+    """Print characters that a stream cannot encode as escapes, and open closed streams.
+
+    A stream that was closed before the start (`>&-`) is connected to the null device. Otherwise the
+    next opened file would get its number, and native code would print into that file.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            # gets the lowest free number
+            os.open(os.devnull, os.O_RDWR)
+    sys.stdout = sys.stdout or os.fdopen(1, "w")
+    sys.stderr = sys.stderr or os.fdopen(2, "w")
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            with suppress(OSError, ValueError):
+                stream.reconfigure(errors="backslashreplace")
 
 
 @contextmanager

@@ -119,7 +119,7 @@ def test_confidence_that_does_not_fit_is_refused(orbit, tmp_path):
 
 
 def test_two_pictures_are_enough(orbit, tmp_path, capsys):
-    pair = ["--ref", str(orbit / "a.png"), "--next", str(orbit / "b.png")]
+    pair = [str(orbit / "a.png"), str(orbit / "b.png")]
     flow = ["--flow", str(orbit / "forward.flo"), "--flow-confidence", str(orbit / "half.png")]
     small = ["--superpixels", "30", "--neighbours", "5", "--no-refine", "--json"]
     small += sets("solver.presolve_iterations=5 solver.max_iter=2")

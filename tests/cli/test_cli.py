@@ -15,9 +15,9 @@ import pytest
 from helpers_files import read_ply, sets, write_flo, write_pair
 
 from soup_nlp.cli.main import main
-from soup_nlp.cli.solve import exit_code
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.report.check import check_folder
+from soup_nlp.report.verdict import exit_code
 
 pytestmark = pytest.mark.slow
 
@@ -140,10 +140,10 @@ def images(tmp_path_factory) -> Path:
 def solve_files(images: Path, out: Path, **changes: str) -> int:
     options = {"ref": "a.png", "next": "b.png", "intrinsics": "144,144,79.5,59.5"} | changes
     small = options.pop("sets", "segmentation.superpixels=40 segmentation.neighbours=6")
-    args = ["solve", "--out", str(out), "-q"]
+    args = ["solve", *(str(images / options.pop(k)) for k in ("ref", "next"))]
+    args += ["--out", str(out), "-q"]
     for key, value in options.items():
-        path = key in ("ref", "next", "flow", "depth")
-        args += [f"--{key.replace('_', '-')}", str(images / value) if path else value]
+        args += [f"--{key}", str(images / value) if key == "flow" else value]
     return main([*args, *sets(small)])
 
 
@@ -152,10 +152,10 @@ def solve_files(images: Path, out: Path, **changes: str) -> int:
     [
         ({"ref": "missing.png"}, "missing.png"),
         ({"intrinsics": "0.9,0.9,0.5,0.5"}, "normalised"),
-        ({"intrinsics": "a.png,b.png"}, "a file"),
+        ({"intrinsics": "a.png,b.png"}, "existing file"),
         ({"intrinsics": "0,0,79.5,59.5"}, "focal"),
         ({"intrinsics": "nan,9,1,1"}, "finite"),
-        ({"intrinsics": "1,2,3"}, "fx,fy,cx,cy"),
+        ({"intrinsics": "1,2,3"}, "a list of 4"),
         ({"flow": "cut.flo"}, "cut.flo"),
         ({"ref": "flat.png", "next": "flat.png"}, "too few pixels"),
         ({"sets": "segmentation.superpixels=10 segmentation.neighbours=15"}, "K"),
@@ -190,11 +190,10 @@ def test_one_superpixel_is_one_plane(images, tmp_path):
     ("words", "part"),
     [
         ("solve a.png", "a pair is two images"),
-        ("solve --ref a.png", "solve REF NEXT"),
+        ("solve --depth d.npy", "no image and no problem"),
         ("solve a.png b.png c.png", "soup-nlp chain"),
-        ("solve a.png b.png --next c.png", "--next c.png"),
         ("solve street b.png", "street, b.png"),
-        ("solve", "nothing to solve"),
+        ("solve", "solve REF NEXT"),
         ("solve missing.yaml", "problem file is missing"),
         ("check missing", "summary.json is missing"),
     ],
@@ -215,7 +214,7 @@ def test_arguments_that_are_no_pair_and_no_result_are_refused(words, part, capsy
     ],
 )
 def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
-    monkeypatch.setattr("soup_nlp.cli.solve.certainty", lambda run: {"weak": 0.51})
+    monkeypatch.setattr("soup_nlp.report.verdict.certainty", lambda run: {"weak": 0.51})
     outcome = {"status": "Solve_Succeeded", "solved": True, "guessed": 0.1, "mre": 0.1} | changes
     expected = SimpleNamespace(mre_at_most=0.2)
     fake = SimpleNamespace(
@@ -242,8 +241,7 @@ def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch
     small += sets("output.page=false")
 
     def solve(clip: str, *arguments: str) -> int:
-        pair = ["--ref", f"{clip}/frame_0.png", "--next", f"{clip}/frame_1.png"]
-        return main(["solve", *pair, *small, *arguments])
+        return main(["solve", *(f"{clip}/frame_{k}.png" for k in (0, 1)), *small, *arguments])
 
     assert solve("a/clip") in (0, 1)
     assert solve("b/clip") in (0, 1)

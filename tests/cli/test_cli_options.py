@@ -28,7 +28,7 @@ SMALL = sets(
 
 
 @pytest.mark.parametrize(
-    "option", [("--depth", "truth.npy"), ("--intrinsics-next", "1,1,0,0"), ("--ref", "a.png")]
+    "option", [("--depth", "truth.npy"), ("--intrinsics", "1,1,0,0"), ("--fov", "50")]
 )
 def test_options_of_a_pair_exclude_a_problem_file(option, tmp_path, capsys):
     assert main(["solve", ORBIT, "--out", str(tmp_path / "out"), *option]) == 2
@@ -112,7 +112,7 @@ def test_images_may_differ_in_size(tmp_path, capsys):
     cut = str(tmp_path / "pair" / "cut.png")
     cv2.imwrite(cut, pair.image_next[:76, :104, ::-1])
     np.save(tmp_path / "cut.npy", pair.truth.depth_next[:76, :104])
-    options = ["--ref", str(tmp_path / "pair" / "frame_0.png"), "--next", cut]
+    options = [str(tmp_path / "pair" / "frame_0.png"), cut]
     # the camera is a file here, as it may be in a problem file
     options += ["--intrinsics", str(tmp_path / "pair" / "K.txt")]
     options += ["--set", f"input.depth_next={tmp_path / 'cut.npy'}"]

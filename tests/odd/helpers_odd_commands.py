@@ -21,8 +21,6 @@ READ = {
     **{
         f"solve --{option} {suffix}": f"{{solve}} --{option} {{odd.{suffix}}}"
         for option, suffixes in {
-            "ref": "png",
-            "next": "png",
             "intrinsics": "txt",
             "flow": "flo npy png onnx",
             "flow-confidence": "npy",
@@ -31,7 +29,8 @@ READ = {
         }.items()
         for suffix in suffixes.split()
     },
-    "solve --ref alone": "solve --ref {odd.png} --next {b} -q -o {out}",
+    "solve REF": "solve {odd.png} {b} -q -o {out}",
+    "solve NEXT": "solve {a} {odd.png} -q -o {out}",
     "solve PROBLEM": "solve {odd.yaml} -o {out}",
     "view": "view {odd} --no-open",
     "convert": "convert {odd} --to glb -o {out}",

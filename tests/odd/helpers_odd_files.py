@@ -106,7 +106,7 @@ def array_cases() -> Iterator[Case]:
         yield from cases(DOORS, title, line, MAPS, make=make, other=other, solves=good)
         line = f"{{solve}} --flow dis --flow-{option} {{d}}"
         yield from cases(DOORS, f"flow_{option} {{}}", line, ["without a flow"])
-    yield from cases(DOORS, "json of {}", "{solve} --json --ref no.png", ["an error"])
+    yield from cases(DOORS, "json of {}", "solve no.png {b} --json -o {out}", ["an error"])
 
 
 # --- images --------------------------------------------------------------------------------------
@@ -178,9 +178,9 @@ def _photos(w: World, o: Path, exif: dict[int, Any] | bytes) -> None:
 def image_cases() -> Iterator[Case]:
     tiffs = dict.fromkeys(("float tiff", "float64 tiff"), ANY)
     for doors, line in {
-        "ref": "{solve} --ref {x}",
-        "next": "{solve} --next {x}",
-        "ref and next": "{solve} --flow dis --ref {x} --next {x}",
+        "ref": "solve {x} {b} --flow {f} --intrinsics {camera} {tiny} -q -o {out}",
+        "next": "solve {a} {x} --flow {f} --intrinsics {camera} {tiny} -q -o {out}",
+        "ref and next": "solve {x} {x} --intrinsics {camera} {tiny} -q -o {out}",
     }.items():
         title, make = f"image {{}} as {doors}", written("x.png")
         yield from cases("4 endless", title, line, IMAGES, make=make, other=tiffs)

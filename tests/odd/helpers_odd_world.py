@@ -80,10 +80,9 @@ class World:
 
     @cached_property
     def pair(self) -> list[str]:
-        """Options of `solve` for the tiny pair; the last one of a repeated option counts."""
-        names = {"ref": "a.png", "next": "b.png", "flow": "f.npy"}
-        words = [w for key, name in names.items() for w in (f"--{key}", str(self.good(name)))]
-        return [*words, "--intrinsics", CAMERA]
+        """Words of `solve` for the tiny pair; the last one of a repeated option counts."""
+        a, b, flow = (str(self.good(name)) for name in ("a.png", "b.png", "f.npy"))
+        return [a, b, "--flow", flow, "--intrinsics", CAMERA]
 
     @cached_property
     def result(self) -> Path:
