@@ -70,19 +70,19 @@ def digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _is_blocked(folder: Path, name: str) -> bool:
-    """Whether a folder is in the place of a file, or a file or link in that of its folder."""
+def _state(folder: Path, name: str) -> str:
+    """What a folder holds under a name.
+
+    "nothing", "made" by the program, "foreign", or "blocked": by a folder, or by a file or link
+    above it.
+    """
     path, above = folder / name, [folder / p for p in PurePosixPath(name).parents[:-1]]
-    wrong = (os.path.lexists(p) and (p.is_symlink() or not p.is_dir()) for p in above)
-    return any(wrong) or (path.is_dir() and not path.is_symlink())
-
-
-def _is_foreign(folder: Path, name: str) -> bool:
-    """Whether a folder holds something under this name that the program did not make."""
-    path, blocked = folder / name, _is_blocked(folder, name)
-    if blocked or path.is_symlink() or not path.is_file():
-        return blocked or os.path.lexists(path)
-    return mark_of(folder).files.get(name) != digest_of(path)
+    if any(p.is_symlink() or (p.exists() and not p.is_dir()) for p in above):
+        return "blocked"
+    if path.is_symlink() or path.is_file():
+        made = not path.is_symlink() and mark_of(folder).files.get(name) == digest_of(path)
+        return "made" if made else "foreign"
+    return "blocked" if path.is_dir() else "foreign" if path.exists() else "nothing"
 
 
 def default_folder(name: str, subject: str) -> Path:
@@ -96,8 +96,7 @@ def claim(
 ) -> Path:
     """Check that these files may be written into an output folder, and return it.
 
-    A missing folder is not made yet. Moves that a killed process has begun are finished, and its
-    temporary folders are removed.
+    A missing folder is not made yet.
 
     Args:
         folder: The output folder.
@@ -109,22 +108,17 @@ def claim(
         DataError: the folder cannot be written, holds a file of the user or a folder with one of
             the names, or is the result of another subject.
     """
-    target = Path(os.path.realpath(as_path(folder, "output folder")))
-    with _named_errors(folder), _locked(target):
+    with _locked(folder) as target:
         existing = next(p for p in (target, *target.parents) if os.path.lexists(p))
         # fails where nothing can be written
-        with tempfile.TemporaryFile(dir=existing):
-            _finish(target)
+        tempfile.TemporaryFile(dir=existing).close()
         before = mark_of(target).subject
+        states = {name: _state(target, name) for name in names}
+        foreign = [name for name, state in states.items() if state in ("foreign", "blocked")]
+        hint = "choose another --out, or --overwrite"
         if subject and before not in ("", subject) and not overwrite:
-            raise DataError(
-                "output folder holds the result of something else",
-                where=folder,
-                found=before,
-                expected=subject,
-                hint="choose another --out, or --overwrite",
-            )
-        foreign = [name for name in names if _is_foreign(target, name)]
+            what = "output folder holds the result of something else"
+            raise DataError(what, where=folder, found=before, expected=subject, hint=hint)
         if foreign and not overwrite:
             raise DataError(
                 "output folder holds files that would be overwritten and that this program did not"
@@ -132,13 +126,11 @@ def claim(
                 where=folder,
                 found=", ".join(foreign),
                 expected="a new or empty folder, or that of an earlier result",
-                hint="choose another --out, or --overwrite",
+                hint=hint,
             )
-        for name in foreign:
-            if _is_blocked(target, name):
-                raise DataError(
-                    "cannot write over a folder, or below a file or link", where=target / name
-                )
+        for name in (name for name in foreign if states[name] == "blocked"):
+            what = "cannot write over a folder, or below a file or link"
+            raise DataError(what, where=target / name)
     return Path(folder)
 
 
@@ -159,9 +151,9 @@ def staged(
     Raises:
         DataError: a file cannot be written, or a file of the user has the name of a new one.
     """
+    target = Path(os.path.realpath(as_path(folder, "output folder")))
+    fresh = [p for p in (target, *target.parents) if not os.path.lexists(p)]
     with _named_errors(folder):
-        target = Path(os.path.realpath(as_path(folder, "output folder")))
-        fresh = [p for p in (target, *target.parents) if not os.path.lexists(p)]
         target.mkdir(parents=True, exist_ok=True)
         recover(target)
         try:
@@ -169,7 +161,6 @@ def staged(
                 yield stage
                 claim(target, files_in(stage), overwrite)
                 with _locked(target), deferred_signals():
-                    _finish(target)
                     _commit(stage, target, whole, subject)
         except DataError as error:
             # name the final path instead of the temporary one
@@ -187,11 +178,7 @@ def staged(
 def _commit(stage: Path, target: Path, whole: bool, subject: str) -> None:
     """Mark a temporary folder as complete and move its files to their places."""
     new, before = {name: digest_of(stage / name) for name in files_in(stage)}, mark_of(target)
-    old = {k: v for k, v in before.files.items() if not _is_foreign(target, k)}
-    for name in old.keys() & new.keys():
-        # a file of the program may have been removed
-        with suppress(FileNotFoundError):
-            shutil.copymode(target / name, stage / name)
+    old = {k: v for k, v in before.files.items() if _state(target, k) == "made"}
     files = new if whole else old | new
     of = {"of": subject or before.subject} if subject or before.subject else {}
     mark = json.dumps({**of, "files": dict(sorted(files.items()))}, indent=1)
@@ -211,21 +198,35 @@ def recover(folder: Path) -> None:
     The incomplete folders of running processes are kept.
     """
     with _locked(folder):
-        _finish(folder)
+        pass
+
+
+@contextmanager
+def _locked(folder: PathLike) -> Iterator[Path]:
+    """The real path of an output folder, recovered, and locked until the block ends.
+
+    A kill releases the lock. A missing folder is not locked, nor one in a file system that has no
+    locks, where another process may be moving the same files.
+    """
+    target = Path(os.path.realpath(as_path(folder, "output folder")))
+    with ExitStack() as stack, _named_errors(folder):
+        with suppress(OSError):
+            handle = os.open(target, os.O_RDONLY | os.O_DIRECTORY)
+            stack.callback(os.close, handle)
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        _finish(target)
+        yield target
 
 
 def _finish(folder: Path) -> None:
-    """The same for a process that has locked the folder.
-
-    Where locks are not supported, another process may be moving the same files.
-    """
+    """See `recover`."""
     for stage in folder.glob(f"{_COMPLETE}*"):
         if stage.is_symlink():
             continue
         # the mark is moved last: without it, every file was moved
         if (stage / MARK).is_file():
             for name in mark_of(folder).files.keys() - mark_of(stage).files.keys():
-                if not _is_foreign(folder, name):
+                if _state(folder, name) == "made":
                     (folder / name).unlink(missing_ok=True)
                     with suppress(OSError):
                         # removes empty folders only
@@ -239,26 +240,11 @@ def _finish(folder: Path) -> None:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Wait for the lock of a folder and keep it until the block ends; a kill releases it."""
-    with ExitStack() as stack:
-        # the folder may be missing, and some network file systems have no locks
-        with suppress(OSError):
-            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-            stack.callback(os.close, handle)
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-
-
-@contextmanager
 def _named_errors(folder: PathLike) -> Iterator[None]:
     """Turn errors of the operating system into a DataError that names the output folder."""
     try:
         yield
     except OSError as error:
-        raise DataError(
-            "output folder cannot be written",
-            where=folder,
-            found=error.strerror or error,
-            hint="choose another --out, or make room where the disk is full",
-        ) from error
+        reason, hint = error.strerror or error, "choose another --out, or make room on a full disk"
+        what = "output folder cannot be written"
+        raise DataError(what, where=folder, found=reason, hint=hint) from error

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import stat
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -247,16 +246,6 @@ def test_the_working_folder_keeps_its_identity(tmp_path, monkeypatch):
         write(Path(), a=text)
     assert content(tmp_path) == {"a": "2"}
     assert tmp_path.stat().st_ino == before
-
-
-def test_permissions_are_those_of_the_old_files(tmp_path):
-    target = tmp_path / "out"
-    target.mkdir(0o750)
-    write(target, a="1")
-    (target / "a").chmod(0o604)
-    write(target, a="2")
-    assert stat.S_IMODE((target / "a").stat().st_mode) == 0o604
-    assert stat.S_IMODE(target.stat().st_mode) == 0o750
 
 
 KILLED = """
