@@ -246,7 +246,7 @@ def growth(frame: pd.DataFrame) -> pd.DataFrame:
 def speed_page(frame: pd.DataFrame) -> str:
     """The page of all rows."""
     good = with_costs(frame)
-    blocks = ["# Speed and growth", _conclusion(good)]
+    blocks = ["# Speed and growth"]
     if len(good):
         runs = good.set_axis(pd.MultiIndex.from_frame(good[list(RUN)].rename(columns=RUN)))
         blocks += [titled(runs, COLUMNS), NOTE]
@@ -256,30 +256,3 @@ def speed_page(frame: pd.DataFrame) -> str:
     facts = {"date": date.today(), **machine()}.items()
     blocks += ["## Machine", "\n".join(f"- {k}: {v}" for k, v in facts)]
     return page_text(blocks, frame)
-
-
-def progress_line(row: Row) -> str:
-    """The result of a run as text for the progress line."""
-    reference = row["reference"]
-    return (
-        f"{row['status']}, {row['cpu']['nlp']:.1f} CPU s, E {row['energy']['total']:.4g}; LM"
-        f" {reference['cpu_seconds']:.1f} CPU s, E {reference['energy']['total']:.4g}"
-    )
-
-
-def _conclusion(frame: pd.DataFrame) -> str:
-    """Summary of the table in sentences."""
-    if frame.empty:
-        return "No run ended with a result."
-    large = frame[frame["n"] > 0.8 * frame["n"].max()]
-
-    def ends(values: pd.Series, form: str) -> str:
-        return f"{values.min():{form}} to {values.max():{form}}"
-
-    return (
-        f"{int(frame['converged'].sum())} of {len(frame)} runs converged to their tolerance."
-        f" With the most superpixels (about {large['n'].max()}) the NLP takes"
-        f" {ends(large['cpu.nlp'], '.1f')} CPU s ({len(large)} runs). Its energy is"
-        f" {ends(frame['energy_to_reference'], '.4f')} times that of Levenberg-Marquardt on the"
-        f" same smoothing, its CPU time {ends(frame['time_to_reference'], '.2f')} times."
-    )

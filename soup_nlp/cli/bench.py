@@ -225,7 +225,7 @@ def speed(
     k = options.numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS)
     cells = timing.speed_cells(items, n, k, overrides or [])
     measured = partial(measure_cells, cells, timing.measure_speed)
-    page, write, line = out / "table.md", _text(timing.speed_page), timing.progress_line
+    page, write, line = out / "table.md", _text(timing.speed_page), lambda row: row["status"]
     return _run(page, measured, write, quiet, overwrite, line=line, fresh=True)
 
 

@@ -28,7 +28,7 @@ from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
-from soup_nlp.solve.functions import Functions, iteration_callback
+from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.ipopt import DEFAULTS
 from soup_nlp.storage.system import end_with_parent
 
@@ -127,12 +127,11 @@ class Plugin(NamedTuple):
 
 CLAIMS = ("Solve_Succeeded", "Solved_To_Acceptable_Level", "SUCCESS", "success", "Converged")
 NESTED = ("ipopt", "uno", "bonmin", "fatrop")
-CALLS_BACK = ("ipopt", "sqpmethod")
-"""Libraries that call a callback at every iteration."""
 TOLERANCES = {
     **dict.fromkeys(("tol", "dual_inf_tol", "compl_inf_tol"), "tol"),
     "constr_viol_tol": "feasibility",
     "max_iter": "iterations",
+    "max_cpu_time": "seconds",
 }
 """Attribute of `Limits` by name of Ipopt's option."""
 TWO_LIMITS = {"max_iter": "iterations", "tol": "tol"}
@@ -198,15 +197,6 @@ def plugin(name: str, task: Task) -> Answer:
     chosen = PLUGINS[name]
     library = chosen.library
     nlp = task.gauss_newton if chosen.hessian == "gauss-newton" else task.nlp
-    end = clock() + task.limits.seconds
-    ended: list[bool] = []
-
-    def late(*outputs: Float) -> float:
-        """Whether the time is over; then `ended` has an entry."""
-        if clock() > end:
-            ended.append(True)
-        return float(bool(ended))
-
     # parameters are replaced by numbers, since bonmin has no parameters
     x, functions = ca.MX.sym("x", nlp.nx), Functions(nlp)
     # these libraries differentiate f and g at set-up, in spite of cached derivatives
@@ -217,22 +207,19 @@ def plugin(name: str, task: Task) -> Answer:
         "print_time": False,
         "show_eval_warnings": False,
         "error_on_fail": False,
-        "no_nlp_grad": library in CALLS_BACK,
+        "no_nlp_grad": library in ("ipopt", "sqpmethod"),
         "cache": _derivatives(nlp, functions, CACHED[library]),
     }
-    if library in CALLS_BACK:
-        common["iteration_callback"] = iteration_callback("watch", nlp.nx, nlp.ng, 0, late)
     problem = {"x": x, "f": f, "g": g}
     solver = ca.nlpsol("solver", library, problem, common | chosen.made_for(task.limits))
     out = solver(x0=nlp.x0, lbx=nlp.lbx, ubx=nlp.ubx, lbg=nlp.lbg, ubg=nlp.ubg)
     stats = solver.stats()
     status = str(stats.get("return_status", stats.get("unified_return_status", "?")))
-    claimed = bool(stats.get("success")) or status in CLAIMS
     return Answer(
         np.asarray(out["x"]).ravel(),
         np.asarray(out["lam_g"]).ravel(),
-        "Time_Limit" if ended else status,
-        claimed and not ended,
+        status,
+        bool(stats.get("success")) or status in CLAIMS,
         int(stats.get("iter_count", -1)),
     )
 
