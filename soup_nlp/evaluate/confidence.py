@@ -93,9 +93,7 @@ class Confidence:
         spread: (H, W) standard deviation of log depth by the flow's information beside the terms
             on shape, not calibrated.
         marginals: Marginal variances of the planes and of the components' scales.
-        noise: Noise of the flow, pixels.
         component_sigma: (C,) standard deviation of the components' log scale.
-        misfit: (N,) mean distance between the flow and the answer's induced flow, pixels.
         evidence: Evidence of the flow for the depth of every component.
         scale: (N,) standard deviation of log depth by the scales of components, see
             `scale_by_contact`.
@@ -104,9 +102,7 @@ class Confidence:
     sigma: Float
     spread: Float
     marginals: Marginals
-    noise: float
     component_sigma: Float
-    misfit: Float
     evidence: Evidence
     scale: Float
 
@@ -189,7 +185,6 @@ def calibrated(
 
     Args:
         spread: Standard deviation of log depth by the marginals.
-        noise: Noise of the flow, pixels.
         misfit: Misfit of the superpixel, pixels; where it is larger than the noise, the geometric
             mean of both replaces the noise.
         prior: Standard deviation without the flow; its information is added.
@@ -308,5 +303,4 @@ def confidence(
     in_image = np.hypot(added[rec.labels], at_outlines(rec.depth_ref))
     sigma = calibrated(spread, noise, misfit[rec.labels], before[rec.labels], bends, in_image)
     component_sigma = with_prior(np.sqrt(with_flow.component))
-    errors = noise, component_sigma, misfit, flow_evidence, scale
-    return Confidence(sigma, spread, with_flow, *errors)
+    return Confidence(sigma, spread, with_flow, component_sigma, flow_evidence, scale)

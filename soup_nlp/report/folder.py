@@ -170,7 +170,6 @@ def _attributes(run: Run, config: str) -> dict[str, Any]:
         "config": config,
         "nlp": run.solution.description,
         # None is left out
-        "scale_to_truth": run.metrics["solution"].scale if "solution" in run.metrics else None,
         "truth_unit": None if run.pair.truth is None else run.pair.truth.unit,
     }
 

@@ -126,8 +126,6 @@ confidence/plane          1     N,3,3   marginal covariance of relative inverse 
 anchor and of its slopes over the radius, not calibrated
 confidence/spread         1     H,W     standard deviation of log z by the marginals, not calibrated
 confidence/component_sigma  1   C       standard deviation of a rigid component's log scale
-confidence/misfit         px    N       mean distance of the flow from that of the answer
-confidence/noise          px    -       noise of the flow that the calibration uses
 
 components/of_superpixel  1     N       what moves as one in the solution; 0 is the background
 components/motion         soup  C,4,4   next_from_ref, the camera's motion included
