@@ -13,41 +13,41 @@ import numpy as np
 import pandas as pd
 from scipy.stats import linregress
 
+from soup_nlp.bench.accuracy import scores
 from soup_nlp.bench.processes import machine
 from soup_nlp.bench.reference_solver import levenberg_marquardt
-from soup_nlp.bench.study import Cell, Item, markdown, page_text, titled
+from soup_nlp.bench.study import Cell, Item, main_metric, markdown, page_text, titled
 from soup_nlp.bench.suites import MOTORCYCLE, Options, list_suite
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.pipeline.case import prepare
-from soup_nlp.pipeline.record import Case
-from soup_nlp.pipeline.run import make_run
+from soup_nlp.pipeline.record import Run
+from soup_nlp.pipeline.run import run
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.solve.solver_options import SolverOptions
-from soup_nlp.solve.stages import Solution, solve_soup
+from soup_nlp.solve.stages import Solution
 from soup_nlp.storage.rows import Row, peak_bytes
 from soup_nlp.storage.system import scratch
 
 REFERENCE_ITERATIONS = 100
 """Limit of the steps of Levenberg-Marquardt for every smoothing width."""
-OUTSIDE = ("flow", "segmentation", "start", "weights", "evaluation", "output")
+OUTSIDE = ("flow", "segmentation", "start", "evaluation", "output")
 """All stages but the NLP and the loading or rendering of the frames."""
-PHASES = ("load", *OUTSIDE[:4], "build", "functions", "linear algebra", *OUTSIDE[4:])
+PHASES = ("load", *OUTSIDE[:3], "build", "functions", "linear algebra", *OUTSIDE[3:])
 """Stages of a run; build, functions and linear algebra are the NLP."""
 RUN = {"sequence": "pair", "n": "N", "k": "K"}
 COLUMNS = {
     "cpu.nlp": ("CPU s", ".1f"),
-    "wall.nlp": ("wall s", ".1f"),
+    "stages.nlp": ("wall s", ".1f"),
     "iterations": ("its", ".0f"),
-    "stages": ("its by stage", ""),
+    "each": ("its by stage", ""),
     "energy_start.total": ("E start", ".2f"),
     "energy.total": ("E", ".3f"),
     "reference.energy.total": ("E LM", ".3f"),
     "energy_to_reference": ("E / LM", ".4f"),
     "time_to_reference": ("CPU / LM", ".2f"),
     "reference.iterations": ("LM its", ".0f"),
-    "errors.start": ("MRE start", ".4f"),
-    "errors.solution": ("MRE", ".4f"),
+    "start": ("MRE start", ".4f"),
+    "mre": ("MRE", ".4f"),
     "reference.mre": ("MRE LM", ".4f"),
     "residuals.dual_infeasibility": ("dual inf.", ".1e"),
     "residuals.nlp_infeasibility": ("constraints", ".1e"),
@@ -69,7 +69,7 @@ NOTE = (
     "CPU s and wall s: the whole NLP. LM: Levenberg-Marquardt on the manifold with reweighting,"
     " from the same start on the same smoothing widths, in the same process. E: exact energy. MRE"
     " after median scale, no cap. dual inf., constraints: recomputed at Ipopt's answer. GB: peak of"
-    " the process before LM runs. Outside: flow, segmentation, start, weights, evaluation, output"
+    " the process before LM runs. Outside: flow, segmentation, start, evaluation, output"
     " with every picture, point cloud and HDF5. Wall times of a shared machine vary with its load;"
     " CPU times less so. One thread."
 )
@@ -120,52 +120,43 @@ def speed_cells(
 
 
 def measure_speed(cell: Cell) -> Row:
-    """Solve a problem and measure the cost of every stage.
+    """The scores of a run, and the cost of every stage.
 
     Returns:
-        "wall" and "cpu" seconds by stage ("build", "functions" and "linear algebra" are parts of
-        the wall time of "nlp"), MRE by soup in "errors", "peak_bytes" before the reference solver
-        runs, and that solver's "reference"; further numbers by the names of the solution.
+        Entries of `accuracy.scores`, whose "stages" have "output" and the parts of "nlp" too, "cpu"
+        seconds by stage, "peak_bytes" before the reference solver runs, and that solver's
+        "reference"; further numbers by the names of the solution.
 
     Raises:
         SoupError: the input cannot be used.
     """
-    wall: dict[str, float] = {}
-    cpu: dict[str, float] = {}
-    last = [time.perf_counter(), time.process_time()]
+    cpu, begin = {"": time.process_time()}, time.perf_counter()
 
     def lap(stage: str) -> None:
-        now = [time.perf_counter(), time.process_time()]
-        wall[stage], cpu[stage] = (a - b for a, b in zip(now, last, strict=True))
-        last[:] = now
+        cpu[stage] = time.process_time() - sum(cpu.values())
 
     problem = cell.item.problem(cell.overrides)
-    case = prepare(problem, on_stage=lap)
-    lap("weights")
-    solution = solve_soup(case.soup, case.data, case.weights, case.formulation(), case.options)
-    lap("nlp")
-    run = make_run(case, solution)
-    lap("evaluation")
-    run = replace(run, seconds=dict(wall))
+    result = run(problem, on_stage=lap)
+    solution = result.solution
     with scratch() as folder:
-        write_folder(prepare_folder(folder / "result"), run, "")
+        write_folder(prepare_folder(folder / "result"), result, "")
     lap("output")
+    del cpu[""]
+    spent, peak, row = time.perf_counter() - begin, peak_bytes(), scores(result)
+    whole = sum(v for k, v in result.seconds.items() if not k.startswith("nlp_"))
+    row["stages"] |= {**_parts(row["stages"]["nlp"], solution), "output": spent - whole}
     return {
-        "n": len(case),
+        **row,
+        "n": len(result),
         "k": problem.segmentation.neighbours,
         "sizes": solution.nlp,
-        "wall": {**wall, **_parts(wall["nlp"], solution)},
-        "cpu": cpu,
-        "iterations": sum(s.iterations for s in solution.stages),
-        "stages": " + ".join(str(s.iterations) for s in solution.stages),
-        "status": solution.status,
-        "converged": solution.converged,
+        "cpu": cpu | {"nlp": sum(solution.cpu_seconds.values())},
+        "each": " + ".join(str(s.iterations) for s in solution.stages),
         "energy": dict(solution.energy),
         "energy_start": dict(solution.energy_start),
-        "errors": {k: m.mre for k, m in run.metrics.items()},
         "residuals": dict(solution.residuals),
-        "peak_bytes": peak_bytes(),
-        "reference": _reference(case),
+        "peak_bytes": peak,
+        "reference": _reference(result),
     }
 
 
@@ -186,27 +177,22 @@ def schedule(options: SolverOptions) -> tuple[float, ...]:
     return widths if widths and widths[-1] <= options.eps else (*widths, options.eps)
 
 
-def _reference(case: Case) -> Row:
+def _reference(result: Run) -> Row:
     """Result of Levenberg-Marquardt from the same start on the same energy."""
+    pair, options = result.pair, result.options
     reference = levenberg_marquardt(
-        case.soup,
-        case.data,
-        case.weights,
-        case.formulation(),
-        eps=schedule(case.options),
+        result.start.soup,
+        result.data,
+        result.weights,
+        result.formulation(),
+        eps=schedule(options),
         iterations=REFERENCE_ITERATIONS,
-        seconds=case.options.max_seconds,
+        seconds=options.max_seconds,
     )
-    pair = case.pair
-    dense = reconstruct(reference.soup, case.segmentation.labels, pair.K_ref, pair.K_next)
-    scores = score_depths(pair.truth, {"lm": dense.depth_ref})
-    return {
-        "status": reference.status,
-        "energy": dict(reference.energy),
-        "iterations": reference.iterations,
-        "cpu_seconds": reference.cpu_seconds,
-        "mre": scores["lm"].mre if scores else None,
-    }
+    dense = reconstruct(reference.soup, result.segmentation.labels, pair.K_ref, pair.K_next)
+    scored = score_depths(pair.truth, {"lm": dense.depth_ref})
+    numbers = {k: getattr(reference, k) for k in ("status", "energy", "iterations", "cpu_seconds")}
+    return numbers | {"mre": scored["lm"].mre if scored else None}
 
 
 # --- the page ---------------------------------------------------------------------------------
@@ -218,7 +204,7 @@ def with_costs(frame: pd.DataFrame) -> pd.DataFrame:
         return frame.iloc[:0]
     out = frame[frame["ok"].eq(True)].copy()
     out["outside"] = out.reindex(columns=[f"cpu.{s}" for s in OUTSIDE]).astype(float).sum(axis=1)
-    out["GB"] = out["peak_bytes"].astype(float) / 2**30
+    out["start"], out["GB"] = main_metric(out, "start"), out["peak_bytes"].astype(float) / 2**30
     out["cpu an iteration"] = out["cpu.nlp"] / out["iterations"].clip(lower=1)
     out["energy_to_reference"] = out["energy.total"] / out["reference.energy.total"]
     out["time_to_reference"] = out["cpu.nlp"] / out["reference.cpu_seconds"]
@@ -251,7 +237,7 @@ def speed_page(frame: pd.DataFrame) -> str:
         runs = good.set_axis(pd.MultiIndex.from_frame(good[list(RUN)].rename(columns=RUN)))
         blocks += [titled(runs, COLUMNS), NOTE]
         blocks += ["## Growth: cost = factor N^p", markdown(growth(good), ".2f")]
-        stages = {f"wall.{phase}": (phase, ".2f") for phase in PHASES}
+        stages = {f"stages.{phase}": (phase, ".2f") for phase in PHASES}
         blocks += ["## Wall seconds by stage", titled(runs, stages)]
     facts = {"date": date.today(), **machine()}.items()
     blocks += ["## Machine", "\n".join(f"- {k}: {v}" for k, v in facts)]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import warnings
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers_files import sets
 
 from soup_nlp.bench.solvers import runner
 from soup_nlp.bench.solvers.page import (
@@ -29,12 +29,10 @@ from soup_nlp.export.verify import Limits
 
 pytestmark = pytest.mark.slow
 
-PROBLEMS = Path(__file__).parents[2] / "problems"
-SMALL = [
-    "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
-    "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",
-    "--set", "segmentation.superpixels=12",
-]  # fmt: skip
+SMALL = sets(
+    "input.width=96 input.height=64 flow.source=truth segmentation.neighbours=4"
+    " energy.pixel_samples=4 segmentation.superpixels=12"
+)
 
 
 def row(
@@ -175,7 +173,7 @@ def test_rows_belong_to_a_start_and_a_size(tmp_path):
 
 
 def test_command(tmp_path, capsys):
-    words = ["compare", str(PROBLEMS / "orbit.yaml"), "-o", str(tmp_path)]
+    words = ["compare", "orbit", "-o", str(tmp_path)]
     words += ["--solvers", "soup-nlp", "--seconds", "20", *SMALL]
     assert main(words) == 0
     rows = [json.loads(x) for x in (tmp_path / "runs.jsonl").read_text().splitlines()]
@@ -184,14 +182,13 @@ def test_command(tmp_path, capsys):
     for name in ("README.md", "profile.png"):
         assert (tmp_path / name).stat().st_size > 0
     assert main([*words, "--seconds", "-1"]) == 2
-    assert main(["compare", str(PROBLEMS / "orbit.yaml"), "--solvers", "nothing"]) == 2
+    assert main(["compare", "orbit", "--solvers", "nothing"]) == 2
 
 
 def test_files_are_read_before_anything_runs(tmp_path, capsys):
     words = ["-o", str(tmp_path), "--solvers", "lm,lm", "--seconds", "5", *SMALL]
-    orbit = str(PROBLEMS / "orbit.yaml")
-    assert main(["compare", orbit, "orbitt.yaml", *words]) == 2
-    assert main(["compare", orbit, *words, "--set", "segmentation.superpixels=0"]) == 2
+    assert main(["compare", "orbit", "orbitt.yaml", *words]) == 2
+    assert main(["compare", "orbit", *words, "--set", "segmentation.superpixels=0"]) == 2
     assert "superpixels" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -206,8 +203,9 @@ def test_an_interrupted_comparison_has_a_page_and_goes_on(tmp_path, monkeypatch,
         return done[-1]
 
     monkeypatch.setattr(runner, "isolated", second_is_interrupted)
-    orbit, out = str(PROBLEMS / "orbit.yaml"), tmp_path / "out"
-    words = ["compare", orbit, "--solvers", "lm,soup-nlp", "--seconds", "5", "-o", str(out), *SMALL]
+    out = tmp_path / "out"
+    words = ["compare", "orbit", "--solvers", "lm,soup-nlp", "--seconds", "5"]
+    words += ["-o", str(out), *SMALL]
     assert main(words) == 130
     assert "1 runs" in (out / "README.md").read_text()
     assert (out / "profile.png").stat().st_size > 0

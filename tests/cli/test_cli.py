@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,13 +31,12 @@ FILES = [
     "overview.png", "motions.json", "trajectory.tum", "report.html", "points_ref.ply",
     "points_next.ply",
 ]  # fmt: skip
-PROBLEMS = Path(__file__).parents[2] / "problems"
 
 
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("solved")
-    assert main(["solve", str(PROBLEMS / "orbit.yaml"), "--out", str(out), *SMALL]) == 0
+    assert main(["solve", "orbit", "--out", str(out), *SMALL]) == 0
     return out
 
 
@@ -84,18 +82,6 @@ def test_check_holds_and_catches_tampering(solved, capsys):
     assert main(["check", str(solved)]) == 1
     assert "FAIL energy solution arap" in capsys.readouterr().out
     (solved / "summary.json").write_text(original)
-    with h5py.File(solved / "result.h5", "a") as file:
-        kept = file["solution/R"][3]
-        file["solution/R"][3] = 1.001 * kept
-    report = check_folder(solved)
-    assert not report.ok
-    (so3,) = (r for r in report.rows if r.name == "solution so3")
-    assert not so3.ok
-    # R'R = 1.002 I
-    assert re.match(r"1 of \d+ beyond 1\.0e-08; worst superpixels 3 \(2\.0e-03\)", so3.note)
-    with h5py.File(solved / "result.h5", "a") as file:
-        file["solution/R"][3] = kept
-    assert check_folder(solved).ok
 
 
 def test_evaluate_scores_against_a_file(solved, tmp_path, capsys):
@@ -114,8 +100,7 @@ def test_evaluate_scores_against_a_file(solved, tmp_path, capsys):
 
 def test_a_solve_that_stops_early_is_a_result(tmp_path):
     limit = sets("solver.max_iter=0 solver.presolve=false")
-    path = str(PROBLEMS / "street.yaml")
-    assert main(["solve", path, "--out", str(tmp_path), *SMALL, *limit, "-q"]) == 1
+    assert main(["solve", "street", "--out", str(tmp_path), *SMALL, *limit, "-q"]) == 1
     for name in FILES:
         assert (tmp_path / name).exists(), name
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -162,15 +147,11 @@ def solve_files(images: Path, out: Path, **changes: str) -> int:
     ],
 )
 def test_bad_input_is_refused_with_code_2(images, tmp_path, capsys, changes, part):
-    assert solve_files(images, tmp_path / "out", **changes) == 2
+    assert solve_files(images, tmp_path / "new" / "out", **changes) == 2
+    assert not (tmp_path / "new").exists()
     error = capsys.readouterr().err
     assert part in error
     assert "Traceback" not in error
-
-
-def test_bad_input_leaves_no_folder(images, tmp_path):
-    assert solve_files(images, tmp_path / "new" / "out", flow="cut.flo") == 2
-    assert not (tmp_path / "new").exists()
 
 
 def test_zero_flow_gives_a_constant_depth_and_says_so(images, tmp_path):

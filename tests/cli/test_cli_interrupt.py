@@ -25,7 +25,6 @@ from soup_nlp.storage.progress import interruptible
 
 pytestmark = pytest.mark.slow
 
-ORBIT = str(Path(__file__).parents[2] / "problems" / "orbit.yaml")
 SMALL = sets(
     "input.width=160 input.height=120 flow.source=truth segmentation.superpixels=30"
     " segmentation.neighbours=5 refine.rounds=1"
@@ -33,7 +32,7 @@ SMALL = sets(
 
 
 def solve(out: Path) -> int:
-    return cli.main(["solve", ORBIT, "--out", str(out), "-q", *SMALL])
+    return cli.main(["solve", "orbit", "--out", str(out), "-q", *SMALL])
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +142,7 @@ def test_files_that_are_being_written_are_written(earlier, monkeypatch, capfd):
 
 
 def test_a_run_of_python_says_it_too():
-    problem = load_problem(ORBIT, [word for word in SMALL if word != "--set"])
+    problem = load_problem("orbit", [word for word in SMALL if word != "--set"])
     with interruptible() as stop:
         ctrl_c()
         with pytest.raises(StoppedError, match="load"):

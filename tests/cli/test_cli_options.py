@@ -20,7 +20,6 @@ from soup_nlp.storage.folders import MARK
 
 pytestmark = pytest.mark.slow
 
-ORBIT = str(Path(__file__).parents[2] / "problems" / "orbit.yaml")
 SMALL = sets(
     "input.width=112 input.height=84 refine.enabled=false segmentation.superpixels=16"
     " segmentation.neighbours=5 solver.presolve_iterations=2 solver.max_iter=0 output.page=false"
@@ -31,7 +30,7 @@ SMALL = sets(
     "option", [("--depth", "truth.npy"), ("--intrinsics", "1,1,0,0"), ("--fov", "50")]
 )
 def test_options_of_a_pair_exclude_a_problem_file(option, tmp_path, capsys):
-    assert main(["solve", ORBIT, "--out", str(tmp_path / "out"), *option]) == 2
+    assert main(["solve", "orbit", "--out", str(tmp_path / "out"), *option]) == 2
     error = capsys.readouterr().err
     assert option[0] in error
     assert not (tmp_path / "out").exists()
@@ -41,7 +40,7 @@ def test_a_flow_goes_with_a_problem_file(tmp_path, monkeypatch):
     flow = render_scene("orbit", 0, 112, 84).truth.flow.astype(np.float32)
     write_flo(tmp_path / "own flow.flo", flow)
     monkeypatch.chdir(tmp_path)
-    args = ["solve", ORBIT, "--out", "out", "-q", "--flow", "own flow.flo", *SMALL]
+    args = ["solve", "orbit", "--out", "out", "-q", "--flow", "own flow.flo", *SMALL]
     assert main(args) in (0, 1)
     assert "own flow.flo" in json.loads((tmp_path / "out" / "summary.json").read_text())["flow"]
 

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import json
+import pickle
+import shutil
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
+from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+from PIL.Image import open as open_image
 
 import soup_nlp
-from soup_nlp.config.problem import Problem, SegmentationOptions
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import Problem, SegmentationOptions, load_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.pipeline.run import ProblemKeys
+from soup_nlp.report.check import check_folder
 
 SMALL = {"superpixels": 12, "neighbours": 4}
 
@@ -25,6 +35,13 @@ def run() -> soup_nlp.Run:
     pair = render_scene("orbit", 0, 96, 72)
     none = {"enabled": False}
     return soup_nlp.solve_pair(pair, segmentation=SMALL, flow={"source": "truth"}, refine=none)
+
+
+@pytest.fixture(scope="module")
+def saved(run, tmp_path_factory) -> tuple[Path, list[str]]:
+    """The folder that the run makes of itself, and the names of its files."""
+    out = tmp_path_factory.mktemp("saved") / "out"
+    return out, run.save(out, formats=["npy", "motions"])
 
 
 def test_float_and_channels_first_images_are_the_same():
@@ -86,11 +103,10 @@ def test_a_key_that_solve_pair_does_not_take_is_refused(key, said):
         soup_nlp.solve_pair(render_scene("orbit", 0, 64, 48), **{key: {}})
 
 
-def test_depth_is_scored_from_run_array_or_stored_result(run, tmp_path):
+def test_depth_is_scored_from_run_array_or_stored_result(run, saved):
     truth = run.pair.truth.depth_ref
-    run.save(tmp_path / "out")
-    stored = soup_nlp.load(tmp_path / "out")
-    for result in (run, run.reconstruction.depth_ref, stored, tmp_path / "out"):
+    stored = soup_nlp.load(saved[0])
+    for result in (run, run.reconstruction.depth_ref, stored, saved[0]):
         scores = soup_nlp.evaluate(result, truth)
         assert scores["solution"].mre == pytest.approx(run.metrics["solution"].mre, rel=1e-12)
     assert soup_nlp.evaluate(run, truth.astype(np.float32)).keys() == {
@@ -102,9 +118,8 @@ def test_depth_is_scored_from_run_array_or_stored_result(run, tmp_path):
         soup_nlp.evaluate(run, truth[1:])
 
 
-def test_a_stored_result_has_the_arrays_of_its_run(run, tmp_path):
-    run.save(tmp_path / "out")
-    stored = soup_nlp.load(str(tmp_path / "out"))
+def test_a_stored_result_has_the_arrays_of_its_run(run, saved, tmp_path):
+    stored = soup_nlp.load(str(saved[0]))
     for name in ("depth_ref", "depth_next", "points_next", "sigma_ref"):
         computed, loaded = (getattr(x.reconstruction, name) for x in (run, stored))
         np.testing.assert_allclose(loaded, computed, rtol=1e-9)
@@ -123,3 +138,96 @@ def test_heavy_packages_of_pictures_are_imported_on_use():
     code = code.replace("NAMES", "('matplotlib', 'trimesh', 'pandas', 'skimage.segmentation')")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+# --- a pair in memory: its problem holds a hash of it and cannot be solved again
+
+
+def test_the_hash_is_that_of_the_pair(run):
+    pair = render_scene("orbit", 0, 96, 72)
+    assert run.problem.input.kind == "memory"
+    assert run.problem.input.hash == pair_hash(pair)
+    turned = replace(pair, image_next=np.ascontiguousarray(pair.image_next[::-1]))
+    longer = replace(pair, K_next=pair.K_next * [[1.1], [1], [1]])
+    assert len({pair_hash(p) for p in (pair, turned, longer, run.pair)}) == 4
+    assert pair_hash(replace(pair, name="other", truth=None)) == pair_hash(pair)
+
+
+def test_its_config_cannot_be_solved_again(run, saved, tmp_path, capsys):
+    out, _ = saved
+    problem = load_problem(out / "config.yaml")
+    assert problem.digest() == run.problem.digest()
+    with pytest.raises(ConfigError, match="in memory"):
+        problem.load_pair()
+    assert main(["solve", str(out / "config.yaml"), "--out", str(tmp_path / "new")]) == 2
+    assert run.problem.input.hash in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_run_survives_a_pickle(run):
+    again = pickle.loads(pickle.dumps(run))
+    assert again.problem == run.problem
+    assert again.energy == run.energy
+    np.testing.assert_array_equal(again.reconstruction.depth_ref, run.reconstruction.depth_ref)
+
+
+def test_arrays_of_truth_and_history_are_described(run, saved):
+    with h5py.File(saved[0] / "result.h5") as file:
+        stored = file["truth/scene_flow"]
+        np.testing.assert_array_equal(stored[:], run.pair.truth.scene_flow)
+        assert stored.attrs["units"] == run.pair.truth.unit
+        for name, stage in file["iterations"].items():
+            assert "barrier" in stage["mu"].attrs["description"], name
+            assert "inertia" in stage["regularization_size"].attrs["description"], name
+
+
+def test_a_run_prints_itself_in_five_lines(run):
+    lines = repr(run).splitlines()
+    assert len(lines) == 5
+    assert max(map(len, lines)) <= 110
+    assert f"MRE {run.metrics['solution'].mre:.4f}" in repr(run)
+    records = run.pair, run.segmentation, run.start, run.solution, run.soup, run.reconstruction
+    for record in (*records, run.components, run.camera, run.data):
+        assert len(repr(record)) < 300, type(record)
+
+
+def test_a_run_saves_itself_and_is_converted(run, saved, tmp_path, capsys):
+    out, other = shutil.copytree(saved[0], tmp_path / "out"), tmp_path / "other"
+    files = saved[1]
+    assert set(files) >= {"result.h5", "points_ref.ply", "motions.json", "depth_ref.npy"}
+    assert all((out / name).exists() for name in files)
+    assert check_folder(out).ok
+    assert main(["convert", str(out), "--to", "npy,motions, glb,colmap", "-o", str(other)]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert f"{other / 'mesh_next.glb'}" in printed
+    # the folder has the data of the run
+    for name in ("motions.json", "trajectory.tum", "depth_ref.npy", "depth_next.npy"):
+        assert (other / name).read_bytes() == (out / name).read_bytes(), name
+    told = json.loads((out / "motions.json").read_text())
+    np.testing.assert_array_equal(told["camera"]["next_from_ref"], run.camera.matrix)
+    assert main(["convert", str(out), "--to", "colmap"]) == 0
+    assert (out / "colmap" / "sparse" / "0" / "points3D.txt").is_file()
+
+
+def test_a_run_plots_its_overview(run, saved):
+    np.testing.assert_array_equal(run.plot(), open_image(saved[0] / "overview.png"))
+
+
+def test_what_cannot_be_converted_is_refused(saved, tmp_path, capsys):
+    out, foreign = shutil.copytree(saved[0], tmp_path / "out"), tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "mesh_ref.glb").write_text("mine")
+    for arguments, said in (
+        ([str(out), "--to", "glb", "--out", str(foreign)], "files"),
+        ([str(out), "--to", "obj"], "unknown format"),
+        ([str(out), "--to", ","], "no format"),
+        ([str(out), "--to", ""], "an argument is empty"),
+        ([str(foreign), "--to", "glb"], "result"),
+    ):
+        assert main(["convert", *arguments]) == 2
+        assert said in capsys.readouterr().err
+    assert (foreign / "mesh_ref.glb").read_text() == "mine"
+    with h5py.File(out / "result.h5", "a") as file:
+        del file["input/image_ref"]
+    assert main(["convert", str(out), "--to", "glb"]) == 2
+    assert "input/image_ref" in capsys.readouterr().err

@@ -13,8 +13,9 @@ import casadi as ca
 import h5py
 import numpy as np
 import pytest
+from helpers_files import sets
+from helpers_nl import ReadBack, close
 from scipy import sparse
-from test_nl import ReadBack, close
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
@@ -33,16 +34,14 @@ from soup_nlp.solve.stages import solve_soup
 pytestmark = pytest.mark.slow
 
 ENDS = {"variables": ".col", "rows": ".row"}
-PROBLEMS = Path(__file__).parents[2] / "problems"
-TINY = [
-    "--set", "input.width=96", "--set", "input.height=64", "--set", "flow.source=truth",
-    "--set", "segmentation.neighbours=4", "--set", "energy.pixel_samples=4",
-]  # fmt: skip
+TINY = sets(
+    "input.width=96 input.height=64 flow.source=truth segmentation.neighbours=4"
+    " energy.pixel_samples=4"
+)
 
 
 def write(out: Path, *words: str, scene: str = "orbit") -> int:
-    path = str(PROBLEMS / f"{scene}.yaml")
-    return main(["export", path, "-o", str(out), "--no-presolve", *TINY, *words])
+    return main(["export", scene, "-o", str(out), "--no-presolve", *TINY, *words])
 
 
 @pytest.fixture(scope="module")
@@ -258,8 +257,7 @@ def test_options_are_checked(tmp_path, capsys):
 
 
 def test_a_presolved_start_has_multipliers(tmp_path):
-    path = str(PROBLEMS / "orbit.yaml")
-    assert main(["export", path, "-o", str(tmp_path), *TINY, "--superpixels", "16"]) == 0
+    assert main(["export", "orbit", "-o", str(tmp_path), *TINY, "--superpixels", "16"]) == 0
     assert json.loads((tmp_path / "manifest.json").read_text())["initial_duals"]
     _, nlp, _, (v, r), _ = problem_of(tmp_path)
     builder = ca.NlpBuilder()
@@ -309,9 +307,8 @@ def test_pounce_takes_the_multipliers(tmp_path):
     command = shutil.which("pounce") or shutil.which(str(Path(sys.executable).parent / "pounce"))
     if command is None:
         pytest.skip("pounce is not installed")
-    path = str(PROBLEMS / "orbit.yaml")
     words = ["-o", str(tmp_path), *TINY, "--superpixels", "16", "--suffixes"]
-    assert main(["export", path, *words]) == 0
+    assert main(["export", "orbit", *words]) == 0
     options = {**WARM, "nlp_scaling_method": "none", "tol": 1e-6}
     words = [f"{k}={v}" for k, v in options.items()]
     run = subprocess.run(

@@ -192,11 +192,6 @@ def test_a_component_whose_depth_is_a_guess_is_striped(shown):
     assert 0.3 < white[shown.components.of_superpixel[shown.labels] == 0].mean() < 0.45
 
 
-def test_view_of_no_result(tmp_path, capsys):
-    assert main(["view", str(tmp_path)]) == 2
-    assert "result file is missing" in capsys.readouterr().err
-
-
 def test_limits_name_what_is_wrong(shown):
     good = " ".join(limits(shown))
     assert "did not converge" not in good
