@@ -85,10 +85,10 @@ def __getattr__(name: str) -> Any:
     """A public name, from its module."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home, _, own = _HOMES[name].partition(":")
-    found = getattr(import_module(f"{__name__}.{home}"), own or name)
-    globals()[name] = found
-    return found
+    home, _, attribute = _HOMES[name].partition(":")
+    value = getattr(import_module(f"{__name__}.{home}"), attribute or name)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

@@ -230,7 +230,7 @@ def growth(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def speed_page(frame: pd.DataFrame) -> str:
-    """The page of all rows."""
+    """Markdown page of the rows: conclusion, runs, growth with N, seconds by stage, machine."""
     good = with_costs(frame)
     blocks = ["# Speed and growth"]
     if len(good):

@@ -66,7 +66,7 @@ def _item(
 
 
 def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: Options) -> Items:
-    """Rendered scenes with all seeds; columns and rows are relative to the width."""
+    """Rendered scenes with all seeds, of `columns` x `rows` times the width of the options."""
     width, height = max(64, int(o.width * columns)), max(48, round(o.width * rows))
     for seed in o.seeds:
         for scene in scenes:
@@ -116,7 +116,7 @@ def _shared(root: Path, o: Options) -> Items:
 
 
 def _sintel(root: Path, o: Options) -> Items:
-    """Pairs of the five sequences: the paper has 120 but does not name them, so 24 of each."""
+    """Pairs of the five sequences, 24 of each: the paper does not name its 120 pairs."""
     base = root / "training" if is_folder(root / "training") else root
     for scene, frames in SINTEL_FRAMES.items():
         for frame in spread(frames - 1, 24, 1):
@@ -138,7 +138,7 @@ def _kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Items:
 
 
 def _vkitti(root: Path, o: Options) -> Items:
-    """Morning pairs of version 1 or 2: the paper has 120 but does not name them, so 30 a world."""
+    """Morning pairs of version 1 or 2, 30 of each world: the paper does not name its 120 pairs."""
     second = is_folder(root / "Scene01") or is_folder(root / "Scene02")
     parts = sorted(root.glob("vkitti_*_rgb")) or [root / "vkitti_1.3.1_rgb"]
     raw = {"kind": "vkitti2" if second else "vkitti1", "root": str(root), "variation": "morning"}

@@ -199,13 +199,13 @@ def _open_motion(
     slope[:, 0, 0], slope[:, 1, 1] = focal[0] / depth, focal[1] / depth
     slope[:, :, 2] = -focal * X[:, :2] / depth[:, None] ** 2
     length = max(float(np.median(np.linalg.norm(soup.translation[at], axis=1))), 1e-12)
-    # places of the answer's points that a small error of the camera changes, per unit of it
-    place = X / depth[:, None]
+    # normalised coordinates of the answer's points, which a small error of the camera changes
+    normalised = X / depth[:, None]
     columns = [-slope @ rotation.hat(X), slope * length]
     for kind in KINDS:
-        first, second = corrected(kind, SMALL, ray, place)
+        first, second = corrected(kind, SMALL, ray, normalised)
         shift = np.einsum("nij,njk,nk->ni", slope, soup.R[at], z[:, None] * (first - ray))
-        columns.append(((shift - focal * (second - place)[:, :2]) / SMALL)[..., None])
+        columns.append(((shift - focal * (second - normalised)[:, :2]) / SMALL)[..., None])
     J = np.concatenate(columns, axis=2)
     along = np.einsum("nij,nj->ni", slope, turned)
     # squared image motion by log depth, at least that at which one deviation of relief is visible

@@ -34,14 +34,14 @@ class _Part:
     def columns(self, text: Text, elements: Int | slice, final: Int | None = None) -> list[Int]:
         """Integers for the holes of a text: variables, defined variables, bits of numbers."""
         out = []
-        for kind, place in text.holes:
+        for kind, slot in text.holes:
             if kind == VARIABLE:
-                column = self.index[elements, place]
+                column = self.index[elements, slot]
             elif kind == DEFINED:
-                column = self.identity[place][elements]
+                column = self.identity[slot][elements]
                 column = column if final is None else final[column]
             else:
-                values = np.ascontiguousarray(self.template.numbers[place], float)
+                values = np.ascontiguousarray(self.template.numbers[slot], float)
                 column = values.view(np.int64)[elements]
             out.append(column)
         return out
@@ -70,23 +70,23 @@ class NlBody:
             the objective alone.
     """
 
-    def __init__(self, program: Program, place: Int, row_place: Int) -> None:
+    def __init__(self, program: Program, column: Int, row: Int) -> None:
         """Number the defined variables.
 
         Args:
             program: The NLP in parts.
-            place: (nx,) place in the file of every variable.
-            row_place: (ng,) place in the file of every row.
+            column: (nx,) index in the file of every variable.
+            row: (ng,) index in the file of every row.
         """
-        self._program, self._row_place, self._first = program, row_place, len(place)
+        self._program, self._row, self._first = program, row, len(column)
         self._known: dict[str, dict[bytes, int]] = {}
         self._count = 0
         self._nodes: list[tuple[_Part, int, Text, Int]] = []
         self._parts = []
         # the last entry is for the objective, whose row is -1
-        goals = np.append(row_place, OBJECTIVE)
+        goals = np.append(row, OBJECTIVE)
         for template, index, goal in program.stamped:
-            part = _Part(template, place[index], goals[goal])
+            part = _Part(template, column[index], goals[goal])
             for node, text in template.defined:
                 self._identify(part, node, text)
             self._parts.append(part)
@@ -94,7 +94,7 @@ class NlBody:
         used = low != NO_ROW
         kind = np.select([objective & used, used & (low < high), used], [0, 1, 3], 4)
         # a variable with one user is written before its row
-        owner = np.where(kind == 3, low, len(row_place))
+        owner = np.where(kind == 3, low, len(row))
         self._order = np.lexsort((np.arange(len(kind)), owner, kind))
         self._owner = owner[self._order]
         self._shared = int((kind < 3).sum())
@@ -109,9 +109,9 @@ class NlBody:
         blob, width = np.stack(columns, axis=1).tobytes(), 8 * len(columns)
         begin, identity = self._count, np.empty(len(part.index), np.int64)
         for e in range(len(identity)):
-            place = known.setdefault(blob[e * width : (e + 1) * width], self._count)
-            self._count += place == self._count
-            identity[e] = place
+            number = known.setdefault(blob[e * width : (e + 1) * width], self._count)
+            self._count += number == self._count
+            identity[e] = number
         part.identity[node] = identity
         # first element of every new number, in order
         new, first = np.unique(identity, return_index=True)
@@ -146,7 +146,7 @@ class NlBody:
 
     def segments(self) -> Iterator[str]:
         """`V`, `C` and `O` segments; a variable with one user is written right before it."""
-        rows: list[list[str]] = [[] for _ in self._row_place]
+        rows: list[list[str]] = [[] for _ in self._row]
         objective: list[str] = []
         for part in self._parts:
             for k, root in enumerate(part.template.roots):
@@ -157,7 +157,7 @@ class NlBody:
                     for r, text in zip(part.goal[:, k].tolist(), texts):
                         rows[r].append(text)
         constant = np.zeros(len(rows))
-        constant[self._row_place] = self._program.row_constant
+        constant[self._row] = self._program.row_constant
         written = [
             text
             for part, _, pattern, first in self._nodes

@@ -110,7 +110,7 @@ def write_nl(
     )
     data = ("\n".join(lines) + "\n").encode("ascii")
     write_bytes(path, data)
-    x_names, g_names = ([own[k] for k in order] for own, order in zip(names, (variables, rows)))
+    x_names, g_names = ([axis[k] for k in order] for axis, order in zip(names, (variables, rows)))
     write_text(path.with_suffix(".col"), "".join(f"{name}\n" for name in x_names))
     # the objective's name follows those of the rows
     write_text(path.with_suffix(".row"), "".join(f"{name}\n" for name in [*g_names, "E"]))
@@ -268,12 +268,12 @@ def suffixes_of(
     """
     kinds: dict[str, list[str]] = {}
     out = []
-    for of, own in zip(("variables", "rows"), names):
-        stems = [name.partition("[")[0] for name in own]
+    for of, axis in zip(("variables", "rows"), names):
+        stems = [name.partition("[")[0] for name in axis]
         kinds[of] = list(dict.fromkeys(stems))
-        place = {stem: k + 1 for k, stem in enumerate(kinds[of])}
-        first = [name.partition("[")[2].strip("]").partition(",")[0] for name in own]
-        out.append(Suffix("kind", of, np.array([place[stem] for stem in stems])))
+        kind_number = {stem: k + 1 for k, stem in enumerate(kinds[of])}
+        first = [name.partition("[")[2].strip("]").partition(",")[0] for name in axis]
+        out.append(Suffix("kind", of, np.array([kind_number[stem] for stem in stems])))
         out.append(Suffix("superpixel", of, np.array([int(i) + 1 if i else 0 for i in first])))
     for group in nlp.groups:
         if group.kernel.name == "ridge":

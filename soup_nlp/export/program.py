@@ -174,8 +174,8 @@ def split(group: Group, theta: Float) -> Split:
     for k in range(out.numel()):
         part, gone = out[k], column[linear & (row == k)]
         if len(gone):
-            held = ca.vertcat(*[kernel.x[int(j)] for j in gone])
-            part = ca.substitute(part, held, ca.SX.zeros(len(gone)))
+            removed = ca.vertcat(*[kernel.x[int(j)] for j in gone])
+            part = ca.substitute(part, removed, ca.SX.zeros(len(gone)))
         parts.append(part)
     nonlinear = ca.densify(ca.cse(ca.vertcat(*parts))) if parts else ca.SX(0, 1)
     return Split(nonlinear, row, column, linear, coefficient, kernel.objective is not None)

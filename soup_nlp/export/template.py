@@ -100,9 +100,9 @@ def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
             work[target] = graph.node((0, inputs[1]))
             graph.variable[work[target]] = inputs[1]
         elif op == ca.OP_INPUT:
-            which, place = inputs
-            values = table.data[:, place] if which == 1 else np.asarray(theta[place])
-            work[target] = graph.constant((which, place), values)
+            which, nonzero = inputs
+            values = table.data[:, nonzero] if which == 1 else np.asarray(theta[nonzero])
+            work[target] = graph.constant((which, nonzero), values)
         elif op == ca.OP_ASSIGN:
             work[target] = work[inputs[0]]
         elif op in OPERATIONS and OPERATIONS[op].nl:
@@ -211,9 +211,9 @@ def _common(graph: _Graph, nodes: list[int], group: Group) -> set[int]:
     return common
 
 
-def _mix(column: Int, place: int) -> NDArray[np.uint64]:
+def _mix(column: Int, position: int) -> NDArray[np.uint64]:
     """(E,) SplitMix64 hash of a column; hashes of several columns are added."""
-    h = column.view(np.uint64) + np.uint64(0x9E3779B97F4A7C15 * (place + 1) % 2**64)
+    h = column.view(np.uint64) + np.uint64(0x9E3779B97F4A7C15 * (position + 1) % 2**64)
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return h ^ (h >> np.uint64(31))

@@ -68,8 +68,8 @@ class Segmentation:
     def nearest(self, mask: Mask) -> Int:
         """(N,) the nearest superpixel of a mask (N,), which is not empty; in the mask itself."""
         members = np.flatnonzero(mask)
-        found = members[cKDTree(self.anchors[members]).query(self.anchors)[1]]
-        return np.where(mask, np.arange(len(mask)), found)
+        nearest = members[cKDTree(self.anchors[members]).query(self.anchors)[1]]
+        return np.where(mask, np.arange(len(mask)), nearest)
 
 
 def build_segmentation(

@@ -68,12 +68,12 @@ class Kernel:
 
     @property
     def nx(self) -> int:
-        """Local variables."""
+        """Number of local variables."""
         return int(self.x.numel())
 
     @property
     def nc(self) -> int:
-        """Local constraint rows."""
+        """Number of local constraint rows."""
         return 0 if self.constraints is None else int(self.constraints.numel())
 
     @_once

@@ -136,7 +136,7 @@ class Summed:
         library: ctypes.CDLL,
         function: ca.Function,
         blocks: Blocks,
-        place: NDArray[np.integer],
+        target: NDArray[np.integer],
         size: int,
     ) -> None:
         """Find the function.
@@ -145,12 +145,12 @@ class Summed:
             library: Of `compile_lanes`.
             function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,).
             blocks: The kernel's table in blocks of LANES, with 32-bit indices.
-            place: (E, k) where each entry is added.
+            target: (E, k) where each entry is added.
             size: Of the vector; what pads the last block is added behind it.
         """
         self._call = library[f"{function.name()}_sum"]
         self._call.restype = None
-        self._arrays = *blocks, in_blocks(place, LANES, np.int32, fill=size)
+        self._arrays = *blocks, in_blocks(target, LANES, np.int32, fill=size)
 
     def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
         """Add the elements' entries to `out`.
@@ -162,11 +162,11 @@ class Summed:
             lam_f: Multiplier of f, for Hessians.
             lam_g: (ng,) multipliers of g, for Hessians.
         """
-        index, data, rows, place = map(_pointer, self._arrays)
+        index, data, rows, target = map(_pointer, self._arrays)
         lam = x if lam_g is None else lam_g
         blocks, factor = ctypes.c_long(len(self._arrays[0])), ctypes.c_double(lam_f)
         first = blocks, _pointer(x), index, data, _pointer(theta), factor
-        self._call(*first, _pointer(lam), rows, place, _pointer(out))
+        self._call(*first, _pointer(lam), rows, target, _pointer(out))
 
 
 def _pointer(array: NDArray[Any]) -> ctypes.c_void_p:

@@ -89,25 +89,25 @@ class NLP:
         """f, its gradient, g, its Jacobian."""
         sizes = {"f": 1, "grad": self.nx, "con": self.ng, "jac": self.nnzj}
         jacobian = iter(self.jacobian_pattern.places)
-        places = []
+        targets = []
         for group in self.groups:
             size, table = group.size, group.table
-            place = {"f": np.zeros((size, 1), int), "grad": table.index, "con": table.rows}
+            target = {"f": np.zeros((size, 1), int), "grad": table.index, "con": table.rows}
             if group.kernel.nc:
-                place["jac"] = next(jacobian)
-            places.append(place)
+                target["jac"] = next(jacobian)
+            targets.append(target)
         functions = [g.kernel.first_order() for g in self.groups]
-        return summed(self.groups, functions, places, self._sums(sizes), self.compiled)
+        return summed(self.groups, functions, targets, self._sums(sizes), self.compiled)
 
     @cached_property
     def _second(self) -> Mapping[str, Sum]:
-        """The Hessian; by itself, since a start at a KKT point needs none."""
+        """The Hessian, apart from the rest, since a start at a KKT point does not need it."""
         pattern = self.hessian_pattern
         functions = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
-        places = [{"hess": p} for p in pattern.places]
+        targets = [{"hess": p} for p in pattern.places]
         sums = self._sums({"hess": len(pattern.rows)})
         every = [{"hess": f} if f else {} for f in functions]
-        return summed(self.groups, every, places, sums, self.compiled)
+        return summed(self.groups, every, targets, sums, self.compiled)
 
     def _sums(self, sizes: Mapping[str, int]) -> dict[str, Sum]:
         given = self.nx, len(self.theta), self.ng

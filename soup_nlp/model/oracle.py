@@ -173,7 +173,7 @@ class Ends:
         return array[self.rows].astype(self.states.dtype)[:, None, None]
 
     def distance(self, name: str) -> AnyFloat:
-        """(b, L, L) distance of two vectors of the states."""
+        """(b, L, L) distances between a vector of the states of both ends, by pair of labels."""
         vectors = getattr(self.states, name)
         return _distance(vectors[:, self.i], vectors[:, self.k])
 

@@ -241,8 +241,8 @@ def within_bending(
     edges, pairs = (bends[ends[:, 0]] & bends[ends[:, 1]] for ends in (data.edges, data.pairs))
 
     def more(inside: Mask, term: str) -> Float:
-        own = getattr(rigid, term)
-        return np.where(inside, getattr(bent, term) / own if own else 1.0, 1.0)
+        weight = getattr(rigid, term)
+        return np.where(inside, getattr(bent, term) / weight if weight else 1.0, 1.0)
 
     return replace(
         data,

@@ -66,7 +66,7 @@ def _vector(name: str, values: Float, size: int) -> Float:
 def summed(
     groups: Sequence[Group],
     functions: Sequence[Mapping[str, ca.Function]],
-    places: Sequence[Mapping[str, NDArray[np.integer]]],
+    targets: Sequence[Mapping[str, NDArray[np.integer]]],
     sums: Mapping[str, Sum],
     compiled: bool,
 ) -> Mapping[str, Sum]:
@@ -75,14 +75,14 @@ def summed(
     Args:
         groups: Kernels and tables.
         functions: Functions of every kernel, by the key of the sum that they belong to.
-        places: (E, k) where each entry of them is added.
+        targets: (E, k) where each entry of them is added.
         sums: Without terms, by key.
         compiled: Use the C compiler where there is one.
 
     Raises:
         ModelError: a kernel has an unknown operation.
     """
-    for group, own_functions, own_places in zip(groups, functions, places):
+    for group, own_functions, own_targets in zip(groups, functions, targets):
         for f in own_functions.values():
             unknown = {i.operation for i in instructions(f)} - OPERATIONS.keys() - _OTHERS
             if unknown:
@@ -101,10 +101,10 @@ def summed(
                     error,
                 )
         for key, f in own_functions.items():
-            place, size = own_places[key], sums[key].size
+            target, size = own_targets[key], sums[key].size
             sums[key].terms.append(
-                Summed(library, f, blocks, place, size)
+                Summed(library, f, blocks, target, size)
                 if library and blocks
-                else Vectors(f, group.table, place, size)
+                else Vectors(f, group.table, target, size)
             )
     return sums

@@ -27,14 +27,14 @@ class Vectors:
     """One function of a kernel, summed over the kernel's table."""
 
     def __init__(
-        self, function: ca.Function, table: Table, place: NDArray[np.integer], sums: int
+        self, function: ca.Function, table: Table, target: NDArray[np.integer], sums: int
     ) -> None:
         """Translate the function.
 
         Args:
             function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,).
             table: The kernel's table, E elements.
-            place: (E, k) where each entry is added.
+            target: (E, k) where each entry is added.
             sums: Size of the vector; what pads the last block is added behind it.
         """
         size = max(1, min(BLOCK, len(table)))
@@ -43,7 +43,7 @@ class Vectors:
         self._theta, self._lam_f = np.empty(count[2]), np.empty(1)
         self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
         self._function = function
-        self._blocks = list(zip(*table.blocks(size), in_blocks(place, size, np.int64, fill=sums)))
+        self._blocks = list(zip(*table.blocks(size), in_blocks(target, size, np.int64, fill=sums)))
 
     @cached_property
     def _calls(self) -> list[tuple[Callable[..., Any], Any]]:
@@ -53,7 +53,7 @@ class Vectors:
         """
         f = self._function
         inputs = self._x, self._data, self._theta[:, None], self._lam_f[:, None], self._lam_c
-        rows, out = [list(own) for own in inputs], list(self._out)
+        rows, out = [list(values) for values in inputs], list(self._out)
         work = list(np.empty((f.sz_w(), self._out.shape[1])))
         registers: dict[int, Float] = {}
         calls: list[tuple[Callable[..., Any], Any]] = []
@@ -74,11 +74,11 @@ class Vectors:
         """Add the elements' entries to `out`; arguments as of `lanes.Summed.add`."""
         self._theta[:], self._lam_f[0] = theta[: len(self._theta)], lam_f
         with np.errstate(all="ignore"):
-            for index, data, rows, place in self._blocks:
+            for index, data, rows, target in self._blocks:
                 np.take(x, index, out=self._x)
                 self._data[:] = data
                 if lam_g is not None:
                     np.take(lam_g, rows, out=self._lam_c)
                 for call, given in self._calls:
                     call(*given)
-                out += np.bincount(place.ravel(), self._out.ravel(), len(out))
+                out += np.bincount(target.ravel(), self._out.ravel(), len(out))

@@ -72,8 +72,8 @@ class PairCosts:
         key = np.union1d(*keys.values())
         self.edges = np.stack([key // n, key % n], axis=1).astype(np.int64)
         self.rows = {name: np.full(len(key), -1, np.int64) for name in keys}
-        for name, own in keys.items():
-            self.rows[name][np.searchsorted(key, own)] = np.arange(len(own))
+        for name, term_key in keys.items():
+            self.rows[name][np.searchsorted(key, term_key)] = np.arange(len(term_key))
 
     def tables(
         self, p: Particles, unit: float = 1.0, dtype: type | np.dtype = np.float64

@@ -245,12 +245,12 @@ def _compared(tree: Mapping[str, Any], name: str) -> tuple[Float, Float]:
     return (np.ones_like(gt) if name == "constant" else z), gt
 
 
-def _leaves(tree: Any, place: str = "") -> dict[str, Any]:
-    """Leaves of nested mappings and lists by their dotted place."""
+def _leaves(tree: Any, path: str = "") -> dict[str, Any]:
+    """Leaves of nested mappings and lists by their dotted path."""
     if isinstance(tree, Mapping | list) and tree:
         items = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
-        return {k: v for name, x in items for k, v in _leaves(x, f"{place}.{name}").items()}
-    return {place.removeprefix("."): tree}
+        return {k: v for name, x in items for k, v in _leaves(x, f"{path}.{name}").items()}
+    return {path.removeprefix("."): tree}
 
 
 def _written(r: Stored) -> Iterator[Claim]:

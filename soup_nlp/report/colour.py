@@ -129,9 +129,9 @@ def colourise_flow(uv: AnyFloat, limit: float) -> Image:
     radius = (length / limit)[:, :, None]
     wheel = colour_wheel() / 255
     turn = np.arctan2(-flow[:, :, 1], -flow[:, :, 0]) / np.pi
-    place = (turn + 1) / 2 * (len(wheel) - 1)
-    low = np.floor(place).astype(np.intp)
-    part = (place - low)[:, :, None]
+    position = (turn + 1) / 2 * (len(wheel) - 1)
+    low = np.floor(position).astype(np.intp)
+    part = (position - low)[:, :, None]
     hue = (1 - part) * wheel[low] + part * wheel[(low + 1) % len(wheel)]
     colour = np.where(radius <= 1, 1 - radius * (1 - hue), 0.75 * hue)
     out = np.floor(255 * colour).astype(np.uint8)

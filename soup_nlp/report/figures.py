@@ -65,7 +65,7 @@ def _height(picture: Picture, width: int) -> int:
 
 
 def _draw_panel(sheet: Pil.Image, panel: Picture, left: int, top: int, width: int) -> None:
-    """Title, picture and legend of a panel; pixels from the upper left corner."""
+    """Draw title, picture and legend of a panel from its upper left corner, all in pixels."""
     _write(sheet, left, top + _CAPTION // 2, panel.title, width)
     top, tall = top + _CAPTION, _height(panel, width)
     # makes white panels visible on white paper

@@ -343,7 +343,7 @@ def certainty(run: Run) -> dict[str, float]:
     def share(mask: Mask) -> float:
         return float(mask.mean())
 
-    given = np.zeros(len(start.soup), bool) if run.given is None else run.given.held
+    given = np.zeros(len(start.soup), bool) if run.given is None else run.given.from_prior
     origin = np.array([DETERMINED.index(ORIGINS[name][0]) for name in TIES])[tie]
     # the prior's pixels, whatever gives their component its scale
     origin = np.where(given[labels], DETERMINED.index("given"), origin)

@@ -78,19 +78,19 @@ def prepare_folder(
     folder = as_path(folder, "output folder")
     # realpath, unlike resolve, accepts a link to itself
     here = Path(os.path.realpath(folder))
-    for place in inputs or ():
-        if place == here:
+    for source in inputs or ():
+        if source == here:
             raise DataError(
                 "output folder is the input's folder",
                 where=folder,
                 expected="a folder of its own: depth and flow of a result would pass for truth",
                 hint="choose another --out",
             )
-        if place.parent == here and place.name in (*FILES, *FULL):
+        if source.parent == here and source.name in (*FILES, *FULL):
             raise DataError(
                 "an input would be overwritten by the result",
                 where=folder,
-                found=place.name,
+                found=source.name,
                 expected="a folder that holds no input under the name of a result's file",
                 hint="choose another --out",
             )

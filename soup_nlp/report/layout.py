@@ -145,12 +145,12 @@ record/files              text  F       names of the other files
 record/sha256             text  F       their SHA-256
 record/summary            text  -       summary.json
 """
-"""Place, unit, axes and description of every array, see `parse_table`.
+"""Path, unit, axes and description of every array, see `parse_table`.
 
 "soup" and "truth" are the units of length of the reconstruction and of the truth; "text" is text.
 """
 LAYOUT = parse_table(TABLE)
-"""Rows of `TABLE` by place."""
+"""Rows of `TABLE` by path."""
 
 INDICES = ("segmentation/labels", "segmentation/knn", "energy/edges", "energy/pairs")
 """Arrays of superpixels, 0 to N - 1."""
@@ -166,14 +166,14 @@ def rows_in_file(truth_unit: str = "") -> dict[str, Row]:
     return {k: row._replace(unit=units.get(row.unit, row.unit)) for k, row in LAYOUT.items()}
 
 
-def _listed(values: Mapping[str, Any], place: str = "") -> ReadTree:
+def _listed(values: Mapping[str, Any], prefix: str = "") -> ReadTree:
     """The arrays and numbers of nested mappings that `TABLE` names; None is left out."""
     out: ReadTree = {}
     for name, value in values.items():
-        here = f"{place}{name}"
+        path = f"{prefix}{name}"
         if isinstance(value, Mapping):
-            out[name] = _listed(value, f"{here}/")
-        elif value is not None and row_of(LAYOUT, here) is not None:
+            out[name] = _listed(value, f"{path}/")
+        elif value is not None and row_of(LAYOUT, path) is not None:
             number = isinstance(value, bool | int | float)
             out[name] = np.asarray(np.float64(value) if number else value)
     return out
@@ -244,8 +244,8 @@ def require_layout(tree: ReadTree) -> None:
     """
     # of the shared axes, as the first array has them
     sizes: dict[str, int] = {}
-    for place, row in LAYOUT.items():
-        group, _, name = place.partition("/")
+    for path, row in LAYOUT.items():
+        group, _, name = path.partition("/")
         values = tree.get(group, {})
         if not isinstance(values, Mapping):
             raise _wrong(group, "an array", "a group")
@@ -253,32 +253,32 @@ def require_layout(tree: ReadTree) -> None:
             continue
         value, axes = values[name], row.axes.split(",") if row.axes else []
         if isinstance(value, Mapping) or value.dtype.kind not in "biuf":
-            raise _wrong(place, "a group or text", "numbers")
-        if "/image_" in place and value.dtype != np.uint8:
-            raise _wrong(place, value.dtype, "uint8")
+            raise _wrong(path, "a group or text", "numbers")
+        if "/image_" in path and value.dtype != np.uint8:
+            raise _wrong(path, value.dtype, "uint8")
         if len(axes) != value.ndim:
-            raise _wrong(place, value.shape, f"axes ({row.axes})")
+            raise _wrong(path, value.shape, f"axes ({row.axes})")
         for axis, size in zip(axes, value.shape, strict=True):
             expected = int(axis) if axis.isdigit() else size
-            if axis in SHARED and place not in FREE:
+            if axis in SHARED and path not in FREE:
                 expected = sizes.setdefault(axis, size)
             if size != expected or (axis in ("H", "W") and not size):
-                raise _wrong(place, value.shape, f"({row.axes}) with {axis} = {expected}")
+                raise _wrong(path, value.shape, f"({row.axes}) with {axis} = {expected}")
     last = sizes.get("N", 0) - 1
-    for place in INDICES:
-        group, name = place.split("/")
+    for path in INDICES:
+        group, name = path.split("/")
         if (index := tree.get(group, {}).get(name)) is None:
             continue
         if index.dtype.kind not in "iu" or (
             index.size and not 0 <= index.min() <= index.max() <= last
         ):
-            raise _wrong(place, "other values", f"whole numbers from 0 to {last}")
+            raise _wrong(path, "other values", f"whole numbers from 0 to {last}")
 
 
-def _wrong(place: str, found: object, expected: str) -> DataError:
+def _wrong(path: str, found: object, expected: str) -> DataError:
     return DataError(
         "array of a result does not fit the others",
-        where=f"result.h5, {place}",
+        where=f"result.h5, {path}",
         found=found,
         expected=expected,
     )

@@ -236,8 +236,8 @@ def write_model(
         if K[0, 1] != 0:
             raise DataError("COLMAP has no camera with skew", found=K.tolist(), expected="s = 0")
     model = folder / "sparse" / "0"
-    for place in (model, folder / "images", folder / "masks"):
-        place.mkdir(parents=True, exist_ok=True)
+    for directory in (model, folder / "images", folder / "masks"):
+        directory.mkdir(parents=True, exist_ok=True)
     for name, image, mask in zip(names, images, moving, strict=True):
         write_png(folder / "images" / name, image)
         black = np.where(mask, 0, 255)[..., None]

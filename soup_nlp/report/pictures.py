@@ -219,7 +219,7 @@ def relative_error(result: Result) -> AnyFloat | None:
 def _shares(
     name: str, title: str, values: AnyFloat, colours: str, ticks: Sequence[float]
 ) -> Picture:
-    """Picture of shares (H, W) in a map of OpenCV, with a legend up to the last tick and above."""
+    """Picture of shares (H, W) in a colour map of OpenCV that ends at the last tick."""
     limit, texts = ticks[-1], [f"{100 * x:.0f} %" for x in ticks]
     texts[-1] = f"\u2265 {texts[-1]}"
     bar = Bar(colourise_shares(np.linspace(0, limit, 128)[None], limit, colours), tuple(texts))

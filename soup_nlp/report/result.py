@@ -109,7 +109,7 @@ class Result:
     def depth_maps(self) -> dict[str, Float]:
         """(H, W) z of the reference frame, as those of a `Run`."""
         stored = self.tree["depth"]
-        return {name: stored[place] for name, place in DEPTHS.items() if place in stored}
+        return {name: stored[key] for name, key in DEPTHS.items() if key in stored}
 
     @property
     def points(self) -> tuple[Float, Float]:
@@ -171,9 +171,9 @@ class Result:
         """Whether the whole image bends; then no component is rigid."""
         return bool(self.bends.all())
 
-    def array(self, place: str) -> NDArray[Any] | None:
+    def array(self, path: str) -> NDArray[Any] | None:
         """The array at "a/b" of the tree; None if there is none."""
-        group, name = place.split("/")
+        group, name = path.split("/")
         return self.tree.get(group, {}).get(name)
 
     def soup(self, key: str) -> Float:
@@ -224,12 +224,12 @@ def load(folder: str | Path) -> Result:
     Raises:
         DataError: the folder holds no result, or a damaged one.
     """
-    place = as_path(folder, "result folder")
-    path = place / "result.h5"
+    folder = as_path(folder, "result folder")
+    path = folder / "result.h5"
     tree, unit = read_h5(path), read_attrs(path).get("truth_unit", "m")
-    summary = read_json(place / "summary.json", "summary.json")
+    summary = read_json(folder / "summary.json", "summary.json")
     require_layout(tree)
-    picture = place / "overview.png"
+    picture = folder / "overview.png"
     try:
         _, _, K_ref, K_next, _ = (require(tree, f"input/{name}") for name in INPUTS)
         soup = Soup(*(require(tree, f"solution/{key}") for key in ("lam", "n", "d", "R", "t")))
@@ -247,11 +247,11 @@ def load(folder: str | Path) -> Result:
             components=find_components(soup, seg, part, K_ref, K_next, borrowed),
             metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
             metre_unit=str(unit),
-            verdict=_ending(place / "log.txt"),
+            verdict=_ending(folder / "log.txt"),
             overview=picture.read_bytes() if picture.is_file() else b"",
         )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
-        raise DataError("result does not hold together", where=place, found=error) from error
+        raise DataError("result does not hold together", where=folder, found=error) from error
 
 
 def _ending(log: Path) -> str:

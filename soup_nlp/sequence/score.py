@@ -62,13 +62,13 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
         )
     averaged = "mre_own_scale", "mre_one_scale"
     mre = {key: float(np.mean([f[key] for f in frames])) for key in averaged}
-    own = {f["frame"]: f["own_scale"] for f in frames}
+    own_scale = {f["frame"]: f["own_scale"] for f in frames}
     # the true ratio is that of the pairs' own depths, without the scales of the chain
     ratio = chain.scales[1:] / chain.scales[:-1]
     links = [
-        {"pairs": [k, k + 1], "estimated": r, "true": r * own[k + 1] / own[k]}
+        {"pairs": [k, k + 1], "estimated": r, "true": r * own_scale[k + 1] / own_scale[k]}
         for k, r in enumerate(ratio)
-        if own.keys() >= {k, k + 1}
+        if own_scale.keys() >= {k, k + 1}
     ]
     return {
         "scale": scale,

@@ -235,7 +235,7 @@ def _problem(frames: Frames, k: int, overrides: Sequence[str]) -> Problem:
 
 
 def named(frames: Source, folder: Path | None = None) -> tuple[str, str]:
-    """Name of a sequence, and what its folder is the result of.
+    """Name of a sequence, and the subject of its output folder: what it is the result of.
 
     Images in memory are named after the folder.
     """

@@ -41,7 +41,7 @@ class Given:
         sigma: (N,) its standard deviation, estimated from the flow; inf where it decides nothing.
         opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
         error: (N,) standard deviation of log depth by which E_depth weighs the prior.
-        held: (N,) True where depth or scale of the start are the prior's.
+        from_prior: (N,) True where depth or scale of the start are the prior's.
     """
 
     evidence: Evidence
@@ -49,13 +49,13 @@ class Given:
     sigma: Float
     opened: Float
     error: Float
-    held: Mask
+    from_prior: Mask
 
     def as_dict(self) -> dict[str, Any]:
         """Numbers for summary.json; NaN for the ratio where the flow is no evidence."""
         e = self.evidence
         numbers = {"used": e.used, "kind": e.kind, "ratio": e.ratio, "overall": e.sigma}
-        return {**numbers, "held": float(self.held.mean())}
+        return {**numbers, "held": float(self.from_prior.mean())}
 
 
 def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tuple[Start, Given]:
@@ -102,7 +102,7 @@ def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tup
     sigma = np.where(fixed | ~with_value, np.inf, sigma)
     noise = start.noise / np.maximum(flow.views.parallax(soup), 1e-3)
     opened = np.where(strong & ~fixed, 1 / (1 + (sigma / noise) ** 2) ** 2, 1.0)
-    held = ~fixed & ~(main & strong)
+    from_prior = ~fixed & ~(main & strong)
     # a superpixel has the translation of its component, whatever its depth
     scaled = replace(soup, lam=soup.lam * np.exp(-off))
     planes = about_anchor(
@@ -111,11 +111,11 @@ def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tup
     normal, D = normal_and_distance(planes)
     tilted = Soup(D, normal, np.ones(n), soup.R, scaled.translation / D[:, None])
     soup = scaled.taking(tilted, ~strong).normalised()
-    tie = np.where(held & ~main, TIES.index("given depth"), start.tie)
+    tie = np.where(from_prior & ~main, TIES.index("given depth"), start.tie)
     # without a flow to weigh it against, terms on shape must not undo the prior
     error = sigma if evidence.determined else np.where(np.isfinite(sigma), LEAST_SIGMA, np.inf)
-    decides = np.where(held, sigma, np.inf)
-    given = Given(evidence, prior, decides, opened, error, held)
+    decides = np.where(from_prior, sigma, np.inf)
+    given = Given(evidence, prior, decides, opened, error, from_prior)
     return replace(start, soup=soup, tie=tie), given
 
 

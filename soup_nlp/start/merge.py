@@ -96,8 +96,8 @@ def _spread(flow: FlowFit, choice: Choice) -> Choice:
         return choice
     cost = np.minimum(flow.views.fit([choice.motions[c] for c in kept]).penalised(), CLIP)
     cost[:, 0] -= 0.5 * UNEXPLAINED_PX
-    own = np.minimum(choice.error, CLIP) + 0.5 * least_gain(choice.noise)
-    cost = np.column_stack([cost, np.where(large[label], np.inf, own)])
+    own_cost = np.minimum(choice.error, CLIP) + 0.5 * least_gain(choice.noise)
+    cost = np.column_stack([cost, np.where(large[label], np.inf, own_cost)])
     # motions of whole regions are more reliable than those of pieces: twice the price
     new = smooth_choice(flow, cost, 2 * flow.options.smoothness)
     label = np.where(new < m, np.append(kept, -1)[new], label)

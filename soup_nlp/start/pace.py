@@ -96,9 +96,9 @@ def without_support(flow: FlowFit, label: Int, fixed: Mask) -> tuple[Int, Mask]:
         label: (N,) index of the component.
         fixed: (N,) True in components that are fixed in the image.
     """
-    seg, apart = flow.seg, fixed | (label == largest(label))
+    seg, separate = flow.seg, fixed | (label == largest(label))
     ends = label[seg.pairs]
-    group = connected(ends[~apart[seg.pairs].any(axis=1)], int(label.max()) + 1)[label]
+    group = connected(ends[~separate[seg.pairs].any(axis=1)], int(label.max()) + 1)[label]
     # support of a group, visible and beyond the border, weighted by the squared height difference
     around, groups = outlines(group, seg), int(group.max()) + 1
     usable = flow.views.usable[around.neighbour]
@@ -108,7 +108,7 @@ def without_support(flow: FlowFit, label: Int, fixed: Mask) -> tuple[Int, Mask]:
     )
     last = group[seg.labels[-1]]
     cut_off = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
-    return group, (cut_off + unknown > seen)[group] & ~apart
+    return group, (cut_off + unknown > seen)[group] & ~separate
 
 
 def log_pace(far: Float, label: Int, scene: int | None = None) -> Float:

@@ -47,28 +47,28 @@ class Row(NamedTuple):
 
 
 def parse_table(table: str) -> dict[str, Row]:
-    """Rows by the place of an array, "group/name".
+    """Rows by the path of an array, "group/name".
 
-    Every line of a table has places, unit, axes ("-" for a number) and description. "|" separates
+    Every line of a table has paths, unit, axes ("-" for a number) and description. "|" separates
     groups with the same arrays, "*" stands for any name.
     """
     out = {}
     for line in filter(None, table.strip().splitlines()):
-        places, unit, axes, text = line.split(maxsplit=3)
-        groups, slash, name = places.rpartition("/")
+        paths, unit, axes, text = line.split(maxsplit=3)
+        groups, slash, name = paths.rpartition("/")
         for group in groups.split("|"):
             out[f"{group}{slash}{name}"] = Row(unit, axes.strip("-"), text)
     return out
 
 
-def row_of(rows: Mapping[str, Row], place: str) -> Row | None:
-    """The row of a place; None if there is none. In a description "*" becomes the name."""
-    if place in rows:
-        return rows[place]
+def row_of(rows: Mapping[str, Row], path: str) -> Row | None:
+    """The row of a path; None if there is none. In a description "*" becomes the name."""
+    if path in rows:
+        return rows[path]
     for pattern, row in rows.items():
-        if fnmatchcase(place, pattern):
+        if fnmatchcase(path, pattern):
             start = pattern.partition("*")[0]
-            return row._replace(text=row.text.replace("*", place.removeprefix(start)))
+            return row._replace(text=row.text.replace("*", path.removeprefix(start)))
     return None
 
 

@@ -86,7 +86,7 @@ def test_what_gives_a_component_its_scale_is_said(name, small_run):
     tied = replace(start, tie=np.full_like(start.tie, TIES.index(name)))
     given = None
     if name == "given depth":
-        given = SimpleNamespace(held=np.ones(len(tied.soup), bool))
+        given = SimpleNamespace(from_prior=np.ones(len(tied.soup), bool))
     (line,) = certainty_lines(
         certainty(replace(small_run, start=tied, confidence=certain, given=given))
     )

@@ -140,9 +140,9 @@ def test_a_prior_scales_objects_beside_a_background_that_the_flow_determines():
     assert given.evidence.determined
     assert 0.1 < given.evidence.ratio < CONFIRMED
     main = start.component == np.bincount(start.component).argmax()
-    firm = main & ~given.held
-    assert (main & given.held).any()
-    assert given.held[~main].all()
+    firm = main & ~given.from_prior
+    assert (main & given.from_prior).any()
+    assert given.from_prior[~main].all()
     assert (start.tie[~main] == TIES.index("given depth")).all()
     assert TIES.index("given depth") not in start.tie[main]
     # objects have the scale of the prior, the background keeps its shape by the flow
@@ -190,7 +190,7 @@ def test_the_number_of_superpixels_does_not_change_the_evidence_for_a_prior(swin
         pair = replace(swing.pair, depth_prior=swing.depth * np.exp(0.2 * WAVE))
         given = prepare(make_problem(raw), pair=pair).given
         numbers.append(given.as_dict() | {"held": None})
-        assert len(given.held) > 0.9 * count
+        assert len(given.from_prior) > 0.9 * count
     assert numbers[0] == numbers[1]
 
 
@@ -215,7 +215,7 @@ def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
     assert pan.start.at_rest
     start, given = pan.by(pan.depth)
     assert np.isnan(given.evidence.ratio)
-    assert given.held.all()
+    assert given.from_prior.all()
     assert (given.sigma > 0.25).all()
     assert np.abs(pan.error(start)).mean() < 0.1 < np.abs(pan.error(pan.start)).mean()
     # the flow is the same at both depths

@@ -148,7 +148,7 @@ def make_task(case: Case, build: Build, limits: Limits) -> Task:
 
 
 def problem_task(case: Case, limits: Limits, coordinates: str) -> Labelled:
-    """The task of a case in its formulation."""
+    """Label of a case and the maker of its task; its energy limit is that of the initialisation."""
     form = case.formulation(coordinates=coordinates, hessian="exact", compiled=False)
     ceiling = oracle.energy(case.start.soup, case.data, case.weights)["total"]
     label = {

@@ -98,8 +98,8 @@ class Network:
         try:
             outputs = self.session.run(None, named)
         except Exception as error:  # onnxruntime raises many types
-            found = _first_line(error)
-            raise DataError("network failed", where=self.source, found=found) from error
+            reason = _first_line(error)
+            raise DataError("network failed", where=self.source, found=reason) from error
         fitting = [o for o in outputs if fits(o)]
         if not fitting:
             name, _, shape = kind.partition(" ")
