@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import date
 from itertools import product
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from scipy.stats import linregress
 from soup_nlp.bench.accuracy import scores
 from soup_nlp.bench.processes import machine
 from soup_nlp.bench.reference_solver import levenberg_marquardt
-from soup_nlp.bench.study import Cell, Item, main_metric, markdown, page_text, titled
+from soup_nlp.bench.study import Cell, Item, main_metric, markdown, page_text, provenance, titled
 from soup_nlp.bench.suites import MOTORCYCLE, Options, list_suite
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.soup import reconstruct
@@ -232,13 +231,12 @@ def growth(frame: pd.DataFrame) -> pd.DataFrame:
 def speed_page(frame: pd.DataFrame) -> str:
     """Markdown page of the rows: conclusion, runs, growth with N, seconds by stage, machine."""
     good = with_costs(frame)
-    blocks = ["# Speed and growth"]
+    blocks = ["# Speed and growth", f"{provenance(frame)}."]
     if len(good):
         runs = good.set_axis(pd.MultiIndex.from_frame(good[list(RUN)].rename(columns=RUN)))
         blocks += [titled(runs, COLUMNS), NOTE]
         blocks += ["## Growth: cost = factor N^p", markdown(growth(good), ".2f")]
         stages = {f"stages.{phase}": (phase, ".2f") for phase in PHASES}
         blocks += ["## Wall seconds by stage", titled(runs, stages)]
-    facts = {"date": date.today(), **machine()}.items()
-    blocks += ["## Machine", "\n".join(f"- {k}: {v}" for k, v in facts)]
+    blocks += ["## Machine", "\n".join(f"- {k}: {v}" for k, v in machine().items())]
     return page_text(blocks, frame)

@@ -217,11 +217,14 @@ def titled(frame: pd.DataFrame, columns: Mapping[str, tuple[str, str]]) -> str:
 
 
 def provenance(frame: pd.DataFrame) -> str:
-    """Date, machine, CPU time and code versions of the rows, as one sentence."""
+    """Date, machine, CPU time, code versions and common overrides of the rows, as one sentence."""
     code = ", ".join(sorted(frame["code"].dropna().astype(str).unique()))
     seconds = frame["cpu_seconds"].astype(float).sum()
     where = f"{date.today()}, {platform.machine()}"
-    return f"{where}, {seconds:.0f} CPU seconds in all; code {code}"
+    first, *others = frame.get("overrides", pd.Series([[]])).tolist() or [[]]
+    common = [f"`{o}`" for o in first if all(o in overrides for overrides in others)]
+    changes = f"overrides of every row: {', '.join(common) or 'none'}"
+    return f"{where}, {seconds:.0f} CPU seconds in all; code {code}; {changes}"
 
 
 def page_text(blocks: Sequence[str], frame: pd.DataFrame | None = None) -> str:

@@ -24,7 +24,7 @@ NOTE = (
     " frames: with a median scale for every frame, and with one for the sequence. A link is the"
     " estimated ratio of the scales of two pairs over the true one. Error of the camera's path:"
     " RMSE of its positions after the best similarity, over the path's length (no true path of"
-    " kitti_tracking is known). DIS flow, default options."
+    " kitti_tracking is known). DIS flow."
 )
 KITTI_DEPTH = 256.0
 """Values per metre of a depth of kitti_tracking."""

@@ -132,8 +132,7 @@ def accuracy(
     running: Running = {"workers": workers, "any_code": any_code}
     codes = []
     for each, items in suites.items():
-        note = f"Suite `{each}`: {SUITES[each].text}. Overrides of every pair: "
-        note += f"{', '.join(f'`{o}`' for o in changes) or 'none'}."
+        note = f"Suite `{each}`: {SUITES[each].text}."
         measured = partial(measure_cells, [Cell(item, changes) for item in items], measure_pair)
         write, files = partial(write_suite, note=note), [pictures[each]]
         codes.append(_run(pages[each], measured, write, quiet, overwrite, files, **running))
@@ -190,8 +189,6 @@ def paper(
         _say(quiet)(line)
     settings = {"superpixels": superpixels, "analysis": analysis, "limit": limit, "set": overrides}
     note = f"Superpixels wanted: {superpixels} in the comparison, {analysis} elsewhere."
-    if changes:
-        note += f" Overrides of every row: {', '.join(f'`{o}`' for o in changes)}."
     measured = partial(measure_cells, list(plan.drop_duplicates("key")["cell"]), measure_paper)
     command = _command("paper", data, settings)
     write = partial(write_paper, plan=plan, command=command, note=note)

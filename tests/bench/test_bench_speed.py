@@ -115,6 +115,8 @@ def test_the_page_of_runs():
     text = speed_page(frame_of(rows))
     # E and CPU time relative to Levenberg-Marquardt
     assert text.count("| 1.0200 | 1.50 | 40 |") == 5
+    # N and K differ, and the seed is that of the scene
+    assert "code c0de; overrides of every row: `seed=0`, `refine.enabled=false`." in text
     assert "N 250, K 10: no answer" in text
     assert "N 250, K 10: no answer" in speed_page(frame_of(rows[-1:]))
 

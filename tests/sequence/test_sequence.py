@@ -303,13 +303,15 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
     # the table of chains has the same numbers
     monkeypatch.setattr(chain_study, "scratch", lambda: nullcontext(tmp_path / "out"))
-    item = chain_study.sequences(None)[0]
-    row = chain_study.measure_chain(Cell(item, tuple(SMALL)), frames=3)
+    cell = Cell(chain_study.sequences(None)[0], tuple(SMALL))
+    row = chain_study.measure_chain(cell, frames=3)
     assert row["cost"] == told["score"]["cost"]
     assert row["path"] == told["score"]["path"]["share"]
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
-    row = {**Cell(item).identity(), "ok": True, "cpu_seconds": 1.0, "code": "c", **row}
-    assert "| street | 3 |" in chain_study.chain_page(frame_of([row]))
+    row = {**cell.identity(), "ok": True, "cpu_seconds": 1.0, "code": "c", **row}
+    text = chain_study.chain_page(frame_of([row]))
+    assert "| street | 3 |" in text
+    assert f"code c; overrides of every row: `{SMALL[0]}`" in text
     # a file of the user is not overwritten
     (tmp_path / "out" / "chain.json").write_text("mine")
     assert main(call) == 2
