@@ -4,9 +4,10 @@
 
 c_is, 0 to 1, is the difference of soft census (`data.census`) between sampled pixel s of
 superpixel i and the pixel of the next frame to which the superpixel's homography maps it. A sample
-that leaves the next frame, or is hidden there by a nearer surface, costs `UNSEEN`: more than an
-agreement, less than a contradiction. Nearer surfaces are read off a depth map of the next frame
-which is the same for all soups that are compared, so that E_photo is one function of a soup.
+that leaves the next frame, or is hidden there by a nearer surface, costs tau, as much as the worst
+contradiction: if it cost less, superpixels whose pixels contradict would recede until they are
+hidden. Nearer surfaces are read off a depth map of the next frame which is the same for all soups
+that are compared, so that E_photo is one function of a soup.
 
 Where the images contradict the flow, E_proj is weaker and truncated; everywhere else it is that of
 E. They contradict the flow of a superpixel if, in the soup that followed this flow, the visible
@@ -31,10 +32,8 @@ from soup_nlp.refine.costs import unary_costs
 from soup_nlp.refine.particles import Particles
 from soup_nlp.refine.records import RefineOptions
 
-TAU = 0.35
-"""A contradiction counts at most this much."""
-UNSEEN = 0.25
-"""Cost of a sample that is not visible in the next frame."""
+TAU = 0.25
+"""Most that a sample costs, and what it costs where the next frame does not show it."""
 BEHIND = 1.1
 """A sample is hidden if the nearest surface is nearer by this factor."""
 SAMPLES = 24
@@ -98,7 +97,7 @@ class Photometric:
         for a in range(0, len(out), step):
             b = slice(a, a + step)
             c, seen = self._differences(p, b, unit)
-            out[b] = self.weight * np.where(seen, c, UNSEEN).mean(axis=2)
+            out[b] = self.weight * np.where(seen, c, TAU).mean(axis=2)
         return out
 
     def disagreeing(self, soup: Soup, data: EnergyData) -> Mask:

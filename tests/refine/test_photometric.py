@@ -24,7 +24,6 @@ from soup_nlp.refine.photometric import (
     BEHIND,
     SAMPLES,
     TAU,
-    UNSEEN,
     Photometric,
     common_motions,
     photometric_term,
@@ -125,7 +124,7 @@ def test_costs_are_those_of_a_loop(scene):
             for v, u in zip(*np.divmod(at, WIDTH)):
                 x = u + 80.0 * SHIFT / depth
                 if x > WIDTH - 1 or depth >= BEHIND * photo.nearest[v, int(x + 0.5)]:
-                    total += UNSEEN
+                    total += TAU
                     continue
                 sampled = census_at(nxt, np.array([[x]]), np.array([[float(v)]]))[:, 0, 0]
                 total += min(np.abs(sampled - ref[:, v, u]).sum() / 16.0, TAU)
@@ -139,12 +138,15 @@ def test_the_truth_agrees_and_unseen_points_have_a_fixed_cost(scene):
     assert cost[(u < 38) | ((u > 58) & (u < 76))].max() < 0.03
     # eight columns leave the view
     at_border = np.zeros((HEIGHT, WIDTH))
-    at_border[:, WIDTH - 8 :] = UNSEEN
+    at_border[:, WIDTH - 8 :] = TAU
     for i in np.unique(scene.labels[:, -1]):
         assert cost[i] == pytest.approx(at_border[scene.labels == i].mean(), abs=0.06)
     # on the far plane, superpixels on the right would be hidden by the near one
     hidden = Particles.of(scene.soup(np.full(scene.count, FAR)))
-    np.testing.assert_allclose(photo.costs(hidden, 1.0)[(u > 62) & (u < 85), 0], UNSEEN, atol=1e-6)
+    np.testing.assert_allclose(photo.costs(hidden, 1.0)[(u > 62) & (u < 85), 0], TAU, atol=1e-6)
+    # no superpixel gains by hiding: no visible sample costs more
+    other = Particles.of(scene.soup(np.full(scene.count, 0.7 * FAR)))
+    assert 0.1 < photo.costs(other, 1.0).max() <= TAU + 1e-6
 
 
 def test_energy_does_not_depend_on_scale(scene):
