@@ -40,7 +40,6 @@ from soup_nlp.refine.particles import (
     Proposer,
     counts,
     neighbours,
-    within_reach,
 )
 from soup_nlp.refine.photometric import Photometric, swept
 from soup_nlp.refine.records import Refined, RefineOptions, Round
@@ -48,9 +47,6 @@ from soup_nlp.storage.progress import Progress, Watch
 
 TRWS_ITERATIONS, TRWS_GAP = 15, 1e-4
 """Most iterations of TRW-S in a round, and the relative gap at which it stops earlier."""
-DEPTH_REACH = 2.0
-"""A proposed depth is at most this many times the upper quartile of the neighbours' depths, and at
-least their lower quartile over this squared."""
 SWEPT = 6
 """Planes swept over depth among the particles of every superpixel, if images are used."""
 CONTRADICTED = 0.06
@@ -224,8 +220,6 @@ class Rounds:
         if photo is not None:
             unary += photo.costs(p, photo.unit(best))
         allowed &= feasible(p, *self.visibility)
-        if self.options.proposals != "walks":
-            allowed &= within_reach(p, best, self.proposer.near, data.anchor_ray, DEPTH_REACH)
         unary[~allowed] = np.inf
         # the current belief is allowed even where it violates a constraint
         forbidden = ~np.isfinite(unary[:, 0])

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane import about_anchor, at_anchor, inverse_depth, normal_and_distance
 from soup_nlp.geometry.soup import Soup
@@ -89,11 +89,6 @@ class Particles:
         p = self.take(labels[:, None])
         ones = np.ones(len(labels))
         return Soup(ones, p.n[:, 0], p.D[:, 0], p.R[:, 0], p.T[:, 0]).normalised(share)
-
-
-def anchor_depth(p: Particles, anchor_ray: Float) -> Float:
-    """(N, L) depth of every particle's plane at the anchor."""
-    return -p.D / np.einsum("nlc,nc->nl", p.n, anchor_ray)
 
 
 def from_anchor(Z: Float, g: Float, R: Float, T: Float, anchor_ray: Float) -> Particles:
@@ -218,28 +213,3 @@ class Proposer:
         Z = np.where(bad, depth[sources], 1.0 / np.where(bad, 1.0, inverse))
         g = np.where(bad[..., None], 0.0, m[..., :2] * Z[..., None])
         return Z, g
-
-
-def within_reach(p: Particles, soup: Soup, near: Int, anchor_ray: Float, reach: float) -> Mask:
-    """(N, L) whether the depth of a particle is within reach of its neighbours' depths.
-
-    Lengths are measured in the depth of their anchors, so a superpixel at a thousand times the
-    depth of its neighbours pays hardly anything for its motion. Such depths are not allowed,
-    except the current depth and those between it and the depths of the neighbours.
-
-    Args:
-        p: (N, L) particles.
-        soup: Current belief.
-        near: (N, K) neighbours.
-        anchor_ray: (N, 3).
-        reach: At most this many times the upper quartile of the neighbours' depths, at least the
-            lower quartile over its square (an object in front of its background is common).
-    """
-    depth = soup.depth_at(anchor_ray)
-    Z = anchor_depth(p, anchor_ray)
-    if not near.shape[1]:
-        return np.ones(Z.shape, bool)
-    low, high = np.quantile(depth[near], (0.25, 0.75), axis=1)
-    high = np.maximum(reach * high, depth) * (1 + 1e-9)
-    low = np.minimum(low / reach**2, depth) * (1 - 1e-9)
-    return np.asarray((low[:, None] <= Z) & (high[:, None] >= Z))

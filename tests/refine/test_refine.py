@@ -28,7 +28,6 @@ from soup_nlp.refine.particles import (
     WALKS,
     Particles,
     Proposer,
-    anchor_depth,
     counts,
     neighbours,
 )
@@ -45,7 +44,8 @@ def proposer(data: EnergyData, seed: int = 0) -> Proposer:
 
 def anchor_targets(p: Particles, data: EnergyData) -> np.ndarray:
     """(N, L, 2) positions of moved anchors in the next image, pixels."""
-    X = anchor_depth(p, data.anchor_ray)[..., None] * data.anchor_ray[:, None]
+    depth = -p.D / np.einsum("nlc,nc->nl", p.n, data.anchor_ray)
+    X = depth[..., None] * data.anchor_ray[:, None]
     return camera.project(data.K_next, np.einsum("nlij,nlj->nli", p.R, X) + p.T)
 
 

@@ -12,7 +12,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.refine.costs import PairCosts, feasible, unary_costs
 from soup_nlp.refine.mppbp import length_slope
-from soup_nlp.refine.particles import Particles, anchor_depth, within_reach
+from soup_nlp.refine.particles import Particles
 
 
 def cloud(tiny: Tiny, labels: int, seed: int = 3, spread: float = 1.0) -> Particles:
@@ -107,22 +107,3 @@ def test_the_length_slope_is_the_derivative_of_the_energy():
     assert length_slope(tiny.soup, tiny.data, weights) == pytest.approx(
         (down - up) / (2 * h), rel=1e-5
     )
-
-
-def test_no_particle_runs_away_but_the_current_one_may_stay():
-    tiny = Tiny()
-    n = len(tiny.soup)
-    now = tiny.soup
-    far = Soup(now.lam, now.n, now.d * np.where(np.arange(n) == 3, 1e3, 1.0), now.R, now.t)
-    p = Particles.of(far)
-    p = p.joined(*(Particles(p.n, p.D * s, p.R, p.T) for s in (1.3, 100.0, 1e-3)))
-    near = np.array([[j for j in range(n) if j != i][:6] for i in range(n)])
-    allowed = within_reach(p, far, near, tiny.data.anchor_ray, 2.0)
-    assert allowed[:, 0].all()
-    unmoved = np.arange(n) != 3
-    assert allowed[unmoved, 1].all()
-    assert not allowed[:, 2].any()
-    assert not allowed[unmoved, 3].any()
-    # the distant superpixel may return to the depth of its neighbours
-    assert allowed[3, 3]
-    assert anchor_depth(p, tiny.data.anchor_ray)[3, 3] < 2.0
