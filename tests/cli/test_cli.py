@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import h5py
@@ -16,7 +15,6 @@ from helpers_files import read_ply, sets, write_flo, write_pair
 from soup_nlp.cli.main import main
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.report.check import check_folder
-from soup_nlp.report.verdict import exit_code
 
 pytestmark = pytest.mark.slow
 
@@ -182,34 +180,6 @@ def test_one_superpixel_is_one_plane(images, tmp_path):
 def test_arguments_that_are_no_pair_and_no_result_are_refused(words, part, capsys):
     assert main(words.split()) == 2
     assert part in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("changes", "code", "part"),
-    [
-        ({}, 0, "solved"),
-        ({"status": "Interrupted", "solved": False}, 1, "interrupted"),
-        ({"status": "Time_Limit", "solved": False}, 1, "did not converge (Time_Limit)"),
-        ({"guessed": 0.51}, 1, "51% of the image is a guess"),
-        ({"mre": 0.3}, 1, "above the expected 0.2"),
-    ],
-)
-def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
-    monkeypatch.setattr("soup_nlp.report.verdict.certainty", lambda run: {"weak": 0.51})
-    outcome = {"status": "Solve_Succeeded", "solved": True, "guessed": 0.1, "mre": 0.1} | changes
-    expected = SimpleNamespace(mre_at_most=0.2)
-    fake = SimpleNamespace(
-        refined=None,
-        solution=SimpleNamespace(status=outcome["status"]),
-        solved=outcome["solved"],
-        good=outcome["solved"] and outcome["guessed"] <= 0.5,
-        confidence=SimpleNamespace(guessed=outcome["guessed"]),
-        metrics={"solution": SimpleNamespace(mre=outcome["mre"])},
-        problem=SimpleNamespace(expected=expected),
-    )
-    result = exit_code(fake, 0.2)
-    assert result[0] == code
-    assert part in result[1]
 
 
 def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch, capsys):

@@ -57,20 +57,6 @@ def test_casadis_form_is_read_back(folder):
     assert ((g >= lbg - 1e-4) & (g <= ubg + 1e-4)).all()
 
 
-def test_casadis_form_is_read_without_casadi(folder):
-    reader = pytest.importorskip("casadi_reader")
-    path = folder / f"{STUB}.casadi"
-    found = reader.read_casadi(str(path))
-    function, *vectors = found["roots"]
-    fields = found["objects"][function["$ref"]]["fields"]
-    assert any(f["value"] == "nlp" for f in fields)
-    assert [v["type"] for v in vectors] == ["DM"] * 7
-    data = ca.StringDeserializer(path.read_text())
-    x0 = np.array([data.unpack() for _ in range(8)][-1]).ravel()
-    (values,) = [f["value"] for f in vectors[-1]["fields"] if f["name"] == "Matrix::nonzeros"]
-    assert values == x0.tolist()
-
-
 @pytest.mark.parametrize(("move", "word"), [(0.0, "converged"), (1e-3, "WRONG")])
 def test_the_runner_judges_an_answer(move, word, folder, tmp_path, capsys):
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)

@@ -10,7 +10,7 @@ import pytest
 
 from soup_nlp.report import findings
 from soup_nlp.report.findings import certainty
-from soup_nlp.report.verdict import _energies, facts
+from soup_nlp.report.verdict import _energies, exit_code, facts
 
 
 def titles(text):
@@ -82,3 +82,31 @@ def test_the_table_of_energies_ends_with_what_the_refinement_lowers():
     assert _energies(SimpleNamespace(solution=solution, refined=None, energy=end))[0].split() == [
         "total", "arap",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "part"),
+    [
+        ({}, 0, "solved"),
+        ({"status": "Interrupted", "solved": False}, 1, "interrupted"),
+        ({"status": "Time_Limit", "solved": False}, 1, "did not converge (Time_Limit)"),
+        ({"guessed": 0.51}, 1, "51% of the image is a guess"),
+        ({"mre": 0.3}, 1, "above the expected 0.2"),
+    ],
+)
+def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
+    monkeypatch.setattr("soup_nlp.report.verdict.certainty", lambda run: {"weak": 0.51})
+    outcome = {"status": "Solve_Succeeded", "solved": True, "guessed": 0.1, "mre": 0.1} | changes
+    expected = SimpleNamespace(mre_at_most=0.2)
+    fake = SimpleNamespace(
+        refined=None,
+        solution=SimpleNamespace(status=outcome["status"]),
+        solved=outcome["solved"],
+        good=outcome["solved"] and outcome["guessed"] <= 0.5,
+        confidence=SimpleNamespace(guessed=outcome["guessed"]),
+        metrics={"solution": SimpleNamespace(mre=outcome["mre"])},
+        problem=SimpleNamespace(expected=expected),
+    )
+    result = exit_code(fake, 0.2)
+    assert result[0] == code
+    assert part in result[1]
