@@ -29,6 +29,7 @@ from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.start.given_depth import Given
+from soup_nlp.start.ground import STANDS
 from soup_nlp.start.pace import displacement, log_pace
 from soup_nlp.start.propose import Start
 
@@ -95,8 +96,8 @@ class Confidence:
         marginals: Marginal variances of the planes and of the components' scales.
         component_sigma: (C,) standard deviation of the components' log scale.
         evidence: Evidence of the flow for the depth of every component.
-        scale: (N,) standard deviation of log depth by the scales of components, see
-            `scale_by_contact`.
+        scale: (N,) standard deviation of log depth by the scales of components and contacts with
+            the ground, see `scale_by_contact`.
     """
 
     sigma: Float
@@ -206,6 +207,18 @@ def with_prior(sigma: Float, prior: Float | float = SIGMA_PRIOR) -> Float:
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
+def by_ground(off_ground: Float) -> Float:
+    """(N,) standard deviation of log depth because regions may stand on the ground, or not.
+
+    The depth of a region is its own or that of the ground below it: the log ratio of both counts,
+    in squares without what regions with the right depth have.
+
+    Args:
+        off_ground: (N,) log ratio of both depths (`start.ground.off_ground`).
+    """
+    return np.sqrt(np.maximum(off_ground**2 - STANDS**2, 0.0))
+
+
 def scale_by_contact(
     variances: Marginals, start: Start, sizes: Int, far: Float, given_depth: Given | None = None
 ) -> Float:
@@ -217,7 +230,8 @@ def scale_by_contact(
     a component move farther than the largest one does, by a log ratio (`log_pace`) above `USUAL`,
     the component may be anywhere between there and where both move equally far, and that log ratio
     is added in squares. A component that occlusion has placed has at least `COVERING`, and does not
-    count for the mean.
+    count for the mean. What does not stand on the ground below it has `by_ground`, added in
+    squares.
 
     Args:
         variances: Marginal variances of the components' scales.
@@ -236,6 +250,8 @@ def scale_by_contact(
     pace = log_pace(far, start.component)[start.component]
     fast = (contact | placed) & (pace > USUAL) & (start.tie != TIES.index("given depth"))
     open_scale = np.maximum(np.where(fast, pace, 0.0), np.where(placed, COVERING, 0.0))
+    if start.off_ground is not None:
+        open_scale = np.hypot(open_scale, by_ground(start.off_ground))
     return np.hypot(np.hypot(scale, mean), open_scale)
 
 

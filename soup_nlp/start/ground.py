@@ -13,6 +13,7 @@ lower border is far behind it.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,16 +40,22 @@ ON, BELOW = 0.05, 0.2
 second on it lies below."""
 LEAST_ON, MOST_BELOW = 0.05, 0.05
 """Of the area with known depth, the least share on the ground and the largest share below it."""
-STANDS = 1.35
-"""Ratio to the inverse depth of the ground from which on a superpixel stands above it; superpixels
-on an outline contain pixels of both sides."""
+RISES = 1.35
+"""Ratio to the inverse depth of the ground from which on a superpixel is part of what may float;
+superpixels on an outline contain pixels of both sides."""
+STANDS = 0.1
+"""Log ratio to the depth of the ground up to which a superpixel lies on it, and up to which a
+region stands on it. Regions with the right depth have at most 0.16."""
 STEP, FLOATS = 0.15, 0.2
 """Least log ratios to the depth of a region on its outline: of another surface, and of the plane of
 the ground along its lower border."""
-FEWEST, MOST_AREA = 3, 0.15
-"""Least number of superpixels and least share of the image of a region that floats."""
-IN_FRONT = 0.6
-"""Least share of its outline behind the region, and least share of ground below it."""
+FEWEST = 3
+"""Least number of superpixels of a region that may be off the ground."""
+MOST_AREA, SCENE = 0.15, 0.25
+"""Largest share of the image of a region that floats, and of one whose contact with the ground
+tells its depth."""
+IN_FRONT, VISIBLE = 0.6, 0.6
+"""Least share of its outline behind a region that floats, and of ground along a lower border."""
 TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
@@ -138,13 +145,32 @@ def above_ground(
     return Soup(lam, soup.n, soup.d, soup.R, t), lifted
 
 
-def floating(
-    soup: Soup, seg: Segmentation, K_ref: Float, floor: Float, component: Int
-) -> list[tuple[Mask, float]]:
-    """Masks (N,) of the regions that float above the ground, and their depth ratios to it.
+class Region(NamedTuple):
+    """A region off the ground that is continuous in depth, and the ground along its lower border.
 
-    A region stands above the ground, is continuous in depth, and is in front of most of its
-    surroundings. It floats if the ground visible along its lower border is clearly farther.
+    Attributes:
+        members: (N,) True in the region.
+        ground: Log ratio of the depth of the plane of the ground, along the lower border, to its
+            own.
+        step: The same of the superpixels on the ground there.
+        behind: Share of its outline behind which the depth is larger by `STEP`.
+    """
+
+    members: Mask
+    ground: float
+    step: float
+    behind: float
+
+
+def regions(
+    soup: Soup,
+    seg: Segmentation,
+    K_ref: Float,
+    floor: Float,
+    component: Int,
+    ratios: tuple[float, float],
+) -> list[Region]:
+    """Regions of at least `FEWEST` superpixels off the ground below most of which it is visible.
 
     Args:
         soup: Start, its components scaled.
@@ -152,19 +178,19 @@ def floating(
         K_ref: (3, 3) intrinsics of the reference frame.
         floor: (N,) inverse depth of the ground (`ground`).
         component: (N,) group that moves as one.
+        ratios: Between these ratios to its inverse depth a superpixel lies on the ground.
     """
     if not floor.any():
         return []
     ray = rays(K_ref, seg.anchors)
     mu = 1 / soup.depth_at(ray)
-    stands = (floor == 0) | (mu > STANDS * floor)
-    near_ground = ~stands & (mu > (1 - BELOW) * floor)
+    on_ground = (floor > 0) & (mu > ratios[0] * floor) & (mu <= ratios[1] * floor)
     middle = rays(K_ref, seg.boundary.mean(axis=1))
     depth = soup.depth_across(seg.pairs, middle)
     step = np.log(depth[1] / depth[0])
     i, k = seg.pairs.T
     whole = (np.abs(step) < STEP) & (component[i] == component[k])
-    region = 1 + connected_pieces(stands, seg, whole)
+    region = 1 + connected_pieces(~on_ground, seg, whole)
     around, across = outlines(region, seg), region[i] != region[k]
     plane = np.linalg.lstsq(ray[floor > 0], floor[floor > 0])[0]
     # by entry of the outlines: log ratios of the other side's and the ground's depth to its own
@@ -173,16 +199,73 @@ def floating(
     out = []
     for c in range(1, int(region.max()) + 1):
         mine, edge = region == c, around.component == c
-        if mine.sum() < FEWEST or seg.sizes[mine].sum() > MOST_AREA * seg.sizes.sum():
-            continue
         low = edge & around.below
-        on = low & near_ground[around.neighbour]
-        if not on.any() or around.weight[on].sum() < IN_FRONT * around.weight[low].sum():
+        on = low & on_ground[around.neighbour]
+        visible = on.any() and around.weight[on].sum() >= VISIBLE * around.weight[low].sum()
+        if mine.sum() < FEWEST or not visible:
             continue
-        behind = around.contact[edge & (gap > STEP)].sum() > IN_FRONT * around.contact[edge].sum()
         above, off = (quantile(v[on], around.weight[on], GROUND) for v in (rise, gap))
-        if behind and above > FLOATS and off > STEP:
-            out.append((mine, float(np.exp(above))))
+        behind = around.contact[edge & (gap > STEP)].sum() / around.contact[edge].sum()
+        out.append(Region(mine, above, off, float(behind)))
+    return out
+
+
+def floating(
+    soup: Soup, seg: Segmentation, K_ref: Float, floor: Float, component: Int
+) -> list[tuple[Mask, float]]:
+    """Masks (N,) of the regions that float above the ground, and their depth ratios to it.
+
+    A region floats if it is in front of most of its surroundings, and the ground along its lower
+    border is clearly farther.
+
+    Args:
+        soup: Start, its components scaled.
+        seg: Superpixels and graphs.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        floor: (N,) inverse depth of the ground (`ground`).
+        component: (N,) group that moves as one.
+    """
+    return [
+        (r.members, float(np.exp(r.ground)))
+        for r in regions(soup, seg, K_ref, floor, component, (1 - BELOW, RISES))
+        if seg.sizes[r.members].sum() <= MOST_AREA * seg.sizes.sum()
+        and r.behind > IN_FRONT
+        and r.ground > FLOATS
+        and r.step > STEP
+    ]
+
+
+def off_ground(
+    soup: Soup, seg: Segmentation, K_ref: Float, component: Int, reliable: Mask, seed: int
+) -> Float:
+    """(N,) log ratio of the depth of the ground below a region to its own, 0 where none is known.
+
+    The camera's motion explains what moves along the epipolar lines at a wrong depth. Where the
+    ground is visible along the lower border of a region, its depth there tells. The ground is that
+    of the component with the largest area on one. A region of more than `SCENE` of the image is
+    left out: it may be a table, which does not stand on the floor below its edge.
+
+    Args:
+        soup: Start.
+        seg: Superpixels and graphs.
+        K_ref: (3, 3) intrinsics of the reference frame.
+        component: (N,) group that moves as one.
+        reliable: (N,) True where the depth is reliable.
+        seed: Seed of the random planes.
+    """
+    ray, area = rays(K_ref, seg.anchors), seg.sizes.astype(float)
+    mu = 1 / soup.depth_at(ray)
+    floor, most = np.zeros(len(mu)), 0.0
+    for c in range(int(component.max()) + 1):
+        own = component == c
+        level = ground(mu, ray, area, reliable & own, seed)
+        on = area[own & (np.abs(mu - level) < ON * level)].sum()
+        if on > most:
+            floor, most = level, on
+    out = np.zeros(len(mu))
+    for r in regions(soup, seg, K_ref, floor, component, (np.exp(-STANDS), np.exp(STANDS))):
+        if area[r.members].sum() <= SCENE * area.sum():
+            out[r.members] = r.ground
     return out
 
 

@@ -40,6 +40,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.selected_inverse import BlockCholesky, layers
 from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import TIES
+from soup_nlp.start.ground import STANDS
 
 FORM = Formulation(compiled=False)
 
@@ -378,6 +379,23 @@ def test_a_scale_is_open_where_contact_implies_too_fast_motion(small_room):
     np.testing.assert_allclose(scale(5.0)[moving], np.hypot(usual[moving], np.log(5.0)))
     # the other components do not change
     np.testing.assert_array_equal(scale(5.0)[~moving], usual[~moving])
+
+
+def test_what_does_not_stand_on_the_ground_below_it_is_unsure_by_the_ratio(small_room):
+    inside = small_room.segmentation.labels == 25
+    usual = sure_of(small_room).sigma
+    assert usual[inside].mean() < 0.1
+
+    def sigma(log_ratio):
+        off = np.where(np.arange(len(small_room.soup)) == 25, log_ratio, 0.0)
+        return sure_of(replace(small_room, start=replace(small_room.start, off_ground=off))).sigma
+
+    np.testing.assert_array_equal(sigma(0.99 * STANDS), usual)
+    # both too near and too far by 20 %
+    for log_ratio in np.log([0.8, 1.25]):
+        floats = sigma(log_ratio)
+        assert floats[inside].min() > 0.18
+        np.testing.assert_array_equal(floats[~inside], usual[~inside])
 
 
 def test_a_camera_at_rest_leaves_a_guess_that_keeps_its_order(small_room):

@@ -8,7 +8,7 @@ import pytest
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.ground import above_ground, floating, ground
+from soup_nlp.start.ground import above_ground, floating, ground, off_ground
 
 HIGH, FAR = 1.5, 30.0
 """Height of the camera, and distance of a wall."""
@@ -122,3 +122,29 @@ def test_a_floating_region_is_found_with_its_distance(car):
     np.testing.assert_array_equal(region, body)
     # up to the spacing of the sampled rows of the boundary
     assert farther == pytest.approx(1 / car, rel=0.1)
+
+
+@pytest.mark.parametrize("car", [0.8, 1.0, 2.0])
+@pytest.mark.parametrize("road", [0, 1])
+def test_a_region_that_does_not_stand_on_the_ground_below_it_is_told_by_how_much(car, road):
+    """Whether it is too near or too far, and whichever component the ground is."""
+    seg, K, _, Z = street(car)
+    row, column = np.divmod(np.arange(len(Z)), 30)
+    body = (row >= 9) & (row <= 13) & (column >= 10) & (column <= 14)
+    component = np.where(body, 1 - road, road)
+    reliable = np.ones(len(Z), bool)
+    off = off_ground(facing(Z), seg, K, component, reliable, 0)
+    np.testing.assert_allclose(off[body], -np.log(car), atol=0.02)
+    # the wall is the scene, and the road no region
+    assert (off[~body] == 0).all()
+    assert (off_ground(facing(Z), seg, K, component, reliable & body, 0) == 0).all()
+
+
+def test_a_region_of_a_quarter_of_the_image_may_be_a_table():
+    seg, K, ray, Z = street(1.0)
+    row, column = np.divmod(np.arange(len(Z)), 30)
+    table = (row >= 4) & (row <= 16) & (column >= 5) & (column <= 24)
+    assert table.mean() > 0.25
+    Z = np.where(table, 0.5 * HIGH / ray[17 * 30, 1], Z)
+    off = off_ground(facing(Z), seg, K, table.astype(int), np.ones(len(Z), bool), 0)
+    assert (off[table] == 0).all()
