@@ -56,6 +56,9 @@ MOST_AREA, SCENE = 0.15, 0.25
 tells its depth."""
 IN_FRONT, VISIBLE = 0.6, 0.6
 """Least share of its outline behind a region that floats, and of ground along a lower border."""
+FACES_DOWN = 0.7
+"""Cosine between the normal of a superpixel and the vertical downwards from which it fills the gap
+between a region and the ground below: it contains pixels of both."""
 TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
@@ -195,7 +198,10 @@ def regions(
     plane = np.linalg.lstsq(ray[floor > 0], floor[floor > 0])[0]
     # by entry of the outlines: log ratios of the other side's and the ground's depth to its own
     gap = np.concatenate([step[across], -step[across]])
-    rise = -np.log(depth * np.maximum(middle @ plane, 1e-9))[:, across].ravel()
+    level = np.tile(-np.log(np.maximum(middle @ plane, 1e-9))[across], 2)
+    rise = level - np.log(depth[:, across]).ravel()
+    down = soup.n[:, 1] > FACES_DOWN
+    fills = down[seg.pairs[across].T.ravel()]
     out = []
     for c in range(1, int(region.max()) + 1):
         mine, edge = region == c, around.component == c
@@ -204,7 +210,11 @@ def regions(
         visible = on.any() and around.weight[on].sum() >= VISIBLE * around.weight[low].sum()
         if mine.sum() < FEWEST or not visible:
             continue
-        above, off = (quantile(v[on], around.weight[on], GROUND) for v in (rise, gap))
+        body = mine & ~down
+        # what fills a gap has the depth of the rest
+        own = level + np.log(np.median(mu[body])) if body.any() else rise
+        values = np.where(fills, own, rise), gap
+        above, off = (quantile(v[on], around.weight[on], GROUND) for v in values)
         behind = around.contact[edge & (gap > STEP)].sum() / around.contact[edge].sum()
         out.append(Region(mine, above, off, float(behind)))
     return out

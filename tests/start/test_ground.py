@@ -140,6 +140,23 @@ def test_a_region_that_does_not_stand_on_the_ground_below_it_is_told_by_how_much
     assert (off_ground(facing(Z), seg, K, component, reliable & body, 0) == 0).all()
 
 
+def test_superpixels_that_join_a_region_to_the_ground_below_do_not_tell_its_depth():
+    """They contain pixels of both, and their planes face down from one to the other."""
+    seg, K, _, Z = street(0.8)
+    row, column = np.divmod(np.arange(len(Z)), 30)
+    body = (row >= 9) & (row <= 13) & (column >= 10) & (column <= 14)
+    joins, near = body & (row == 13), Z[body][0]
+    top, bottom = (rays(K, np.array([[0.0, v]]))[0, 1] for v in (13 * 8 - 0.5, 14 * 8 - 0.5))
+    along = np.array([bottom * near / 0.8 - top * near, near / 0.8 - near])
+    normal = np.array([0.0, along[1], -along[0]]) / np.linalg.norm(along)
+    soup = facing(Z)
+    n, d = soup.n.copy(), soup.d.copy()
+    n[joins], d[joins] = normal, -(normal[1] * top + normal[2])
+    soup = Soup(np.where(joins, near, soup.lam), n, d, soup.R, soup.t)
+    off = off_ground(soup, seg, K, body.astype(int), np.ones(len(Z), bool), 0)
+    np.testing.assert_allclose(off[body], -np.log(0.8), atol=0.03)
+
+
 def test_a_region_of_a_quarter_of_the_image_may_be_a_table():
     seg, K, ray, Z = street(1.0)
     row, column = np.divmod(np.arange(len(Z)), 30)
