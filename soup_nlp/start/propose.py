@@ -135,7 +135,7 @@ def propose(flow: FlowFit) -> Start:
     motions, bends = surface_motions(flow, surface)
     bends &= o.bending
     choice = gather(flow, rigid_choice(flow, motions))
-    turn = turn_alone(flow, choice)
+    turn = None if bends.all() else turn_alone(flow, choice)
     if turn is not None or bends.all():
         soup, error = constant_depth(flow.views, turn)
         every = np.ones(len(seg), bool)

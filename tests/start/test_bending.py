@@ -23,6 +23,7 @@ from soup_nlp.pipeline.case import build_energy, prepare, solver_options
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import (
+    ANY_TURN,
     REFERENCE,
     constant_depth,
     fit_turn,
@@ -232,6 +233,19 @@ def test_depth_that_explains_the_flow_is_no_turn():
     turned = flow.views.ray @ choice.motions[0].R.T
     still = replace(flow.views, target=turned / turned[..., 2:])
     assert turn_alone(flow._replace(views=still), choice) is not None
+
+
+def test_depth_within_three_noises_of_the_flow_is_not_seen():
+    c = case("orbit")
+    flow = fitted(c)
+    choice = gather(flow, rigid_choice(flow, dominant(flow)))
+    at = choice.label == 0
+    turn = fit_turn(flow.views.subset(np.flatnonzero(at)), ANY_TURN)[1]
+    gain = float(np.median(turn - choice.fit.cost[at, 0]))
+    assert gain > 1.0
+    for noise, sees in ((gain / 3.1, True), (gain / 2.9, False)):
+        residual = np.full(len(c), noise * np.sqrt(REFERENCE / len(c)))
+        assert (turn_alone(flow._replace(residual=residual), choice) is None) == sees
 
 
 def test_a_stabilised_turn_is_a_turn():
