@@ -20,7 +20,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.choice import LEAST_NOISE, Choice, dominant
+from soup_nlp.start.choice import Choice, dominant
 from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, essential_motion, refine_near
 from soup_nlp.start.merge import candidates
@@ -32,8 +32,8 @@ REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
 with the diameter of the superpixel."""
 UNSEEN = 3.0
-"""Gain of depths over a turn alone, in units of the flow's noise, up to
-which the flow does not show them, as in `evaluate.evidence`."""
+"""Gain of depths over a turn alone, in units of the flow's noise, up to which the flow does not
+show them, as in `evaluate.evidence`."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
 """Pixels of a fit of a rotation or of the least median error, and the least scale of the latter's
 refinement, pixels."""
@@ -52,17 +52,18 @@ def systematic_error(noise: float) -> float:
 def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
     """The camera's (3, 3) rotation, if a turn explains the flow of the main motion without depth.
 
-    It does if the main rigid motion, with depths, lowers the error by no more than `UNSEEN` noises
-    of the flow, or `LEAST_NOISE`, in the median, which movers assigned to that motion do not
-    change. A zoom and a shift of the next image are free there, because they leave a residual that
-    depths explain; the rotation itself, which a shift can replace, is that of the plain turn.
+    It does if the main rigid motion, with depths, lowers the error by no more than the systematic
+    error of the flow, or `UNSEEN` noises, in the median, which movers assigned to that motion do
+    not change. A zoom and a shift of the next image are free there, because they leave a residual
+    that depths explain; the rotation itself, which a shift can replace, is that of the plain turn.
     """
     at = np.flatnonzero(flow.views.usable & (choice.label == 0))
     if not len(at):
         return None
     views = flow.views.subset(at)
     gain = np.median(fit_turn(views, ANY_TURN)[1] - choice.fit.cost[at, 0])
-    if gain > max(UNSEEN * reference_noise(flow.residual), LEAST_NOISE):
+    noise = reference_noise(flow.residual)
+    if gain > max(systematic_error(noise), UNSEEN * noise):
         return None
     return fit_turn(views)[0]
 
