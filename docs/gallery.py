@@ -19,9 +19,10 @@ from soup_nlp.arrays import Float
 from soup_nlp.evaluate.metrics import depth_metrics
 from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import strip
-from soup_nlp.report.findings import certainty, certainty_lines, found_words, hints, summary
+from soup_nlp.report.findings import certainty_lines, found_words, hints
 from soup_nlp.report.pictures import Picture, pictures
 from soup_nlp.report.result import result_of
+from soup_nlp.report.summary import certainty, summary
 from soup_nlp.report.verdict import sectioned
 
 PAGE = Path(__file__).with_name("gallery.md")

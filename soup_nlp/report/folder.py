@@ -20,12 +20,12 @@ from soup_nlp.errors import DataError
 from soup_nlp.pipeline import run as pipeline
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture, write_png
-from soup_nlp.report.findings import summary
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import record_of, recorded_files, rows_in_file
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import PAGE, html, load, result_of
+from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.files import as_path, write_text
 from soup_nlp.storage.folders import claim, digest_of, files_in, staged

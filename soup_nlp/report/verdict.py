@@ -11,7 +11,6 @@ from soup_nlp.evaluate.metrics import DepthMetrics, skill
 from soup_nlp.evaluate.scoring import SURE
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.findings import (
-    certainty,
     certainty_lines,
     flow_words,
     found_words,
@@ -19,6 +18,7 @@ from soup_nlp.report.findings import (
     hints,
 )
 from soup_nlp.report.result import PAGE
+from soup_nlp.report.summary import certainty
 
 STATUS = {
     "Solve_Succeeded": "converged to the tolerance",

@@ -12,7 +12,8 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.camera import KINDS, camera_errors, corrected
 from soup_nlp.geometry import rotation
 from soup_nlp.pipeline.run import run
-from soup_nlp.report.findings import certainty, hints
+from soup_nlp.report.findings import hints
+from soup_nlp.report.summary import certainty
 from soup_nlp.start.epipolar import Matches
 
 FOCAL = 400.0

@@ -13,10 +13,10 @@ from soup_nlp.report.findings import (
     DETERMINED,
     GUESSES,
     ORIGINS,
-    certainty,
     certainty_lines,
     guess_reason,
 )
+from soup_nlp.report.summary import certainty
 from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.start.pace import displacement
 

@@ -17,11 +17,12 @@ from soup_nlp.cli.main import main
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report import page as page_module
-from soup_nlp.report.findings import limits, summary
+from soup_nlp.report.findings import limits
 from soup_nlp.report.folder import write_folder
 from soup_nlp.report.page import MODES, make_scene, page, surface_cells
 from soup_nlp.report.pictures import _enlarged, pictures
 from soup_nlp.report.result import result_of
+from soup_nlp.report.summary import summary
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ import pytest
 import trimesh
 from helpers_chromium import Chromium, file_address, find_chromium
 
-from soup_nlp.report.findings import summary
 from soup_nlp.report.page import MODES, page
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import result_of
+from soup_nlp.report.summary import summary
 
 CHROMIUM = find_chromium()
 pytestmark = [

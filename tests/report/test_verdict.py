@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.report import findings
-from soup_nlp.report.findings import certainty
+from soup_nlp.report.summary import certainty
 from soup_nlp.report.verdict import _energies, exit_code, facts
 
 

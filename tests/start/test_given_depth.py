@@ -22,7 +22,7 @@ from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.reweighting import with_prior
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.report.findings import certainty, summary
+from soup_nlp.report.summary import certainty, summary
 from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
 from soup_nlp.start.prior_evidence import CONFIRMED, follows_edges, judged
