@@ -186,6 +186,7 @@ def calibrated(
 
     Args:
         spread: Standard deviation of log depth by the marginals.
+        noise: Noise of the flow, pixels.
         misfit: Misfit of the superpixel, pixels; where it is larger than the noise, the geometric
             mean of both replaces the noise.
         prior: Standard deviation without the flow; its information is added.

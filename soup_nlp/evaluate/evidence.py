@@ -19,13 +19,13 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.start.bending import PLAIN_TURN, fit_robustly, turned
+from soup_nlp.start.bending import LEAST_GAP, PLAIN_TURN, fit_robustly, turned
 from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.settle import RELIEF
 
-LEAST_GAP_PX, LEAST_GAP = 0.5, 3.0
+LEAST_GAP_PX = 0.5
 """Least gain of depth over a turn alone or a constant depth in explaining the flow of a component,
-in pixels and in units of the flow's noise; below either, depth is a guess."""
+in pixels; below it, or below `LEAST_GAP` noises of the flow, depth is a guess."""
 OPEN = 0.5
 """Systematic error of the flow that leaves motions undetermined, in units of its noise."""
 CLIP_PX = 3.0

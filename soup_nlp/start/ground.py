@@ -153,10 +153,10 @@ class Region(NamedTuple):
 
     Attributes:
         members: (N,) True in the region.
-        ground: Log ratio of the depth of the plane of the ground, along the lower border, to its
-            own.
-        step: The same of the superpixels on the ground there.
-        behind: Share of its outline behind which the depth is larger by `STEP`.
+        ground: Log ratio of the depth of the plane of the ground to that of the region, along the
+            lower border.
+        step: The same ratio with the depth of the superpixels on the ground there.
+        behind: Share of the outline across which the depth grows by more than `STEP`.
     """
 
     members: Mask
@@ -173,7 +173,9 @@ def regions(
     component: Int,
     ratios: tuple[float, float],
 ) -> list[Region]:
-    """Regions of at least `FEWEST` superpixels off the ground below most of which it is visible.
+    """Regions off the ground, with the ground visible along most of their lower borders.
+
+    Regions of fewer than `FEWEST` superpixels are left out.
 
     Args:
         soup: Start, its components scaled.
@@ -226,14 +228,7 @@ def floating(
     """Masks (N,) of the regions that float above the ground, and their depth ratios to it.
 
     A region floats if it is in front of most of its surroundings, and the ground along its lower
-    border is clearly farther.
-
-    Args:
-        soup: Start, its components scaled.
-        seg: Superpixels and graphs.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        floor: (N,) inverse depth of the ground (`ground`).
-        component: (N,) group that moves as one.
+    border is clearly farther. The arguments are those of `regions`.
     """
     return [
         (r.members, float(np.exp(r.ground)))
@@ -251,9 +246,9 @@ def off_ground(
     """(N,) log ratio of the depth of the ground below a region to its own, 0 where none is known.
 
     The camera's motion explains what moves along the epipolar lines at a wrong depth. Where the
-    ground is visible along the lower border of a region, its depth there tells. The ground is that
-    of the component with the largest area on one. A region of more than `SCENE` of the image is
-    left out: it may be a table, which does not stand on the floor below its edge.
+    ground is visible along the lower border of a region, its depth there shows that. The ground is
+    that of the component with the largest area on a level plane. A region of more than `SCENE` of
+    the image is left out: it may be a table, which does not stand on the floor below its edge.
 
     Args:
         soup: Start.

@@ -179,6 +179,8 @@ def _commit(stage: Path, target: Path, whole: bool, subject: str) -> None:
     """Mark a temporary folder as complete and move its files to their places."""
     new, before = {name: digest_of(stage / name) for name in files_in(stage)}, mark_of(target)
     old = {k: v for k, v in before.files.items() if _state(target, k) == "made"}
+    for name in old.keys() & new.keys():
+        shutil.copymode(target / name, stage / name)
     files = new if whole else old | new
     of = {"of": subject or before.subject} if subject or before.subject else {}
     mark = json.dumps({**of, "files": dict(sorted(files.items()))}, indent=1)

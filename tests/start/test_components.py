@@ -275,15 +275,19 @@ def test_pieces_of_a_cut_off_object_come_nearer_together():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "seed", "count", "most"),
-    # the car of the street remains too far, see docs/results.md, Limits
-    [("room", 3, 200, 0.5), ("street", 0, 300, 0.9)],
+    ("scene", "seed", "count"),
+    [
+        ("room", 3, 200),
+        pytest.param(
+            "street",
+            0,
+            300,
+            marks=pytest.mark.xfail(strict=True, reason="0.83: see docs/results.md, Limits"),
+        ),
+    ],
 )
-def test_components_cut_off_by_the_image_come_nearer(scene, seed, count, most, monkeypatch):
-    """Rendered pairs whose lower part is cropped: contact alone puts cut-off components too far.
-
-    At most this share of their error remains.
-    """
+def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, monkeypatch):
+    """Rendered pairs whose lower part is cropped: contact alone puts cut-off components too far."""
     what = {"kind": "scene", "scene": scene, "seed": seed, "width": 512, "height": 218}
     problem = make_problem({"input": what, "segmentation": {"superpixels": count}})
     pair = problem.load_pair()
@@ -297,7 +301,7 @@ def test_components_cut_off_by_the_image_come_nearer(scene, seed, count, most, m
         data = case.segmentation, case.pair.flow, pair.K_ref, pair.K_next
         contact = cut_errors(case, propose(FlowFit.of(*data, options)).soup)
     moved = contact != shipped
-    assert shipped[moved].mean() < most * contact[moved].mean()
+    assert shipped[moved].mean() < 0.7 * contact[moved].mean()
 
 
 def cut_errors(case, soup):

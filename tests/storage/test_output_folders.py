@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -227,3 +228,13 @@ def test_files_of_the_user_are_refused_before_anything_is_computed(command, name
     assert "that this program did not make" in error
     assert f"found: {name}" in error
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_permissions_are_those_of_the_old_files(tmp_path):
+    target = tmp_path / "out"
+    target.mkdir(0o750)
+    write(target, a="1")
+    (target / "a").chmod(0o604)
+    write(target, a="2")
+    assert stat.S_IMODE((target / "a").stat().st_mode) == 0o604
+    assert stat.S_IMODE(target.stat().st_mode) == 0o750
