@@ -14,21 +14,14 @@ from scipy.stats import linregress
 
 from soup_nlp.bench.accuracy import scores
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.reference_solver import levenberg_marquardt
 from soup_nlp.bench.study import Cell, Item, main_metric, markdown, page_text, provenance, titled
 from soup_nlp.bench.suites import MOTORCYCLE, Options, list_suite
-from soup_nlp.evaluate.scoring import score_depths
-from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.folder import prepare_folder, write_folder
-from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution
 from soup_nlp.storage.rows import Row, peak_bytes
 from soup_nlp.storage.system import scratch
 
-REFERENCE_ITERATIONS = 100
-"""Limit of the steps of Levenberg-Marquardt for every smoothing width."""
 OUTSIDE = ("flow", "segmentation", "start", "evaluation", "output")
 """All stages but the NLP and the loading or rendering of the frames."""
 PHASES = ("load", *OUTSIDE[:3], "build", "functions", "linear algebra", *OUTSIDE[3:])
@@ -41,13 +34,8 @@ COLUMNS = {
     "each": ("its by stage", ""),
     "energy_start.total": ("E start", ".2f"),
     "energy.total": ("E", ".3f"),
-    "reference.energy.total": ("E LM", ".3f"),
-    "energy_to_reference": ("E / LM", ".4f"),
-    "time_to_reference": ("CPU / LM", ".2f"),
-    "reference.iterations": ("LM its", ".0f"),
     "start": ("MRE start", ".4f"),
     "mre": ("MRE", ".4f"),
-    "reference.mre": ("MRE LM", ".4f"),
     "residuals.dual_infeasibility": ("dual inf.", ".1e"),
     "residuals.nlp_infeasibility": ("constraints", ".1e"),
     "sizes.hessian_nonzeros": ("nnz H", ".0f"),
@@ -65,12 +53,10 @@ COSTS = {
 }
 """Costs whose growth with N is fitted."""
 NOTE = (
-    "CPU s and wall s: the whole NLP. LM: Levenberg-Marquardt on the manifold with reweighting,"
-    " from the same start on the same smoothing widths, in the same process. E: exact energy. MRE"
-    " after median scale, no cap. dual inf., constraints: recomputed at Ipopt's answer. GB: peak of"
-    " the process before LM runs. Outside: flow, segmentation, start, evaluation, output"
-    " with every picture, point cloud and HDF5. Wall times of a shared machine vary with its load;"
-    " CPU times less so. One thread."
+    "CPU s and wall s: the whole NLP. E: exact energy. MRE after median scale, no cap. dual inf.,"
+    " constraints: recomputed at Ipopt's answer. GB: peak of the process. Outside: flow,"
+    " segmentation, start, evaluation, output with every picture, point cloud and HDF5. Wall times"
+    " of a shared machine vary with its load; CPU times less so. One thread."
 )
 
 
@@ -123,8 +109,7 @@ def measure_speed(cell: Cell) -> Row:
 
     Returns:
         Entries of `accuracy.scores`, whose "stages" have "output" and the parts of "nlp" too, "cpu"
-        seconds by stage, "peak_bytes" before the reference solver runs, and that solver's
-        "reference"; further numbers by the names of the solution.
+        seconds by stage, and "peak_bytes"; further numbers by the names of the solution.
 
     Raises:
         SoupError: the input cannot be used.
@@ -155,7 +140,6 @@ def measure_speed(cell: Cell) -> Row:
         "energy_start": dict(solution.energy_start),
         "residuals": dict(solution.residuals),
         "peak_bytes": peak,
-        "reference": _reference(result),
     }
 
 
@@ -170,30 +154,6 @@ def _parts(wall: float, solution: Solution) -> dict[str, float]:
     }
 
 
-def schedule(options: SolverOptions) -> tuple[float, ...]:
-    """Smoothing widths of the reference solver: those of the presolve and of Ipopt."""
-    widths = tuple(options.presolve_eps) if options.presolve else ()
-    return widths if widths and widths[-1] <= options.eps else (*widths, options.eps)
-
-
-def _reference(result: Run) -> Row:
-    """Result of Levenberg-Marquardt from the same start on the same energy."""
-    pair, options = result.pair, result.options
-    reference = levenberg_marquardt(
-        result.start.soup,
-        result.data,
-        result.weights,
-        result.formulation(),
-        eps=schedule(options),
-        iterations=REFERENCE_ITERATIONS,
-        seconds=options.max_seconds,
-    )
-    dense = reconstruct(reference.soup, result.segmentation.labels, pair.K_ref, pair.K_next)
-    scored = score_depths(pair.truth, {"lm": dense.depth_ref})
-    numbers = {k: getattr(reference, k) for k in ("status", "energy", "iterations", "cpu_seconds")}
-    return numbers | {"mre": scored["lm"].mre if scored else None}
-
-
 # --- the page ---------------------------------------------------------------------------------
 
 
@@ -205,8 +165,6 @@ def with_costs(frame: pd.DataFrame) -> pd.DataFrame:
     out["outside"] = out.reindex(columns=[f"cpu.{s}" for s in OUTSIDE]).astype(float).sum(axis=1)
     out["start"], out["GB"] = main_metric(out, "start"), out["peak_bytes"].astype(float) / 2**30
     out["cpu an iteration"] = out["cpu.nlp"] / out["iterations"].clip(lower=1)
-    out["energy_to_reference"] = out["energy.total"] / out["reference.energy.total"]
-    out["time_to_reference"] = out["cpu.nlp"] / out["reference.cpu_seconds"]
     return out
 
 
