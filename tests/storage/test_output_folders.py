@@ -197,7 +197,7 @@ def test_the_folder_itself_is_kept(name, tmp_path, monkeypatch):
     assert (tmp_path / "link").is_symlink()
 
 
-def test_the_log_of_a_failure_overwrites_one_of_the_user_only_where_allowed(tmp_path):
+def test_a_failure_log_overwrites_only_where_allowed(tmp_path):
     log, missing = tmp_path / "failed.log", tmp_path / "ipopt.log"
     log.write_text("mine")
     with pytest.raises(DataError, match="would be overwritten"):
