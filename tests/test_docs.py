@@ -436,5 +436,5 @@ def test_a_file_becomes_depth_by_another_solver(monkeypatch):
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.what)
-def test_a_mutant_of_a_constraint_changes_one_place_of_the_package(mutant):
+def test_a_mutant_of_a_constraint_changes_one_place(mutant):
     assert (ROOT / "soup_nlp" / mutant.module).read_text().count(mutant.old) == 1

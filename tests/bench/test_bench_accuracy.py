@@ -72,7 +72,7 @@ def test_a_row_has_every_number(orbit_row):
     assert row["sparsification"]["curve"][0][0] == 1.0
 
 
-def test_a_pair_that_cannot_be_measured_is_a_row_with_the_reason(tmp_path):
+def test_a_pair_that_cannot_be_measured_has_a_reason(tmp_path):
     row = row_of(item(), (*QUICK, "segmentation.neighbours=99"))
     assert not row["ok"]
     assert "K-NN" in row["error"]
@@ -93,7 +93,7 @@ def test_a_pair_that_cannot_be_measured_is_a_row_with_the_reason(tmp_path):
         assert words in row["error"]
 
 
-def test_a_row_is_identified_by_settings_and_input_without_its_folder(tmp_path):
+def test_a_row_is_identified_by_settings_and_input(tmp_path):
     def identity(root: str, *overrides: str) -> Row:
         raw = {"kind": "sintel", "root": root, "scene": "alley_1", "frame": 2}
         return Cell(Item("sintel", "alley_1", "alley_1-0002", "dis", raw), overrides).identity()

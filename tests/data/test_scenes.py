@@ -148,7 +148,7 @@ def test_still_background_does_not_move():
     assert np.mean(change[same] == 0) > 0.95  # the others are edge pixels of the moving body
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_each_kind_has_its_parallax_and_moving_bodies(name, seed):
     p = pair(name, seed, 160, 120)
@@ -178,7 +178,7 @@ def test_each_kind_has_its_parallax_and_moving_bodies(name, seed):
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_seeds_differ_in_depth_and_camera_motion(name):
-    for a, b in combinations([pair(name, seed, 160, 120).truth for seed in range(4)], 2):
+    for a, b in combinations([pair(name, seed, 160, 120).truth for seed in range(2)], 2):
         assert abs(np.log(a.depth_ref / b.depth_ref)).mean() > 0.02
         assert name == "standing" or abs(a.motions[0] - b.motions[0]).max() > 1e-3
 

@@ -86,6 +86,7 @@ def test_a_wrong_principal_point_makes_depth_unsure(orbit):
     K = orbit.K_ref.copy()
     K[0, 2] += 32
     exact, told = solved(replace(orbit, flow=None))
+    assert exact.good
     assert exact.confidence.evidence.camera is None
     assert "intrinsics" not in told
     wrong, told = solved(replace(orbit, flow=None, K_ref=K, K_next=K))

@@ -281,7 +281,7 @@ def test_the_background_of_a_camera_at_rest_is_a_guess(small_room):
     assert sure_of(small_room).guessed < 0.2
 
 
-def test_a_focal_length_that_was_guessed_or_given_wrong_makes_depth_unsure():
+def test_a_guessed_or_wrong_focal_length_makes_depth_unsure():
     scene = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
     raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 100}}
     problem = make_problem(raw)
@@ -381,7 +381,7 @@ def test_a_scale_is_open_where_contact_implies_too_fast_motion(small_room):
     np.testing.assert_array_equal(scale(5.0)[~moving], usual[~moving])
 
 
-def test_what_does_not_stand_on_the_ground_below_it_is_unsure_by_the_ratio(small_room):
+def test_what_floats_above_the_ground_is_unsure_by_the_ratio(small_room):
     inside = small_room.segmentation.labels == 25
     usual = sure_of(small_room).sigma
     assert usual[inside].mean() < 0.1
@@ -398,7 +398,7 @@ def test_what_does_not_stand_on_the_ground_below_it_is_unsure_by_the_ratio(small
         np.testing.assert_array_equal(floats[~inside], usual[~inside])
 
 
-def test_a_camera_at_rest_leaves_a_guess_that_keeps_its_order(small_room):
+def test_a_camera_at_rest_leaves_a_guess_in_its_order(small_room):
     rests = replace(small_room, start=replace(small_room.start, at_rest=True))
     moving, resting = sure_of(small_room).sigma, sure_of(rests).sigma
     least = GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)

@@ -51,7 +51,7 @@ def test_fine_texture_does_not_cost_superpixels(size, count):
     assert np.median(np.bincount(labels.ravel())) > 0.3 * labels.size / count
 
 
-def test_an_image_of_one_colour_is_cut_into_cells_of_equal_size():
+def test_an_image_of_one_colour_has_equal_cells():
     grey = np.full((48, 64, 3), 90, np.uint8)
     labels = segment(grey, 12, "grid")
     np.testing.assert_array_equal(segment(grey, 12, "slic"), labels)

@@ -351,7 +351,7 @@ def test_ipopt_gets_every_kind_of_bound(side):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "gauge"),
-    [("orbit", "unit-offset"), ("room", "unit-offset"), ("street", "unit-translation")],
+    [("room", "unit-offset"), ("street", "unit-translation")],
 )
 def test_the_raw_answer_of_a_default_solve_keeps_every_constraint(scene, gauge):
     small = ["input.width=96", "input.height=72", "segmentation.superpixels=30"]

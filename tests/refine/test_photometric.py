@@ -214,7 +214,7 @@ def test_images_repair_what_the_flow_says_wrongly(scene):
     assert np.abs(scale * alone.soup.depth_at(data.anchor_ray)[patch] / FAR - 1).min() > 0.3
 
 
-def test_objective_is_e_without_images_and_e_plus_e_photo_where_they_agree(scene):
+def test_the_objective_has_e_photo_only_with_images(scene):
     data, w = scene.data(scene.flow), Weights(proj=2.0)
     assert objective(scene.truth, data, w) == oracle.energy(scene.truth, data, w)
     photo = replace(scene.look(scene.truth), contradicted=np.zeros(scene.count, bool))
@@ -226,7 +226,7 @@ def test_objective_is_e_without_images_and_e_plus_e_photo_where_they_agree(scene
     )
 
 
-def test_e_proj_is_weaker_and_truncated_only_where_the_images_contradict(scene):
+def test_e_proj_is_weaker_only_where_the_images_contradict(scene):
     data, w = scene.data(scene.flow), Weights(proj=2.0)
     contradicted = np.arange(scene.count) % 3 == 0
     photo = replace(scene.look(scene.truth), contradicted=contradicted)

@@ -136,7 +136,7 @@ def test_nearer_neighbours_are_taken_over_more_often():
     assert count[0] > 1.5 * count[-1]
 
 
-def test_planes_of_neighbours_keep_the_motion_or_the_image_of_the_anchor():
+def test_planes_of_neighbours_keep_motion_or_anchor():
     tiny = Tiny("pixels")
     p = proposer(tiny.data).propose(tiny.soup, "neighbour_plane", 4)
     targets = [anchor_targets(q, tiny.data) for q in (Particles.of(tiny.soup), p)]

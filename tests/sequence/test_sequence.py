@@ -232,9 +232,9 @@ def test_similarities_are_found_exactly():
     assert not np.allclose(aligned(points * [1, 1, -1], target), target)
 
 
-@pytest.mark.parametrize("order", [[0, 0, 1, 1, 1, 2], [0, 1, 2, 2], [0, 0]])
+@pytest.mark.parametrize("order", [[0, 0, 1, 1, 1, 2, 2], [0, 0]])
 def test_duplicate_frames_are_bridged(order, tmp_path):
-    """A recording that starts, pauses or ends at rest."""
+    """A recording that starts, pauses and ends at rest, or rests all the time."""
     for k, frame in enumerate(order):
         write_png(tmp_path / f"{k}.png", render_scene("orbit", 0, 160, 108, frame).image_ref)
     np.savetxt(tmp_path / "K.txt", render_scene("orbit", 0, 160, 108).K_ref)
@@ -245,7 +245,7 @@ def test_duplicate_frames_are_bridged(order, tmp_path):
     for k in range(len(order) - 2):
         same = len({*order[k : k + 3]}) < 3
         assert links[k, k + 1]["flagged"] == same
-    if len(order) == 6:
+    if len(order) > 2:
         assert links[1, 4]["bridge"]
         assert not links[1, 4]["flagged"]
 
@@ -336,12 +336,12 @@ def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch)
 
 
 @pytest.mark.filterwarnings("default:.*no intrinsics")
-@pytest.mark.parametrize("workers", [1, 2])
-def test_warnings_of_pairs_are_printed_as_one_line(workers, tmp_path, capfd):
+def test_warnings_of_pairs_are_printed_as_one_line(tmp_path, capfd):
+    """Also those of worker processes."""
     for k in range(2):
         write_png(tmp_path / f"{k}.png", render_scene("orbit", 0, 160, 108, k).image_ref)
     fast = ["--superpixels", "20", "--neighbours", "5", "--set", "refine.enabled=false"]
-    call = ["chain", str(tmp_path), "-o", str(tmp_path / "out"), "--workers", str(workers), *fast]
+    call = ["chain", str(tmp_path), "-o", str(tmp_path / "out"), "--workers", "2", *fast]
     assert main(call) == 0
     lines = capfd.readouterr().err.splitlines()
     assert [line[:8] for line in lines if "no intrinsics" in line] == ["warning:"]

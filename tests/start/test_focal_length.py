@@ -35,7 +35,7 @@ def test_a_turn_with_parallax_determines_the_focal_length(wrong):
     assert sigma < 0.15
 
 
-def test_a_shift_without_a_turn_leaves_the_focal_length_as_it_is():
+def test_a_shift_without_a_turn_keeps_the_focal_length():
     """A longer lens and as much deeper a scene have the same flow."""
     factor, sigma = focal_length(correspondences((0, 0, 0), (0.4, 0, 0), 1.25), GUESS_SIGMA)
     assert factor == pytest.approx(1.0, abs=0.05)

@@ -126,7 +126,7 @@ def test_a_floating_region_is_found_with_its_distance(car):
 
 @pytest.mark.parametrize("car", [0.8, 1.0, 2.0])
 @pytest.mark.parametrize("road", [0, 1])
-def test_a_region_that_does_not_stand_on_the_ground_below_it_is_told_by_how_much(car, road):
+def test_the_distance_of_a_region_from_the_ground_is_told(car, road):
     """Whether it is too near or too far, and whichever component the ground is."""
     seg, K, _, Z = street(car)
     row, column = np.divmod(np.arange(len(Z)), 30)
@@ -140,7 +140,7 @@ def test_a_region_that_does_not_stand_on_the_ground_below_it_is_told_by_how_much
     assert (off_ground(facing(Z), seg, K, component, reliable & body, 0) == 0).all()
 
 
-def test_superpixels_that_join_a_region_to_the_ground_below_do_not_tell_its_depth():
+def test_superpixels_that_join_region_and_ground_do_not_count():
     """They contain pixels of both, and their planes face down from one to the other."""
     seg, K, _, Z = street(0.8)
     row, column = np.divmod(np.arange(len(Z)), 30)
@@ -157,7 +157,7 @@ def test_superpixels_that_join_a_region_to_the_ground_below_do_not_tell_its_dept
     np.testing.assert_allclose(off[body], -np.log(0.8), atol=0.03)
 
 
-def test_a_region_of_a_quarter_of_the_image_may_be_a_table():
+def test_a_quarter_of_the_image_may_be_a_table():
     seg, K, ray, Z = street(1.0)
     row, column = np.divmod(np.arange(len(Z)), 30)
     table = (row >= 4) & (row <= 16) & (column >= 5) & (column <= 24)

@@ -203,19 +203,10 @@ def test_the_nlp_keeps_the_order_and_marks_it_a_guess(covers):
     assert (done.reconstruction.sigma_ref > MOST_SIGMA).all()
 
 
-def test_without_its_factor_nothing_is_placed_and_no_term_is_left():
+def test_without_its_weight_nothing_is_placed_in_order():
     problem, pair = made(True, "energy.weights.order=0")
     case = prepare(problem, pair=pair)
     assert case.start.order is None
     assert not case.data.order_weight.any()
     answer = solve_soup(case.start.soup, case.data, case.weights, case.formulation(), case.options)
     assert "order" not in answer.energy
-
-
-def test_the_preset_of_the_paper_has_no_order():
-    problem = make_problem(
-        {"name": "p", "preset": "paper", "input": {"kind": "scene", "scene": "swing"}},
-        [],
-        where="t",
-    )
-    assert problem.energy.weights.order == 0

@@ -61,8 +61,14 @@ STILL = {
 }
 
 
+@pytest.fixture(scope="module")
+def clean(seg):
+    """The start of the scene alone."""
+    return start_of(seg, scene_flow())
+
+
 @pytest.mark.parametrize("name", STILL)
-def test_a_region_that_stands_still_before_a_moving_camera_is_fixed(seg, name):
+def test_a_still_region_before_a_moving_camera_is_fixed(seg, clean, name):
     where, turn = STILL[name]
     flow, mask = scene_flow(turn), np.zeros((H, W), bool)
     mask[where] = True
@@ -76,7 +82,6 @@ def test_a_region_that_stands_still_before_a_moving_camera_is_fixed(seg, name):
     assert not set(start.component[at]) & set(start.component[~at])
     if turn.any():
         # other superpixels are as without the region
-        clean = start_of(seg, scene_flow())
         ray = camera.rays(K, seg.anchors)
         log = np.log(start.soup.depth_at(ray) / clean.soup.depth_at(ray))[~at & ~clean.borrowed]
         assert np.median(np.abs(log - np.median(log))) < 0.02
@@ -95,7 +100,7 @@ def test_what_moves_or_is_far_is_not_fixed(seg, what):
     assert not (start_of(seg, flow).tie == FIXED).any()
 
 
-def test_the_part_between_still_parts_and_the_border_belongs_to_them(seg):
+def test_still_parts_reach_to_the_border(seg):
     x, y = seg.anchors.T
     core = (y > 90) & ((x < 40) | (x > 110)) & (x > 15) & (x < 145)
     inside = towards_border(core, seg)

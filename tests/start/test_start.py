@@ -135,6 +135,7 @@ def test_two_motions_are_told_apart():
         assert np.median(e.normal[mine]) < normal
         ratio = e.depth_ratio[mine] / np.median(e.depth_ratio[mine])
         assert np.median(np.abs(ratio - 1)) < depth
+    assert str(start).startswith(f"Start({len(seg)} superpixels, ")
     # the motions must explain the flow
     assert np.median(start.error[pure]) < 0.1
     assert np.quantile(start.error[pure], 0.95) < 0.5
@@ -308,10 +309,3 @@ def test_too_few_usable_pixels_are_an_error(corner, usable):
         propose(FlowFit.of(seg, Flow(pair.flow.uv, confidence, "thin"), K, K))
     assert "thin" in str(caught.value)
     assert str(usable) in str(caught.value)
-
-
-def test_the_start_prints_itself(corner):
-    pair, seg, _ = corner
-    text = str(propose(FlowFit.of(seg, pair.flow, K, K)))
-    assert text.startswith(f"Start({len(seg)} superpixels, ")
-    assert "borrowed" in text

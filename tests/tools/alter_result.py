@@ -65,13 +65,16 @@ def alter_byte(path: Path, rng: random.Random) -> str:
 
 
 def alter_entry(path: Path, rng: random.Random) -> str:
-    """One value of a JSON file."""
+    """One value of a JSON file, changed or, one time in four, removed."""
     tree = json.loads(path.read_text())
     *above, last = rng.choice(leaves(tree))
     here = tree
     for key in above:
         here = here[key]
-    here[last] = other(here[last])
+    if isinstance(here, dict) and rng.random() < 0.25:
+        del here[last]
+    else:
+        here[last] = other(here[last])
     path.write_text(json.dumps(tree, indent=2))
     return " ".join(map(str, (*above, last)))
 
