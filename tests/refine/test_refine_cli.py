@@ -112,6 +112,12 @@ def test_without_the_nlp_the_start_is_refined(tmp_path, capsys):
     assert again.refine.from_start
 
 
+@pytest.mark.xfail(strict=True, reason="0.995: the start with settled motions is lower")
+def test_the_refinement_lowers_the_start_by_a_hundredth(tmp_path):
+    r = solve(tmp_path, "--no-nlp")[1]["refinement"]
+    assert r["end"]["total"] < 0.99 * r["begin"]["total"]
+
+
 def test_both_halves_cannot_be_left_out(tmp_path, capsys):
     assert main(["solve", "orbit", "-o", str(tmp_path), "--no-nlp", "--no-refine"]) == 2
     assert "nothing is left to do" in capsys.readouterr().err

@@ -274,10 +274,22 @@ def test_pieces_of_a_cut_off_object_come_nearer_together():
 
 
 @pytest.mark.slow
-def test_components_cut_off_by_the_image_are_placed_well(monkeypatch):
-    """The lower part of a room is cropped: contact alone puts cut-off components too far."""
-    what = {"kind": "scene", "scene": "room", "seed": 3, "width": 512, "height": 218}
-    problem = make_problem({"input": what, "segmentation": {"superpixels": 200}})
+@pytest.mark.parametrize(
+    ("scene", "seed", "count"),
+    [
+        ("room", 3, 200),
+        pytest.param(
+            "street",
+            0,
+            300,
+            marks=pytest.mark.xfail(strict=True, reason="0.83: see docs/results.md, Limits"),
+        ),
+    ],
+)
+def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, monkeypatch):
+    """Rendered pairs whose lower part is cropped: contact alone puts cut-off components too far."""
+    what = {"kind": "scene", "scene": scene, "seed": seed, "width": 512, "height": 218}
+    problem = make_problem({"input": what, "segmentation": {"superpixels": count}})
     pair = problem.load_pair()
     pair = replace(cropped(pair, 0, 0, 0, int(0.3 * pair.image_ref.shape[0])), flow=None)
     case = prepare(problem, pair=pair)
