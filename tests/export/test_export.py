@@ -36,7 +36,7 @@ pytestmark = pytest.mark.slow
 ENDS = {"variables": ".col", "rows": ".row"}
 TINY = sets(
     "input.width=96 input.height=64 flow.source=truth segmentation.neighbours=4"
-    " energy.pixel_samples=4"
+    " energy.pixel_samples=4 output.page=false"
 )
 
 

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 SMALL = (
     "input.width=160 input.height=96 segmentation.superpixels=30 segmentation.neighbours=6"
-    " flow.source=truth refine.rounds=3 refine.particles=20 refine.stagnation=0"
+    " flow.source=truth refine.rounds=3 refine.particles=20 refine.stagnation=0 output.page=false"
 )
 
 

@@ -354,7 +354,7 @@ def test_frames_without_a_camera_get_one_focal_length(tmp_path):
     for k, name in enumerate(names):
         pair = render_scene("room", 1, 320, 216, k)
         write_png(tmp_path / name, pair.image_ref)
-    fast = ["segmentation.superpixels=100"]
+    fast = ["segmentation.superpixels=60"]
     camera = one_camera(Frames(tuple(names)), fast).camera
     focal = 160 / np.tan(np.radians(camera["fov"] / 2))
     assert focal == pytest.approx(pair.K_ref[0, 0], rel=0.1)  # the guess is 1.5 times as long
