@@ -33,8 +33,12 @@ def numbered(label: Int) -> Int:
     return np.unique(label, return_inverse=True)[1].ravel()
 
 
+SCENE = 0
+"""Index of the component that is the static scene: depths and motions refer to it."""
+
+
 def largest(label: Int) -> int:
-    """The most frequent index of (N,) labels; of components the background."""
+    """The most frequent index of (N,) labels."""
     return int(np.argmax(np.bincount(label)))
 
 
@@ -84,7 +88,7 @@ TIES = (
     "occlusion",
     "too fast",
 )
-"""What gives a component its scale. reference: it is the largest component and defines the scale.
+"""What gives a component its scale. reference: it is the scene and defines the scale.
 contact below: it stands on its lower neighbours. outline: it touches its neighbours. cut off below:
 the lower image border hides its support. nothing: it has no neighbour with a scale. ground:
 it was lifted to the ground. fixed in the image: it stands still there, though the camera moves,
@@ -163,9 +167,8 @@ def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[
     seg, upright = flow.seg, flow.options.upright
     count = int(label.max()) + 1
     log_scale = np.zeros(count)
-    scene = largest(label)
     tie = np.full(count, TIES.index("nothing"))
-    tie[scene] = TIES.index("reference")
+    tie[SCENE] = TIES.index("reference")
     if count == 1 or not len(seg.pairs):
         return np.ones(len(soup)), tie[label]
     zi, zk = depth_from_inside(soup, label, seg, flow.K_ref)
@@ -180,7 +183,7 @@ def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[
     ratio, below = ratio[keep], around.below[keep] & upright
     support = np.bincount(a[below], weight[below], minlength=count)
     placed = np.zeros(count, bool)
-    placed[scene] = True
+    placed[SCENE] = True
     while not placed.all():
         touch = ~placed[a] & placed[b]
         if not touch.any():

@@ -18,7 +18,7 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.choice import PIECE_SIZE
-from soup_nlp.start.components import FIXED, TIES, largest
+from soup_nlp.start.components import FIXED, SCENE, TIES
 from soup_nlp.start.prior_evidence import FEWEST, LEAST_SIGMA, Evidence, Seen, without_gaps
 from soup_nlp.start.propose import Start
 from soup_nlp.start.views import FlowFit
@@ -61,8 +61,8 @@ class Given:
 def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tuple[Start, Given]:
     """The start with depths and scales of the pair's prior where the flow leaves them open.
 
-    Every rigid component, the largest one first, takes its shape and motion from flow and prior
-    and its scale from the prior. Depths of the largest one that the flow determines correct the
+    Every rigid component, the scene first, takes its shape and motion from flow and prior and its
+    scale from the prior. Depths of the scene that the flow determines correct the
     prior near them and tell its error. All superpixels whose depth the flow does not determine,
     and those that bend, take depth and slope of the prior.
 
@@ -77,23 +77,22 @@ def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tup
     prior, sigma = evidence.log_depth(value), np.full(n, evidence.sigma)
     if not evidence.used:
         return start, Given(evidence, prior, sigma, np.zeros(n), sigma, np.zeros(n, bool))
-    seen, reference = Seen(start, flow), largest(start.component)
-    main = start.component == reference
+    seen, main = Seen(start, flow), start.component == SCENE
     soup, before = start.soup, np.log(start.soup.depth_at(anchor))
     # components that are fixed in the image keep their depth relative to the scene
     fixed = start.tie == FIXED
     off, strong = np.zeros(n), fixed.copy()
     rigid = np.unique(start.component[~start.bends & ~fixed])
-    for c in sorted(rigid, key=lambda c: bool(c != reference)):
+    for c in sorted(rigid, key=lambda c: bool(c != SCENE)):
         mask = start.component == c
-        determined = evidence.determined if c == reference else seen.relief(c) > seen.tells
+        determined = evidence.determined if c == SCENE else seen.relief(c) > seen.tells
         soup, strong[mask] = _shaped(seen, soup, c, prior, evidence.sigma, determined)
         firm = mask & strong
         if not firm.any():
             continue
         gap = np.log(soup.depth_at(anchor)) - prior
         off[mask] = np.median(gap[firm])
-        if c == reference:
+        if c == SCENE:
             shift, sigma = _local(seg, firm & with_value, gap - off, evidence.sigma)
             prior = np.where(main, prior + shift, prior)
     off[fixed] = np.median((before - prior)[main])

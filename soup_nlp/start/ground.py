@@ -24,9 +24,9 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import (
     FIXED,
     GROUND,
+    SCENE,
     TIES,
     connected_pieces,
-    largest,
     numbered,
     outlines,
     quantile,
@@ -51,9 +51,12 @@ STEP, FLOATS = 0.15, 0.2
 the ground along its lower border."""
 FEWEST = 3
 """Least number of superpixels of a region that may be off the ground."""
-MOST_AREA, SCENE = 0.15, 0.25
-"""Largest share of the image of a region that floats, and of one whose contact with the ground
-tells its depth."""
+MOST_AREA = 0.25
+"""Largest share of the image of a region of the scene whose contact with the ground tells its
+depth: a larger one may be a table, which does not stand on the floor below its edge."""
+MOST_CLIMB = 0.1
+"""Largest share of its displacement that is across the ground, of what moves along it. Vehicles
+have up to 0.07, boxes that swing and limbs 0.22 to 0.44."""
 IN_FRONT, VISIBLE = 0.6, 0.6
 """Least share of its outline behind a region that floats, and of ground along a lower border."""
 FACES_DOWN = 0.7
@@ -108,19 +111,59 @@ def ground(mu: Float, ray: Float, weight: Float, reliable: Mask, seed: int) -> F
     return np.maximum(plane_mu, 0.0)
 
 
+def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Mask) -> Int:
+    """(N,) indices of the components (N,), that of the static scene first, see `SCENE`.
+
+    The scene is the largest component. In a traffic jam that may be a group of vehicles: if it
+    stands on a component with a level ground, directly or on others that do, that one is the scene.
+
+    Args:
+        flow: The flow of every superpixel.
+        soup: Planes, every motion in its own scale.
+        reliable: (N,) True where the depth is reliable.
+        label: (N,) index of the component.
+        fixed: (N,) True in components that are fixed in the image.
+    """
+    seg, o, scene = flow.seg, flow.options, int(np.argmax(np.bincount(label, ~fixed)))
+    if o.upright and o.ground:
+        image, below = label[seg.labels], [scene]
+        while (under := stands_on(image, below[-1])) not in (None, *below):
+            below.append(under)
+        own = reliable & ~fixed & (label == below[-1])
+        mu, area = 1 / soup.depth_at(flow.views.anchor), seg.sizes.astype(float)
+        if own.any() and ground(mu, flow.views.anchor, area, own, o.seed).any():
+            scene = below[-1]
+    return numbered(np.where(label == scene, -1, label))
+
+
+def stands_on(image: Int, component: int) -> int | None:
+    """The component below the lower end of another one on most of its width; None at the border.
+
+    Args:
+        image: (H, W) component of every pixel.
+        component: Index of the one that stands on it.
+    """
+    mine = image == component
+    seen, under = mine.any(axis=0), len(image) - np.argmax(mine[::-1], axis=0)
+    border = seen & (under == len(image))
+    columns = np.flatnonzero(seen & ~border)
+    count = np.bincount(image[under[columns], columns], minlength=1)
+    return None if border.sum() >= count.max() else int(np.argmax(count))
+
+
 def above_ground(
     soup: Soup, ray: Float, weight: Float, reliable: Mask, component: Int, floor: Float
 ) -> tuple[Soup, Mask]:
     """The soup with unreliable or independently moving parts lifted to the ground.
 
     A component with most of its area below the ground comes nearer as a whole, and its translation
-    becomes shorter. Single superpixels of the largest component keep the translation they share.
+    becomes shorter. Single superpixels of the scene keep the translation they share.
 
     Args:
         soup: Start, its components scaled.
         ray: (N, 3) rays of the anchors.
         weight: (N,) area of every superpixel.
-        reliable: (N,) True where the depth is reliable and belongs to the largest component.
+        reliable: (N,) True where the depth is reliable and belongs to the scene.
         component: (N,) group that moves as one.
         floor: (N,) inverse depth of the ground (`ground`).
 
@@ -128,7 +171,7 @@ def above_ground(
         The soup, and (N,) True in components that were lifted as a whole.
     """
     mu = 1 / soup.depth_at(ray)
-    scene = component == largest(component)
+    scene = component == SCENE
     lam, t = soup.lam.copy(), soup.t.copy()
     lifted = np.zeros(len(mu), bool)
 
@@ -157,12 +200,15 @@ class Region(NamedTuple):
             lower border.
         step: The same ratio with the depth of the superpixels on the ground there.
         behind: Share of the outline across which the depth grows by more than `STEP`.
+        climb: Share of its displacement in the scene that is across the ground, at the depth of the
+            ground.
     """
 
     members: Mask
     ground: float
     step: float
     behind: float
+    climb: float
 
 
 def regions(
@@ -202,6 +248,7 @@ def regions(
     gap = np.concatenate([step[across], -step[across]])
     level = np.tile(-np.log(np.maximum(middle @ plane, 1e-9))[across], 2)
     rise = level - np.log(depth[:, across]).ravel()
+    scene = int(np.argmax(component == SCENE))
     down = soup.n[:, 1] > FACES_DOWN
     fills = down[seg.pairs[across].T.ravel()]
     out = []
@@ -218,8 +265,18 @@ def regions(
         values = np.where(fills, own, rise), gap
         above, off = (quantile(v[on], around.weight[on], GROUND) for v in values)
         behind = around.contact[edge & (gap > STEP)].sum() / around.contact[edge].sum()
-        out.append(Region(mine, above, off, float(behind)))
+        point, t = (np.exp(above) * v[mine] for v in (soup.points(ray), soup.translation))
+        moved = np.einsum("nij,nj->ni", soup.R[mine], point) + t - soup.translation[scene]
+        way = np.median(moved @ soup.R[scene] - point, axis=0)
+        climb = abs(way @ plane) / max(np.linalg.norm(way) * np.linalg.norm(plane), 1e-12)
+        out.append(Region(mine, above, off, float(behind), float(climb)))
     return out
+
+
+def small_or_moves(region: Mask, seg: Segmentation, component: Int) -> bool:
+    """Whether a region (N,) has at most `MOST_AREA` of the image or is no part of the scene."""
+    share = seg.sizes[region].sum() / seg.sizes.sum()
+    return bool(share <= MOST_AREA or (component[region] != SCENE).all())
 
 
 def floating(
@@ -227,13 +284,15 @@ def floating(
 ) -> list[tuple[Mask, float]]:
     """Masks (N,) of the regions that float above the ground, and their depth ratios to it.
 
-    A region floats if it is in front of most of its surroundings, and the ground along its lower
-    border is clearly farther. The arguments are those of `regions`.
+    A region floats if it is in front of most of its surroundings, the ground along its lower border
+    is clearly farther, and it moves along the ground there: what hangs in the air does not. The
+    arguments are those of `regions`.
     """
     return [
         (r.members, float(np.exp(r.ground)))
         for r in regions(soup, seg, K_ref, floor, component, (1 - BELOW, RISES))
-        if seg.sizes[r.members].sum() <= MOST_AREA * seg.sizes.sum()
+        if small_or_moves(r.members, seg, component)
+        and r.climb < MOST_CLIMB
         and r.behind > IN_FRONT
         and r.ground > FLOATS
         and r.step > STEP
@@ -247,8 +306,7 @@ def off_ground(
 
     The camera's motion explains what moves along the epipolar lines at a wrong depth. Where the
     ground is visible along the lower border of a region, its depth there shows that. The ground is
-    that of the component with the largest area on a level plane. A region of more than `SCENE` of
-    the image is left out: it may be a table, which does not stand on the floor below its edge.
+    that of the component with the largest area on a level plane.
 
     Args:
         soup: Start.
@@ -269,7 +327,7 @@ def off_ground(
             floor, most = level, on
     out = np.zeros(len(mu))
     for r in regions(soup, seg, K_ref, floor, component, (np.exp(-STANDS), np.exp(STANDS))):
-        if area[r.members].sum() <= SCENE * area.sum():
+        if small_or_moves(r.members, seg, component):
             out[r.members] = r.ground
     return out
 
@@ -290,7 +348,7 @@ def on_ground(
         Soup, components, ties and (N,) inverse depth of the ground, see `ground`.
     """
     anchor, area = flow.views.anchor, flow.seg.sizes.astype(float)
-    reliable = reliable & (component == largest(component))
+    reliable = reliable & (component == SCENE)
     floor = ground(1 / soup.depth_at(anchor), anchor, area, reliable, flow.options.seed)
     soup, lifted = above_ground(soup, anchor, area, reliable, component, floor)
     tie = np.where(lifted & (tie != FIXED), TIES.index("ground"), tie)

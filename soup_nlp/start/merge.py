@@ -19,7 +19,7 @@ from soup_nlp.start.choice import (
     limited_noise,
     smooth_choice,
 )
-from soup_nlp.start.components import connected_labels, connected_pieces, largest
+from soup_nlp.start.components import SCENE, connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, estimate, fit_translation, refine_near
 from soup_nlp.start.views import FlowFit
 
@@ -129,17 +129,17 @@ def unmoved(flow: FlowFit, choice: Choice, component: Int) -> Mask:
     The motion of a piece with more than `SMALL` of all superpixels may be due to a systematic error
     of the flow if it lowers the mean error by less than the noise. A smaller piece may be a
     mixture: along a depth discontinuity the flow of a superpixel mixes those of both sides. It is a
-    mixture if its flow lies between the flows of adjacent superpixels of the largest component. If
+    mixture if its flow lies between the flows of adjacent superpixels of the scene. If
     its own motion explains its flow badly and hardly better than the main motion does, a flow near
     the adjacent flows is enough.
     """
-    main, noise = largest(component), limited_noise(choice.error)
+    noise = limited_noise(choice.error)
     error = flow.views.fit(choice.motions[:1]).penalised()[:, 0]
     gain, shift, usable = choice.gain(flow.views), flow.displacement, flow.views.usable
     i, k = flow.seg.pairs.T
     piece = connected_labels(component[i] == component[k], flow.seg)
     moving, mixed = choice.label > 0, np.zeros(len(piece), bool)
-    for p in np.unique(piece[(component != main) & usable]):
+    for p in np.unique(piece[(component != SCENE) & usable]):
         at = piece == p
         if at.mean() > SMALL:
             mixed |= at & (moving[at].any() and gain[at].mean() < noise)
@@ -147,7 +147,7 @@ def unmoved(flow: FlowFit, choice: Choice, component: Int) -> Mask:
         if usable[at].mean() <= 0.5:
             continue
         around = np.concatenate([k[at[i] & ~at[k]], i[at[k] & ~at[i]]])
-        around = around[usable[around] & (component[around] == main)]
+        around = around[usable[around] & (component[around] == SCENE)]
         if not len(around):
             continue
         middle, sides = np.median(shift[at], axis=0), shift[around]

@@ -24,7 +24,6 @@ from soup_nlp.start.components import (
     TIES,
     connected_labels,
     depth_from_inside,
-    largest,
     quantile,
 )
 from soup_nlp.start.merge import SMALL
@@ -214,9 +213,9 @@ def placed(
 ) -> Float:
     """(N,) factor by which the scale of every superpixel is multiplied to bring regions in order.
 
-    The largest region and those fixed in the image stay. The others are placed one after the
-    other, the one with the most votes against placed regions first. Where the median step of
-    log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
+    The largest region of the scene and those fixed in the image stay. The others are placed one
+    after the other, the one with the most votes against placed regions first. Where the median step
+    of log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
     that step is `IN_FRONT`. A region that stands on one it covers stays if the step across its
     upper outline is `STANDING`. A region without an order moves with the one that it touches most.
 
@@ -231,7 +230,8 @@ def placed(
     region = np.unique(region, return_inverse=True)[1].ravel()
     count = int(region.max()) + 1
     shift, done = np.zeros(count), np.zeros(count, bool)
-    done[[largest(region), *region[tie == FIXED]]] = True
+    scene = np.argmax(np.bincount(region, tie == TIES.index("reference")))
+    done[[scene, *region[tie == FIXED]]] = True
     across = region[seg.pairs[:, 0]] != region[seg.pairs[:, 1]]
     ends, order_across = region[seg.pairs[across]], order[across]
     a, b = np.concatenate([ends, ends[:, ::-1]]).T

@@ -13,14 +13,14 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import FIXED, TIES, TOO_FAST, largest, outlines
+from soup_nlp.start.components import FIXED, SCENE, TIES, TOO_FAST, outlines
 from soup_nlp.start.views import FlowFit
 
 UNKNOWN = np.log(100.0)
 """If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
 PACE, UNCARRIED = 0.7, 0.2
 """Standard deviation of the log displacement of components that stand on what is below them,
-relative to the largest one, and share of the components that do not: they hang in the air, or their
+relative to the scene, and share of the components that do not: they hang in the air, or their
 lower end is hidden."""
 LEAST_DISPLACEMENT = 1e-12
 """Displacements count as at least this, so that their ratio is finite."""
@@ -46,16 +46,16 @@ def nearer_where_fast(flow: FlowFit, soup: Soup, label: Int, tie: Int) -> tuple[
         label: (N,) index of the component.
         tie: (N,) origin of its scale, an index of `TIES`.
     """
-    far, scene = displacement(soup, flow.views.anchor, label), largest(label)
+    far = displacement(soup, flow.views.anchor, label)
     pace, hidden = log_pace(far, label)[label], np.zeros(len(label), bool)
     if flow.options.upright:
         group, hidden = without_support(flow, label, tie == FIXED)
-        pace = np.where(hidden, log_pace(far, group, group[label == scene][0])[group], pace)
+        pace = np.where(hidden, log_pace(far, group, group[label == SCENE][0])[group], pace)
     right = np.exp(-0.5 * (pace / PACE) ** 2) / (PACE * np.sqrt(2 * np.pi))
     wrong = UNCARRIED / UNKNOWN
     too_fast = wrong > (1 - UNCARRIED) * right
     q = np.where(hidden, 1.0, wrong / (wrong + (1 - UNCARRIED) * right))
-    placed = np.isin(tie, (FIXED, TOO_FAST, TIES.index("cut off below"))) | (label == scene)
+    placed = np.isin(tie, (FIXED, TOO_FAST, TIES.index("cut off below"))) | (label == SCENE)
     may = (pace > 0) & (pace < UNKNOWN) & ~placed
     nearer = np.where(may, np.maximum(q - 0.5, 0.0) / q * pace, 0.0)
     tie = np.where(may & hidden, TIES.index("cut off below"), tie)
@@ -89,14 +89,14 @@ def without_support(flow: FlowFit, label: Int, fixed: Mask) -> tuple[Int, Mask]:
 
     The lower end is hidden if the lower image border cuts it off, or if the superpixels below it
     have no flow, so that they may belong to the component. Components that touch are one group,
-    since a person may be cut into pieces; the largest one, and those fixed in the image, are alone.
+    since a person may be cut into pieces; the scene, and those fixed in the image, are alone.
 
     Args:
         flow: The flow of every superpixel.
         label: (N,) index of the component.
         fixed: (N,) True in components that are fixed in the image.
     """
-    seg, separate = flow.seg, fixed | (label == largest(label))
+    seg, separate = flow.seg, fixed | (label == SCENE)
     ends = label[seg.pairs]
     group = connected(ends[~separate[seg.pairs].any(axis=1)], int(label.max()) + 1)[label]
     # support of a group, visible and beyond the border, weighted by the squared height difference
@@ -111,21 +111,21 @@ def without_support(flow: FlowFit, label: Int, fixed: Mask) -> tuple[Int, Mask]:
     return group, (cut_off + unknown > seen)[group] & ~separate
 
 
-def log_pace(far: Float, label: Int, scene: int | None = None) -> Float:
+def log_pace(far: Float, label: Int, scene: int = SCENE) -> Float:
     """(C,) log ratio of the median displacement of every component to that of the scene.
 
     Args:
         far: (N,) displacement relative to the camera (`displacement`).
         label: (N,) index of the component.
-        scene: Index of the component to which the others are compared; the largest if None.
+        scene: Index of the component to which the others are compared.
     """
     median = np.array([np.median(far[label == c]) for c in range(int(label.max()) + 1)])
     median = np.maximum(median, LEAST_DISPLACEMENT)
-    return np.asarray(np.log(median / median[largest(label) if scene is None else scene]))
+    return np.asarray(np.log(median / median[scene]))
 
 
 def displacement(soup: Soup, ray: Float, label: Int) -> Float:
-    """(N,) how far anchors move relative to the camera, which turns as the largest component does.
+    """(N,) how far anchors move relative to the camera, which turns as the scene does.
 
     Args:
         soup: Planes and motions.
@@ -133,6 +133,6 @@ def displacement(soup: Soup, ray: Float, label: Int) -> Float:
         label: (N,) index of the component.
     """
     point = soup.points(ray)
-    first = int(np.argmax(label == largest(label)))
+    first = int(np.argmax(label == SCENE))
     moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation - point @ soup.R[first].T
     return np.linalg.norm(moved, axis=1)

@@ -1,6 +1,6 @@
 """Whether a depth prior belongs to a pair: by the depth that flow determines, else by image edges.
 
-Where the flow determines the depth of the largest component, the right map differs less from that
+Where the flow determines the depth of the scene, the right map differs less from that
 depth than one constant depth does. Where the camera rests or turns, the flow is no evidence. A map
 of another scene then differs from the right map in one way: shifted or mirrored, it follows the
 edges of the image as well as in its own place.
@@ -24,7 +24,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start.bending import fit_robustly
 from soup_nlp.start.choice import CLIP
-from soup_nlp.start.components import largest
+from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.propose import Start
 from soup_nlp.start.settle import MOST_SYSTEMATIC_PX, RELIEF, SYSTEMATIC, most_probable
@@ -71,10 +71,10 @@ class Evidence:
     Attributes:
         kind: Kind of its values.
         log_depth: Log depth, up to a common scale, as a function of its values.
-        ratio: Spread of its log ratio to the depth of the largest component by the flow, relative
+        ratio: Spread of its log ratio to the depth of the scene by the flow, relative
             to the spread of the log of that depth; NaN where the flow is no evidence.
         sigma: Standard deviation of its log depth in the whole image; inf where it is not used.
-        determined: Whether the flow determines the depth of the largest component.
+        determined: Whether the flow determines the depth of the scene.
     """
 
     kind: Kind
@@ -215,12 +215,12 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Eviden
         flow: The flow of these superpixels.
         kind: Kind of the prior's values; None to find it.
     """
-    seen, main = Seen(start, flow), largest(start.component)
+    seen = Seen(start, flow)
     value, with_value, whole = without_gaps(pair, flow.seg)
     if np.ptp(value) < 1e-6 * value.max():
         return Evidence(kind or "relative", np.log, np.nan, np.inf, False)
-    anchor, relief = flow.views.anchor, seen.relief(main)
-    known = with_value & seen.usable & (start.component == main)
+    anchor, relief = flow.views.anchor, seen.relief(SCENE)
+    known = with_value & seen.usable & (start.component == SCENE)
     determined, tells = relief > seen.tells, relief > seen.tells / 3 and known.sum() >= FEWEST
     sure = known & ~start.borrowed & (SURE * flow.views.parallax(start.soup) > start.noise)
     if tells and sure.sum() >= FEWEST:
@@ -234,7 +234,7 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Eviden
         at = np.flatnonzero(known)
         shift = seen.motion(at, value[at], True)[3] if kind == "inverse" else 0.0
         shifted = as_log_depth(kind, value, shift)
-        soup, strong = seen.settled(start.soup, main, shifted(value), UNCONFIRMED)
+        soup, strong = seen.settled(start.soup, SCENE, shifted(value), UNCONFIRMED)
         depth = np.log(soup.depth_at(anchor))
         if (strong & known).sum() >= FEWEST:
             by_flow, gap = (

@@ -11,15 +11,15 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import constant_depth, surface_motions, surfaces, turn_alone
 from soup_nlp.start.choice import CLIP, LEAST_NOISE, Choice, limited_noise, rigid_choice
 from soup_nlp.start.components import (
+    SCENE,
     borrow,
     connected_labels,
     connected_pieces,
     contact_scales,
-    largest,
     numbered,
 )
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.ground import on_ground
+from soup_nlp.start.ground import on_ground, scene_first
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import earned, gather, unmoved
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
@@ -42,9 +42,10 @@ class Start:
         borrowed: (N,) True where plane or motion come from neighbours.
         motion: (N,) index of its motion in `motions`, -1 where it has its own.
         component: (N,) index of the rigid component, which shares one scale: the superpixels of a
-            dominant motion, or a connected piece of superpixels with their own motions.
-        part: (N,) group that moves as one, an index of `component`: its own, or the largest one
-            where its flow is not usable, so that its motion is not known.
+            dominant motion, or a connected piece of superpixels with their own motions. The first
+            one is the scene (`SCENE`).
+        part: (N,) group that moves as one, an index of `component`: its own, or the scene where
+            its flow is not usable, so that its motion is not known.
         motions: The dominant motions.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
             where a region bends, discontinuities make up most of its outline.
@@ -162,6 +163,7 @@ def propose(flow: FlowFit) -> Start:
             # each connected region of the mask is a component
             regions = component.max() + 1 + connected_pieces(mask, seg)
             component = numbered(np.where(mask, regions, component))
+    component = scene_first(flow, soup, ~weak & rigid.views.usable, component, fixed)
     scale, tie = contact_scales(flow, soup, component, fixed)
     soup = replace(soup, lam=soup.lam * scale)
     soup, tie = nearer_where_fast(flow, soup, component, tie)
@@ -171,8 +173,6 @@ def propose(flow: FlowFit) -> Start:
             flow, soup, ~weak & rigid.views.usable, component, tie
         )
         grounded = weak & (floor > 0)
-        # what was lowered to the ground may be too fast there
-        soup, tie = nearer_where_fast(flow, soup, component, tie)
     mixed = unmoved(flow, choice, component) & ~(fixed | bends)
     return Start(
         soup=soup.normalised(),
@@ -181,7 +181,7 @@ def propose(flow: FlowFit) -> Start:
         borrowed=weak,
         motion=label,
         component=component,
-        part=moving_parts(rigid, np.where(mixed, largest(component), component), fixed | bends),
+        part=moving_parts(rigid, np.where(mixed, SCENE, component), fixed | bends),
         motions=choice.motions,
         surface=surface,
         tie=tie,
@@ -220,7 +220,7 @@ def _with_depth(flow: FlowFit, choice: Choice, wrong: Mask) -> tuple[Soup, Mask]
 
 
 def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
-    """(N,) component of every superpixel, the largest one in pieces without usable flow.
+    """(N,) component of every superpixel, the scene in pieces without usable flow.
 
     A part that leaves the image or is hidden has the same wrong flow over several superpixels. As a
     component of its own it gets a better depth than from its neighbours, but it need not move.
@@ -231,13 +231,12 @@ def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
         component: (N,) rigid component of every superpixel.
         kept: (N,) True in components that stay.
     """
-    main = largest(component)
     i, k = flow.seg.pairs.T
     same = component[i] == component[k]
     piece = connected_labels(same, flow.seg)
     weight = np.bincount(piece, flow.views.weight.mean(axis=1)) / np.bincount(piece)
-    moves = kept | ((component != main) & (weight >= USABLE)[piece])
+    moves = kept | ((component != SCENE) & (weight >= USABLE)[piece])
     beside = np.zeros(len(weight), bool)
     for first, second in ((i, k), (k, i)):
         beside[piece[first[~same & moves[second]]]] = True
-    return np.where(moves | beside[piece], component, main)
+    return np.where(moves | beside[piece], component, SCENE)
