@@ -59,8 +59,8 @@ class Component:
 class Components:
     """All rigid components, the background first, then by decreasing number of pixels.
 
-    The background is the component with the most superpixels; the camera's motion is the inverse
-    of its motion.
+    The background is the component of the static scene; the camera's motion is the inverse of its
+    motion.
 
     Attributes:
         of_superpixel: (N,) label of every superpixel.
@@ -126,7 +126,7 @@ def find_components(
     Args:
         soup: Solved state.
         seg: Superpixels.
-        group: (N,) groups, such as the components of the start.
+        group: (N,) groups, such as the components of the start; the first is the background.
         K_ref: (3, 3) intrinsics of the reference frame.
         K_next: (3, 3) intrinsics of the next frame.
         borrowed: (N,) superpixels whose depth is a guess; None for none.
@@ -138,8 +138,8 @@ def find_components(
     count = np.bincount(label)
     motions: list[RigidMotion] = []
     joined = np.empty(len(count), np.int64)
-    # large groups first: a small group joins the large one with the same motion
-    for c in np.argsort(-count, kind="stable"):
+    # then large groups first: a small group joins the large one with the same motion
+    for c in [0, *(1 + np.argsort(-count[1:], kind="stable"))]:
         mask = label == c
         x, y, weight = _usable(before[mask], after[mask], seg.sizes[mask])
         gap = [float(np.median(_gap(m, x, y, K_next))) if len(x) else np.inf for m in motions]

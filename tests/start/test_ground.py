@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from helpers_model import flow_of
 
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.ground import above_ground, floating, ground, off_ground
+from soup_nlp.start.ground import above_ground, floating, ground, off_ground, scene_first
 
 HIGH, FAR = 1.5, 30.0
 """Height of the camera, and distance of a wall."""
@@ -122,6 +125,10 @@ def test_a_floating_region_is_found_with_its_distance(car):
     np.testing.assert_array_equal(region, body)
     # up to the spacing of the sampled rows of the boundary
     assert farther == pytest.approx(1 / car, rel=0.1)
+    # relative to a camera that moves by (0, 0, 1), it would climb by a fifth of its way
+    soup = facing(Z)
+    hangs = replace(soup, t=soup.t + np.where(body, 0.1 / Z, 0.0)[:, None] * [0.0, 1.0, 0.0])
+    assert floating(hangs, seg, K, floor, np.zeros(len(Z), int)) == []
 
 
 @pytest.mark.parametrize("car", [0.8, 1.0, 2.0])
@@ -136,7 +143,7 @@ def test_the_distance_of_a_region_from_the_ground_is_told(car, road):
     off = off_ground(facing(Z), seg, K, component, reliable, 0)
     np.testing.assert_allclose(off[body], -np.log(car), atol=0.02)
     # the wall is the scene, and the road no region
-    assert (off[~body] == 0).all()
+    np.testing.assert_allclose(off[~body], 0.0, atol=1e-12)
     assert (off_ground(facing(Z), seg, K, component, reliable & body, 0) == 0).all()
 
 
@@ -157,11 +164,48 @@ def test_superpixels_that_join_region_and_ground_do_not_count():
     np.testing.assert_allclose(off[body], -np.log(0.8), atol=0.03)
 
 
+<<<<<<< HEAD
 def test_a_quarter_of_the_image_may_be_a_table():
+=======
+def test_a_region_of_a_quarter_of_the_image_may_be_a_table_unless_it_moves():
+>>>>>>> fe7bf673 (Describe the scene and what moves along the ground; test both)
     seg, K, ray, Z = street(1.0)
     row, column = np.divmod(np.arange(len(Z)), 30)
     table = (row >= 4) & (row <= 16) & (column >= 5) & (column <= 24)
     assert table.mean() > 0.25
     Z = np.where(table, 0.5 * HIGH / ray[17 * 30, 1], Z)
-    off = off_ground(facing(Z), seg, K, table.astype(int), np.ones(len(Z), bool), 0)
-    assert (off[table] == 0).all()
+    reliable = np.ones(len(Z), bool)
+    off = off_ground(facing(Z), seg, K, np.zeros(len(Z), int), reliable, 0)
+    assert (off == 0).all()
+    off = off_ground(facing(Z), seg, K, table.astype(int), reliable, 0)
+    np.testing.assert_allclose(off[table], np.log(2), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("sky", "road", "reference"),
+    # vehicles between these rows of 20 are larger than the road on which they stand, or the sky is
+    # larger than both and stands on the vehicles; what the lower border cuts off stands on nothing
+    [(3, 12, 2), (11, 14, 2), (3, 20, 1)],
+)
+def test_the_scene_is_the_ground_on_which_the_largest_component_stands(sky, road, reference):
+    seg, K, _, Z = street(1.0)
+    row = np.arange(len(Z)) // 30
+    label = np.digitize(row, [sky, road])
+    flow, none, sure = flow_of(seg, K=K), np.zeros(len(Z), bool), np.ones(len(Z), bool)
+
+    def first(soup, **options):
+        found = scene_first(flow_of(seg, K=K, **options), soup, sure, label, none)
+        # the others keep their order
+        rest = label[(found != 0)]
+        assert (np.diff(found[found != 0][np.argsort(rest, kind="stable")]) >= 0).all()
+        (mine,) = np.unique(label[found == 0])
+        return mine
+
+    largest = int(np.argmax(np.bincount(label)))
+    assert first(facing(Z)) == reference
+    # a wall is no ground, and the vertical has to be known
+    assert first(facing(np.full(len(Z), FAR))) == largest
+    assert first(facing(Z), upright=False) == largest
+    # nothing stands on what is fixed in the image
+    fixed = scene_first(flow, facing(Z), sure, label, label == 2)
+    assert (label[fixed == 0] == np.argmax(np.bincount(label[label < 2]))).all()

@@ -80,6 +80,14 @@ def test_one_stray_superpixel_keeps_its_components_motion():
     np.testing.assert_allclose(components.camera.matrix, CAMERA.matrix, atol=1e-3)
 
 
+def test_the_first_group_is_the_background_even_if_another_one_is_larger():
+    group = np.r_[np.zeros(4, int), np.ones(8, int)]
+    soup = soup_of([*[CAMERA] * 4, *[CAR] * 8])
+    components = find_components(soup, tiles(), group, K, K)
+    np.testing.assert_array_equal(components.of_superpixel, group)
+    np.testing.assert_allclose(components.camera.matrix, CAMERA.matrix, atol=ROUNDING)
+
+
 def test_a_component_that_is_not_rigid_has_a_large_residual():
     rng = np.random.default_rng(1)
     motions = [RigidMotion(np.eye(3), t) for t in rng.normal(0, 0.1, (12, 3))]
