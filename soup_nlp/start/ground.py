@@ -127,7 +127,7 @@ def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Ma
     seg, o, scene = flow.seg, flow.options, int(np.argmax(np.bincount(label, ~fixed)))
     if o.upright and o.ground:
         image, below = label[seg.labels], [scene]
-        while (under := stands_on(image, below[-1])) not in (None, *below):
+        while (under := stands_on(image, below[-1])) not in (-1, *below):
             below.append(under)
         own = reliable & ~fixed & (label == below[-1])
         mu, area = 1 / soup.depth_at(flow.views.anchor), seg.sizes.astype(float)
@@ -136,8 +136,8 @@ def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Ma
     return numbered(np.where(label == scene, -1, label))
 
 
-def stands_on(image: Int, component: int) -> int | None:
-    """The component below the lower end of another one on most of its width; None at the border.
+def stands_on(image: Int, component: int) -> int:
+    """The component below the lower end of another one on most of its width; -1 for the border.
 
     Args:
         image: (H, W) component of every pixel.
@@ -148,7 +148,7 @@ def stands_on(image: Int, component: int) -> int | None:
     border = seen & (under == len(image))
     columns = np.flatnonzero(seen & ~border)
     count = np.bincount(image[under[columns], columns], minlength=1)
-    return None if border.sum() >= count.max() else int(np.argmax(count))
+    return -1 if border.sum() >= count.max() else int(np.argmax(count))
 
 
 def above_ground(

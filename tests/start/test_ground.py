@@ -164,11 +164,7 @@ def test_superpixels_that_join_region_and_ground_do_not_count():
     np.testing.assert_allclose(off[body], -np.log(0.8), atol=0.03)
 
 
-<<<<<<< HEAD
-def test_a_quarter_of_the_image_may_be_a_table():
-=======
-def test_a_region_of_a_quarter_of_the_image_may_be_a_table_unless_it_moves():
->>>>>>> fe7bf673 (Describe the scene and what moves along the ground; test both)
+def test_a_quarter_of_the_image_may_be_a_table_that_rests():
     seg, K, ray, Z = street(1.0)
     row, column = np.divmod(np.arange(len(Z)), 30)
     table = (row >= 4) & (row <= 16) & (column >= 5) & (column <= 24)
@@ -177,6 +173,7 @@ def test_a_region_of_a_quarter_of_the_image_may_be_a_table_unless_it_moves():
     reliable = np.ones(len(Z), bool)
     off = off_ground(facing(Z), seg, K, np.zeros(len(Z), int), reliable, 0)
     assert (off == 0).all()
+    # what moves is no table
     off = off_ground(facing(Z), seg, K, table.astype(int), reliable, 0)
     np.testing.assert_allclose(off[table], np.log(2), atol=0.1)
 
@@ -187,7 +184,7 @@ def test_a_region_of_a_quarter_of_the_image_may_be_a_table_unless_it_moves():
     # larger than both and stands on the vehicles; what the lower border cuts off stands on nothing
     [(3, 12, 2), (11, 14, 2), (3, 20, 1)],
 )
-def test_the_scene_is_the_ground_on_which_the_largest_component_stands(sky, road, reference):
+def test_the_scene_is_the_ground_below_the_largest_component(sky, road, reference):
     seg, K, _, Z = street(1.0)
     row = np.arange(len(Z)) // 30
     label = np.digitize(row, [sky, road])
@@ -196,9 +193,9 @@ def test_the_scene_is_the_ground_on_which_the_largest_component_stands(sky, road
     def first(soup, **options):
         found = scene_first(flow_of(seg, K=K, **options), soup, sure, label, none)
         # the others keep their order
-        rest = label[(found != 0)]
-        assert (np.diff(found[found != 0][np.argsort(rest, kind="stable")]) >= 0).all()
-        (mine,) = np.unique(label[found == 0])
+        left = found != 0
+        assert (np.diff(found[left][np.argsort(label[left], kind="stable")]) >= 0).all()
+        (mine,) = np.unique(label[~left])
         return mine
 
     largest = int(np.argmax(np.bincount(label)))

@@ -80,7 +80,7 @@ def test_one_stray_superpixel_keeps_its_components_motion():
     np.testing.assert_allclose(components.camera.matrix, CAMERA.matrix, atol=1e-3)
 
 
-def test_the_first_group_is_the_background_even_if_another_one_is_larger():
+def test_the_first_group_is_the_background():
     group = np.r_[np.zeros(4, int), np.ones(8, int)]
     soup = soup_of([*[CAMERA] * 4, *[CAR] * 8])
     components = find_components(soup, tiles(), group, K, K)
