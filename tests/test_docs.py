@@ -20,7 +20,6 @@ import typer
 from constraint_mutants import MUTANTS
 from helpers_model import PAPER, Tiny
 from pydantic import BaseModel, Field
-from test_layers import ALLOWED
 
 from soup_nlp.bench.solvers.plugins import Task
 from soup_nlp.bench.solvers.runner import find_solver
@@ -143,16 +142,6 @@ def test_commands_that_are_named_exist(page):
     text = page.read_text(encoding="utf-8")
     for command in re.findall(r"soup-nlp (bench [a-z][a-z-]+|[a-z]+)\b", text):
         assert command in known, command
-
-
-def test_the_rooms_are_those_of_the_layering_test():
-    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
-    table = text.split("## Rooms")[1].split("\n## ")[0]
-    rows = re.findall(r"^\| `(\w+)` \|[^|]*\|([^|]*)\|$", table, re.MULTILINE)
-    documented = {room: {x.strip() for x in names.split(",")} - {""} for room, names in rows}
-    assert list(documented) == list(ALLOWED)
-    for room, allowed in ALLOWED.items():
-        assert documented[room] == set(allowed) - {room}, room
 
 
 def test_every_equation_has_its_function():
