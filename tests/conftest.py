@@ -24,7 +24,7 @@ SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 
 
 # a scene that many tests want is rendered once: test files import this function later
-inputs.render_scene = catalogue.render_scene = lru_cache(maxsize=16)(catalogue.render_scene)
+inputs.render_scene = catalogue.render_scene = lru_cache(maxsize=32)(catalogue.render_scene)
 
 
 def pytest_collection_finish() -> None:

@@ -33,7 +33,10 @@ NO_EDGES, NO_TABLES = np.zeros((0, 2), int), np.zeros((0, 3, 3))
 
 
 @pytest.mark.parametrize("seed", range(24))
-def test_equals_plain_loops(seed):
+def test_equals_plain_loops(seed, monkeypatch):
+    if seed % 2:
+        # edges are passed in small blocks
+        monkeypatch.setattr("soup_nlp.mrf.trws._CACHE_BYTES", 3 * 5 * 5 * 8)
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 15))
     unary, edges, tables = ragged(rng, n, int(rng.integers(0, 3 * n + 1)))
@@ -45,24 +48,6 @@ def test_equals_plain_loops(seed):
         best = int(np.argmin(energies[:k]))
         np.testing.assert_array_equal(result.labels, labellings[best])
         np.testing.assert_allclose(result.best_history, np.minimum.accumulate(energies[:k]))
-
-
-def test_equals_plain_loops_on_a_grid(monkeypatch):
-    monkeypatch.setattr("soup_nlp.mrf.trws._CACHE_BYTES", 3 * 7 * 7 * 8)
-    rng = np.random.default_rng(3)
-    index = np.arange(48).reshape(6, 8)
-    edges = np.concatenate(
-        [
-            np.stack([index[:, :-1].ravel(), index[:, 1:].ravel()], 1),
-            np.stack([index[1:].ravel(), index[:-1].ravel()], 1),
-        ]
-    )
-    unary, tables = rng.random((48, 7)), rng.random((len(edges), 7, 7))
-    bounds, energies, _ = textbook(unary, edges, tables, colour_order(48, edges), 5)
-    result = followed(unary, edges, tables, max_iter=5, **FOREVER)
-    np.testing.assert_allclose(result.bound_history, bounds, rtol=1e-12)
-    np.testing.assert_allclose(result.energy_history, energies, rtol=1e-12)
-    assert rises(result)
 
 
 # --- exactness and bounds ---------------------------------------------------------------------
