@@ -2,9 +2,7 @@
 
 The motion (R, t) of a superpixel comes from the flow of itself and of its nearest neighbours, by
 essential matrix and cheirality; its plane then follows from `q ~ (R - t n^T / d) r`, which is
-linear in n / d. Without neighbours the homography of the superpixel alone is decomposed. Up to
-four (R, t, n) explain it. Cheirality leaves those with the superpixel in front of both cameras,
-mostly two, and the one whose epipolar geometry explains the flow of the neighbours better is taken.
+linear in n / d.
 
 A superpixel for which this fails takes the result of the nearest one for which it succeeds. All
 scales are equal and all anchors have the same depth, which the paper takes as a positive constant.
@@ -15,7 +13,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
@@ -26,12 +23,6 @@ from soup_nlp.start.views import LEAST_PIXELS, FlowFit, Views
 
 MOST_PIXELS = 400
 """Largest number of correspondences to which a motion is fitted."""
-JUDGES = 6
-"""Number of neighbours whose flow decides between two decompositions."""
-LEAST_MOTION = 1e-6
-"""Smallest |t| / d at which a decomposition determines a direction and a depth."""
-CLIP = 5.0
-"""Sampson distances are clipped at this many pixels."""
 
 
 class Patch(NamedTuple):
@@ -62,23 +53,15 @@ def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
 
 def _patch(flow: FlowFit, i: int) -> Patch | None:
     """Motion and plane of a superpixel; None if its flow does not determine them."""
-    views, knn, o = flow.views, flow.seg.knn[i], flow.options
+    views, o = flow.views, flow.options
     inside = confident(views, np.array([i]))
     if len(inside.ray) < LEAST_PIXELS:
         return None
-    seen = np.vstack([inside.ray, views.anchor[i]])
-    if not o.motion_neighbours:
-        H = fit_homography(inside)
-        choices = [] if H is None else in_front(H, seen)
-        if len(choices) < 2:
-            return choices[0] if choices else None
-        around = confident(views, knn[:JUDGES])
-        return choices[int(np.argmin([epipolar_error(c.motion, around) for c in choices]))]
-    around = confident(views, np.append(i, knn[: o.motion_neighbours]))
+    around = confident(views, np.append(i, flow.seg.knn[i]))
     motion = essential_motion(around, o.threshold_px, o.seed)
     if motion is None:
         return None
-    m = plane_of(motion, inside)
+    m, seen = plane_of(motion, inside), np.vstack([inside.ray, views.anchor[i]])
     return Patch(motion, m) if (seen @ m > 0).all() else None
 
 
@@ -97,47 +80,3 @@ def plane_of(motion: Motion, matched: Matches) -> Float:
     b = (t[:2] - q[:, :2] * t[2]) * root
     A = b[:, :, None] * matched.ray[:, None, :]
     return np.asarray(np.linalg.lstsq(A.reshape(-1, 3), -a.ravel(), rcond=None)[0])
-
-
-def fit_homography(matched: Matches) -> Float | None:
-    """Least-squares homography (3, 3) of rays, with the sign of positive depths, or None."""
-    if len(matched.ray) < LEAST_PIXELS:
-        return None
-    a, b = (np.ascontiguousarray(v[:, :2]) for v in (matched.ray, matched.target))
-    try:
-        H, _ = cv2.findHomography(a, b, 0)
-    except cv2.error:
-        return None
-    if H is None or not np.isfinite(H).all():
-        return None
-    ahead = matched.ray @ H[2]
-    if not (ahead > 0).all() and not (ahead < 0).all():
-        return None
-    return np.asarray(H if ahead[0] > 0 else -H, np.float64)
-
-
-def in_front(H: Float, ray: Float) -> list[Patch]:
-    """The decompositions of H with the plane in front of both cameras on every ray (M, 3).
-
-    With `1 / Z(r) = m . r > 0` in the reference frame, the depth in the next one is `Z (H r)_z`,
-    which the sign of H makes positive.
-    """
-    try:
-        _, Rs, ts, ns = cv2.decomposeHomographyMat(H, np.eye(3))
-    except cv2.error:
-        return []
-    patches = []
-    for R, t, n in zip(Rs, ts, ns, strict=True):
-        length = float(np.linalg.norm(t))
-        # each comes as (t, n) and as (-t, -n), of which one faces the camera
-        if np.linalg.det(R) > 0 and length > LEAST_MOTION and (ray @ n > 0).all():
-            patches.append(Patch(Motion(R, t.ravel() / length), length * n.ravel()))
-    return patches
-
-
-def epipolar_error(motion: Motion, around: Matches) -> float:
-    """Mean clipped Sampson distance of correspondences to a motion, pixels."""
-    if not len(around.ray):
-        return 0.0
-    error = np.minimum(np.abs(around.distance(motion)), CLIP)
-    return float(np.average(error, weights=around.weight))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from soup_nlp.schema.section import Count, NonNegative, Samples, Section, Seed
+from soup_nlp.schema.section import NonNegative, Samples, Section, Seed
 
 
 class StartOptions(Section):
@@ -13,9 +13,6 @@ class StartOptions(Section):
     method: Literal["shared", "homography"] = "shared"
     """shared (every superpixel takes one of the motions of the whole image) or homography (the
     paper's: epipolar geometry and homography of every superpixel, equal scales)."""
-    motion_neighbours: Count = 15
-    """With homography: number of nearest neighbours whose flow is used for the motion of a
-    superpixel, as in the paper for small ones; with 0 its own homography is decomposed."""
     samples: Samples = 40
     """Sampled pixels per superpixel."""
     threshold_px: NonNegative = 1.0

@@ -23,8 +23,8 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.start.epipolar import Matches
-from soup_nlp.start.homographies import fit_homography, in_front, plane_of
+from soup_nlp.start.epipolar import Matches, Motion
+from soup_nlp.start.homographies import plane_of
 
 PAPER = {
     # Sec. 4.4.1: "1,000-2,000 superpixels" by SLIC
@@ -151,20 +151,13 @@ def test_the_start_is_one_of_single_superpixels(case):
     u, v = case.segmentation.anchors.round().astype(int).T
     static = truth.components[v, u] == 0
 
-    def error(neighbours: int) -> float:
-        problem = paper(f"start.motion_neighbours={neighbours}", flow={"source": "truth"})
-        start = prepare(problem, pair=case.pair).start.soup
-        z = start.depth_at(case.data.anchor_ray) / np.linalg.norm(start.translation, axis=1)
-        ratio = (z / truth.depth_ref[v, u])[static]
-        return float(np.median(np.abs(ratio / np.median(ratio) - 1)))
-
-    # superpixels on one plane have an exact homography; the neighbours' flow is of other components
-    assert error(0) < 0.02
-    assert error(8) < 0.3
+    z = depth / np.linalg.norm(soup.translation, axis=1)
+    ratio = (z / truth.depth_ref[v, u])[static]
+    # the neighbours' flow is in part of other components
+    assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.3
 
 
-def test_a_homography_has_its_own_motion_among_its_decompositions():
-    """The true one of an exact homography is found, and the plane follows from the motion."""
+def test_a_plane_follows_from_its_motion():
     angle = 0.05
     R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     t, m = np.array([0.6, 0.0, 0.8]), np.array([0.02, -0.05, 0.11])
@@ -172,16 +165,7 @@ def test_a_homography_has_its_own_motion_among_its_decompositions():
     ray = np.column_stack([grid.reshape(-1, 2), np.ones(25)])
     target = ray @ R.T + (ray @ m)[:, None] * t
     matched = Matches(ray, target / target[:, 2:], np.ones(25), 1.0)
-    H = fit_homography(matched)
-    patches = in_front(H, ray)
-    assert 1 <= len(patches) <= 2
-    off = [np.abs(p.motion.R - R).max() + np.abs(p.motion.t - t).max() for p in patches]
-    best = patches[int(np.argmin(off))]
-    # OpenCV fits in single precision
-    assert min(off) < 1e-3
-    assert np.allclose(best.m, m, atol=1e-3)
-    assert np.allclose(plane_of(best.motion, matched), m, atol=1e-3)
-    assert fit_homography(Matches(ray[:5], target[:5], np.ones(5), 1.0)) is None
+    assert np.allclose(plane_of(Motion(R, t), matched), m, atol=1e-9)
 
 
 @pytest.mark.parametrize("length", ["depth", "translation", "scales"])
