@@ -71,16 +71,15 @@ def borrow(
     return mu, slope
 
 
-OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6
-"""Quantiles of the depth ratios: along the outline of a component, along its contact with lower
-neighbours, and along the outline as the upper limit of a scale by contact below."""
+SCALE, MOST = 0.4, 0.6
+"""Quantiles of the depth ratios: along the contact that gives a component its scale, and along the
+whole outline as the upper limit of a scale by contact below."""
 BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 TIES = (
     "reference",
     "contact below",
     "outline",
-    "cut off below",
     "nothing",
     "ground",
     "fixed in the image",
@@ -88,13 +87,12 @@ TIES = (
     "occlusion",
     "too fast",
 )
-"""What gives a component its scale. reference: it is the scene and defines the scale.
-contact below: it stands on its lower neighbours. outline: it touches its neighbours. cut off below:
-the lower image border hides its support. nothing: it has no neighbour with a scale. ground:
-it was lifted to the ground. fixed in the image: it stands still there, though the camera moves,
-and is placed by its outline. given depth: a depth prior gives it. occlusion: it covers its
-background, and is placed in front of the background by a guess. too fast: contact is probably
-wrong, because it would make the component move much farther than the scene."""
+"""What gives a component its scale. reference: it is the scene and defines the scale. contact
+below: it stands on its lower neighbours. outline: it touches its neighbours. nothing: it has no
+neighbour with a scale. ground: it was lifted to the ground. fixed in the image: it stands still
+there, though the camera moves, and is placed by its outline. given depth: a depth prior gives it.
+occlusion: it covers its background, and is placed in front of the background by a guess. too fast:
+contact is probably wrong, because it would make the component move much farther than the scene."""
 FIXED, TOO_FAST = TIES.index("fixed in the image"), TIES.index("too fast")
 UNSUPPORTED = 1e-6
 """Added to the placed share of a component's support, so that the longest contact goes first where
@@ -112,7 +110,6 @@ class Outlines(NamedTuple):
         below: Whether the second lies below the first in the image.
         weight: Contact times the squared height difference to the top of the first component, since
             a car touches the road at its wheels only.
-        top: (C,) row of the highest anchor of every component.
     """
 
     component: Int
@@ -121,7 +118,6 @@ class Outlines(NamedTuple):
     contact: Float
     below: Mask
     weight: Float
-    top: Float
 
 
 def outlines(label: Int, seg: Segmentation) -> Outlines:
@@ -137,18 +133,17 @@ def outlines(label: Int, seg: Segmentation) -> Outlines:
     np.minimum.at(top, label, seg.anchors[:, 1])
     low = np.maximum(np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) - top[component], 1.0)
     below = np.concatenate([down, -down]) > BELOW
-    return Outlines(component, other, neighbour, contact, below, contact * low**2, top)
+    return Outlines(component, other, neighbour, contact, below, contact * low**2)
 
 
 def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[Float, Int]:
     """Relative scale of every component, such that components touch their surroundings.
 
     In an upright image a component stands on its lower neighbours. Its scale is then the quantile
-    GROUND of the depth ratios to them, weighted by `Outlines.weight`. A component occludes what is
+    `SCALE` of the depth ratios to them, weighted by `Outlines.weight`. A component occludes what is
     behind it, so its depth is at most that of its neighbours; therefore the scale is at most the
-    quantile MOST of the depth ratios along the whole outline. If the lower neighbours make up less
-    than a tenth of the contact, or if the image is not upright, the scale is the quantile OUTLINE
-    of the depth ratios along the whole outline.
+    quantile `MOST` of the depth ratios along the whole outline. Without lower neighbours, or if the
+    image is not upright, it is the quantile `SCALE` along the whole outline.
 
     Components are placed one after the other, in the order of their contact length with placed
     components times the placed share of their lower neighbours (1 where there are none). The roof
@@ -196,14 +191,14 @@ def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[
         mine = touch & (a == c)
         ground = mine & below
         value = ratio + log_scale[b]
-        if contact[ground].sum() >= 0.1 * contact[mine].sum():
+        if ground.any():
             log_scale[c] = min(
-                quantile(value[ground], weight[ground], GROUND),
+                quantile(value[ground], weight[ground], SCALE),
                 quantile(value[mine], contact[mine], MOST),
             )
             tie[c] = TIES.index("contact below")
         else:
-            log_scale[c] = quantile(value[mine], contact[mine], OUTLINE)
+            log_scale[c] = quantile(value[mine], contact[mine], SCALE)
             tie[c] = TIES.index("outline")
         placed[c] = True
     tie[at_camera] = FIXED

@@ -24,6 +24,8 @@ from soup_nlp.start.components import (
     TIES,
     connected_labels,
     depth_from_inside,
+    numbered,
+    outlines,
     quantile,
 )
 from soup_nlp.start.merge import SMALL
@@ -188,7 +190,7 @@ def in_order(start: Start, pair: Pair, flow: FlowFit) -> Start:
     soup = replace(start.soup, lam=start.soup.lam * factor).normalised()
     tie = np.where(moved, TIES.index("occlusion"), start.tie)
     grouped = np.where(moved & start.bends, len(seg) + region, start.component)
-    component = np.unique(grouped, return_inverse=True)[1].ravel()
+    component = numbered(grouped)
     part = np.where(start.bends.all(), component, start.part)
     return replace(start, soup=soup, tie=tie, component=component, part=part, order=order)
 
@@ -217,7 +219,7 @@ def placed(
     after the other, the one with the most votes against placed regions first. Where the median step
     of log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
     that step is `IN_FRONT`. A region that stands on one it covers stays if the step across its
-    upper outline is `STANDING`. A region without an order moves with the one that it touches most.
+    upper outline is `STANDING`.
 
     Args:
         soup: Planes.
@@ -227,26 +229,21 @@ def placed(
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
     """
-    region = np.unique(region, return_inverse=True)[1].ravel()
+    region = numbered(region)
     count = int(region.max()) + 1
     shift, done = np.zeros(count), np.zeros(count, bool)
     scene = np.argmax(np.bincount(region, tie == TIES.index("reference")))
     done[[scene, *region[tie == FIXED]]] = True
     across = region[seg.pairs[:, 0]] != region[seg.pairs[:, 1]]
-    ends, order_across = region[seg.pairs[across]], order[across]
-    a, b = np.concatenate([ends, ends[:, ::-1]]).T
-    behind = np.concatenate([order_across, -order_across])
+    around = outlines(region, seg)
+    a, b, length = around.component, around.other, around.contact
+    behind = np.concatenate([order[across], -order[across]])
     step = np.log(depth_from_inside(soup, region, seg, K_ref))
     step = np.concatenate([step[0] - step[1], step[1] - step[0]])
-    length = np.tile(seg.boundary_length[across], 2).astype(float)
     middle = np.array([np.median(seg.anchors[region == c, 1]) for c in range(count)])
     upper = np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) < middle[a]
     on_ground = tie == TIES.index("contact below")
     upper &= np.bincount(region[on_ground], minlength=count)[a] > 0
-    touch = np.zeros((count, count))
-    np.add.at(touch, (a, b), length)
-    free = np.ones(count, bool)
-    free[a[behind != 0]] = False
     while (use := ~done[a] & done[b] & (behind != 0)).any():
         c = int(np.argmax(np.bincount(a[use], np.abs(behind[use]), minlength=count)))
         # c recedes behind regions that cover it, and comes in front of those that it covers
@@ -258,6 +255,4 @@ def placed(
                 gap = IN_FRONT if quantile(now[high], length[high], 0.5) >= STANDING else gap
             shift[c] += sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0
         done[c] = True
-    follows = free & ~done & (touch.max(axis=1) > 0)
-    shift[follows] = shift[np.argmax(touch, axis=1)[follows]]
     return np.exp(shift)[region]
