@@ -145,6 +145,7 @@ def thrice(cells):
 
 TOWER = [[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]]
 TOWER_OF = [[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]]
+TWO_HIGH = [[0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 0, 0]]
 CORNER = [[0, 0, 0], [0, 1, 0], [0, 0, 0]]
 CONTACTS = {
     # a tall piece with a long outline to a far wall, on a low piece that stands on the ground
@@ -166,7 +167,7 @@ CONTACTS = {
     # a ground farther than most of the outline does not count
     "far ground": ([[1.0, 4, 4], [1, 1, 4], [1, 40.0, 40.0]], CORNER, 4.0),
     # the lower edge of the image cuts it off: a quantile of the depth ratios around it
-    "outline": ([[4.0, 6, 4], [3, 1, 3.5]], [[0, 0, 0], [0, 1, 0]], 3.0),
+    "outline": ([[4.0, 6, 4], [3, 1, 3.5]], [[0, 0, 0], [0, 1, 0]], 3.5),
 }
 
 
@@ -182,8 +183,11 @@ def test_without_a_vertical_the_longest_contact_comes_first():
     component = thrice(TOWER_OF)
     scale_found = scales(thrice(TOWER), component, upright=False)
     np.testing.assert_allclose(scale_found[component == 2], 8.0, rtol=1e-12)
-    z, component, _ = CONTACTS["ground"]
-    np.testing.assert_allclose(scales(thrice(z), thrice(component), upright=False), 1.0, rtol=1e-12)
+    # and what is below it counts as much as the rest of its outline
+    z, component = thrice([[4.0, 4, 4], [4, 1, 4], [4, 1, 4], [2, 2, 2]]), thrice(TWO_HIGH)
+    for upright, scale in ((True, 2.0), (False, 4.0)):
+        scale_found = scales(z, component, upright=upright)
+        np.testing.assert_allclose(scale_found[component == 1], scale, rtol=1e-12)
 
 
 def test_a_car_has_room_between_its_wheels():
