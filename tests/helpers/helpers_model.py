@@ -353,14 +353,16 @@ def world(name: str, units: str, at_anchors: bool) -> tuple[Soup, EnergyData]:
 def flow_of(
     seg: Segmentation,
     jump: np.ndarray | float = 0.0,
+    usable: np.ndarray | None = None,
     K: np.ndarray | None = None,
     **options: bool,
 ) -> FlowFit:
-    """A flow that jumps by (P,) pixels, known in all superpixels."""
+    """A flow that jumps by (P,) pixels, known in the superpixels `usable` (N,); all without it."""
     n = len(seg)
     K = np.eye(3) if K is None else K
+    weight = np.ones((n, 1)) if usable is None else usable[:, None].astype(float)
     anchor, none = camera.rays(K, seg.anchors), np.zeros(n)
-    views = Views(anchor[:, None], anchor[:, None], np.ones((n, 1)), anchor, np.ones(n), (1.0, 1.0))
+    views = Views(anchor[:, None], anchor[:, None], weight, anchor, np.ones(n), (1.0, 1.0))
     jump = np.broadcast_to(jump, len(seg.pairs))
     affine = np.zeros((n, 3, 2))
     return FlowFit(seg, K, K, SeededStart(**options), views, none > 0, affine, none, jump)
