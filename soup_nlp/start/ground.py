@@ -115,7 +115,7 @@ def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Ma
     """(N,) indices of the components (N,), that of the static scene first, see `SCENE`.
 
     The scene is the largest component. In a traffic jam that may be a group of vehicles: if it
-    stands on a component with a level ground, directly or on others that do, that one is the scene.
+    stands on a component with a level ground that stands on nothing, that one is the scene.
 
     Args:
         flow: The flow of every superpixel.
@@ -126,13 +126,13 @@ def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Ma
     """
     seg, o, scene = flow.seg, flow.options, int(np.argmax(np.bincount(label, ~fixed)))
     if o.upright and o.ground:
-        image, below = label[seg.labels], [scene]
-        while (under := stands_on(image, below[-1])) not in (-1, *below):
-            below.append(under)
-        own = reliable & ~fixed & (label == below[-1])
+        image = label[seg.labels]
+        below = stands_on(image, scene)
+        own = reliable & ~fixed & (label == below)
         mu, area = 1 / soup.depth_at(flow.views.anchor), seg.sizes.astype(float)
-        if own.any() and ground(mu, flow.views.anchor, area, own, o.seed).any():
-            scene = below[-1]
+        if own.any() and stands_on(image, below) < 0:
+            level = ground(mu, flow.views.anchor, area, own, o.seed)
+            scene = below if level.any() else scene
     return numbered(np.where(label == scene, -1, label))
 
 
