@@ -144,8 +144,9 @@ def disturbed(
     begin = time.perf_counter()
     waiting, until = writing, begin + delay
     while waiting or time.perf_counter() < until:
-        time.sleep(0.0005)
-        now = busy(command.folder)
+        # at other moments than those of writing, nobody has to look often
+        time.sleep(0.0005 if writing else 0.01)
+        now = writing and busy(command.folder)
         stale = stale and now
         if waiting and now and not stale:
             waiting, until = False, time.perf_counter() + delay
