@@ -19,11 +19,12 @@ from soup_nlp.start.components import (
     numbered,
 )
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.ground import on_ground, scene_first
+from soup_nlp.start.ground import on_ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import earned, gather, unmoved
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
 from soup_nlp.start.pace import nearer_where_fast, order_in_front
+from soup_nlp.start.scene import scene_first
 from soup_nlp.start.settle import settle
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import LEAST_PARALLAX_PX, USABLE, FlowFit, Views

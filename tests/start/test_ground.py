@@ -11,7 +11,8 @@ from helpers_model import flow_of
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.ground import above_ground, floating, ground, off_ground, scene_first
+from soup_nlp.start.ground import above_ground, floating, ground, off_ground
+from soup_nlp.start.scene import scene_first
 
 HIGH, FAR = 1.5, 30.0
 """Height of the camera, and distance of a wall."""
