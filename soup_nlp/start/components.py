@@ -80,6 +80,7 @@ TIES = (
     "reference",
     "contact below",
     "outline",
+    "cut off below",
     "nothing",
     "ground",
     "fixed in the image",
@@ -87,12 +88,13 @@ TIES = (
     "occlusion",
     "too fast",
 )
-"""What gives a component its scale. reference: it is the scene and defines the scale. contact
-below: it stands on its lower neighbours. outline: it touches its neighbours. nothing: it has no
-neighbour with a scale. ground: it was lifted to the ground. fixed in the image: it stands still
-there, though the camera moves, and is placed by its outline. given depth: a depth prior gives it.
-occlusion: it covers its background, and is placed in front of the background by a guess. too fast:
-contact is probably wrong, because it would make the component move much farther than the scene."""
+"""What gives a component its scale. reference: it is the scene and defines the scale.
+contact below: it stands on its lower neighbours. outline: it touches its neighbours. cut off below:
+the lower image border hides its support. nothing: it has no neighbour with a scale. ground:
+it was lifted to the ground. fixed in the image: it stands still there, though the camera moves,
+and is placed by its outline. given depth: a depth prior gives it. occlusion: it covers its
+background, and is placed in front of the background by a guess. too fast: contact is probably
+wrong, because it would make the component move much farther than the scene."""
 FIXED, TOO_FAST = TIES.index("fixed in the image"), TIES.index("too fast")
 UNSUPPORTED = 1e-6
 """Added to the placed share of a component's support, so that the longest contact goes first where
@@ -110,6 +112,7 @@ class Outlines(NamedTuple):
         below: Whether the second lies below the first in the image.
         weight: Contact times the squared height difference to the top of the first component, since
             a car touches the road at its wheels only.
+        top: (C,) row of the highest anchor of every component.
     """
 
     component: Int
@@ -118,6 +121,7 @@ class Outlines(NamedTuple):
     contact: Float
     below: Mask
     weight: Float
+    top: Float
 
 
 def outlines(label: Int, seg: Segmentation) -> Outlines:
@@ -133,7 +137,7 @@ def outlines(label: Int, seg: Segmentation) -> Outlines:
     np.minimum.at(top, label, seg.anchors[:, 1])
     low = np.maximum(np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) - top[component], 1.0)
     below = np.concatenate([down, -down]) > BELOW
-    return Outlines(component, other, neighbour, contact, below, contact * low**2)
+    return Outlines(component, other, neighbour, contact, below, contact * low**2, top)
 
 
 def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[Float, Int]:

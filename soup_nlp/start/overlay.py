@@ -2,7 +2,8 @@
 
 They are fixed to the camera, or move as it does, so that their flow shows neither depth nor the
 camera's motion. A distant region stands still as well, but its depth under the camera's motion
-explains that. The flow of a fixed region contradicts every depth up to infinity.
+explains that. The flow of a fixed region contradicts every depth from the ground, where there is
+one, to infinity.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from soup_nlp.arrays import Float, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.start.choice import PIECE_SIZE, dominant
 from soup_nlp.start.components import connected_labels, connected_pieces
-from soup_nlp.start.views import FlowFit
+from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.ground import BELOW, ground
+from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
 
 STILL_PX = 1.0
 """Mean displacement up to which a superpixel may stand still, pixels: it may reflect movers."""
@@ -39,7 +42,7 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     if may.sum() < PIECE_SIZE:
         return none, shift
     camera = dominant(flow.without(may | ~usable))[0]
-    error = views.fit([camera]).penalised()[:, 0]
+    error = _error_under(flow, camera, usable & ~may)
     if (error[usable] < CONTRADICTED_PX).sum() < LEAST_SCENE * usable.sum():
         return none, shift
     may &= error - shift > CONTRADICTED_PX
@@ -49,6 +52,21 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     count, still_count = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
     core = may & ((still_count >= PIECE_SIZE) & (still_count >= LEAST_SHARE * count))[piece]
     return core | (moves & towards_border(core, seg)), shift
+
+
+def _error_under(flow: FlowFit, camera: Motion, reliable: Mask) -> Float:
+    """(N,) mean error, pixels, of the best depth up to infinity, or up to that of the ground."""
+    views, o = flow.views, flow.options
+    fit = views.fit([camera])
+    mu, error = fit.inverse_depth[:, 0], fit.penalised()[:, 0]
+    if not (o.upright and o.ground):
+        return error
+    reliable = reliable & (error < CONTRADICTED_PX) & (mu > 0)
+    reliable &= fit.parallax[:, 0] * np.abs(mu) > LEAST_PARALLAX_PX
+    floor = ground(mu, views.anchor, flow.seg.sizes.astype(float), reliable, o.seed)
+    least = (1 - BELOW) * floor
+    moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t
+    return np.where(mu < least, np.maximum(error, views.distance(moved)), error)
 
 
 def towards_border(core: Mask, seg: Segmentation) -> Mask:
