@@ -219,7 +219,7 @@ def placed(
     after the other, the one with the most votes against placed regions first. Where the median step
     of log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
     that step is `IN_FRONT`. A region that stands on one it covers stays if the step across its
-    upper outline is `STANDING`.
+    upper outline is `STANDING`. A region without an order moves with the one that it touches most.
 
     Args:
         soup: Planes.
@@ -244,6 +244,10 @@ def placed(
     upper = np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) < middle[a]
     on_ground = tie == TIES.index("contact below")
     upper &= np.bincount(region[on_ground], minlength=count)[a] > 0
+    touch = np.zeros((count, count))
+    np.add.at(touch, (a, b), length)
+    free = np.ones(count, bool)
+    free[a[behind != 0]] = False
     while (use := ~done[a] & done[b] & (behind != 0)).any():
         c = int(np.argmax(np.bincount(a[use], np.abs(behind[use]), minlength=count)))
         # c recedes behind regions that cover it, and comes in front of those that it covers
@@ -255,4 +259,6 @@ def placed(
                 gap = IN_FRONT if quantile(now[high], length[high], 0.5) >= STANDING else gap
             shift[c] += sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0
         done[c] = True
+    follows = free & ~done & (touch.max(axis=1) > 0)
+    shift[follows] = shift[np.argmax(touch, axis=1)[follows]]
     return np.exp(shift)[region]
