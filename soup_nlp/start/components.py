@@ -71,9 +71,9 @@ def borrow(
     return mu, slope
 
 
-SCALE, MOST = 0.4, 0.6
-"""Quantiles of the depth ratios: along the contact that gives a component its scale, and along the
-whole outline as the upper limit of a scale by contact below."""
+OUTLINE, GROUND, MOST = 0.2, 0.4, 0.6
+"""Quantiles of the depth ratios: along the outline of a component, along its contact with lower
+neighbours, and along the outline as the upper limit of a scale by contact below."""
 BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 TIES = (
@@ -144,10 +144,11 @@ def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[
     """Relative scale of every component, such that components touch their surroundings.
 
     In an upright image a component stands on its lower neighbours. Its scale is then the quantile
-    `SCALE` of the depth ratios to them, weighted by `Outlines.weight`. A component occludes what is
-    behind it, so its depth is at most that of its neighbours; therefore the scale is at most the
-    quantile `MOST` of the depth ratios along the whole outline. Without lower neighbours, or if the
-    image is not upright, it is the quantile `SCALE` along the whole outline.
+    `GROUND` of the depth ratios to them, weighted by `Outlines.weight`. A component occludes what
+    is behind it, so its depth is at most that of its neighbours; therefore the scale is at most the
+    quantile `MOST` of the depth ratios along the whole outline. If the lower neighbours make up
+    less than a tenth of the contact, or if the image is not upright, the scale is the quantile
+    `OUTLINE` of the depth ratios along the whole outline.
 
     Components are placed one after the other, in the order of their contact length with placed
     components times the placed share of their lower neighbours (1 where there are none). The roof
@@ -195,14 +196,14 @@ def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[
         mine = touch & (a == c)
         ground = mine & below
         value = ratio + log_scale[b]
-        if ground.any():
+        if contact[ground].sum() >= 0.1 * contact[mine].sum():
             log_scale[c] = min(
-                quantile(value[ground], weight[ground], SCALE),
+                quantile(value[ground], weight[ground], GROUND),
                 quantile(value[mine], contact[mine], MOST),
             )
             tie[c] = TIES.index("contact below")
         else:
-            log_scale[c] = quantile(value[mine], contact[mine], SCALE)
+            log_scale[c] = quantile(value[mine], contact[mine], OUTLINE)
             tie[c] = TIES.index("outline")
         placed[c] = True
     tie[at_camera] = FIXED

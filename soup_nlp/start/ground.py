@@ -23,7 +23,7 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import (
     FIXED,
-    SCALE,
+    GROUND,
     SCENE,
     TIES,
     connected_pieces,
@@ -223,7 +223,7 @@ def regions(
         # what fills a gap has the depth of the rest
         own = level + np.log(np.median(mu[body])) if body.any() else rise
         values = np.where(fills, own, rise), gap
-        above, off = (quantile(v[on], around.weight[on], SCALE) for v in values)
+        above, off = (quantile(v[on], around.weight[on], GROUND) for v in values)
         behind = around.contact[edge & (gap > STEP)].sum() / around.contact[edge].sum()
         point, t = (np.exp(above) * v[mine] for v in (soup.points(ray), soup.translation))
         moved = np.einsum("nij,nj->ni", soup.R[mine], point) + t - soup.translation[scene]
