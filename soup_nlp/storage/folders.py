@@ -5,8 +5,10 @@ hidden folder in the target (`staged`). One rename marks that folder as complete
 renamed to their places. After a kill, a later call finishes the renaming (`recover`). A lock on the
 folder makes processes that write into the same folder wait for each other.
 
-A file that MARK does not list, or that was changed, belongs to the user: it is never removed, and
-overwritten only with `overwrite`.
+The hidden file MARK lists the files in a folder that the program made, with their SHA-256. A file
+that is not listed, or that was changed, belongs to the user: it is never removed, and overwritten
+only with `overwrite`. The mark also has the subject of the result, such as the frames that were
+solved.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import PathLike, as_path
@@ -30,13 +32,13 @@ from soup_nlp.storage.system import deferred_signals, sweep, temporary_folder
 MARK = ".soup_nlp"
 """Hidden file of a folder with results: `Mark` as JSON, its subject under "of"."""
 _STAGE = f"{MARK}-"
+"""First part of the names of temporary folders; the number of their process follows."""
 _COMPLETE = f"{_STAGE}complete-"
-"""Beginnings of the names of temporary folders: incomplete, and with files that are being moved."""
+"""The same of those whose files are being moved to their places."""
 
 
 class Mark(NamedTuple):
-    """SHA-256 by name of the files that the program made in a folder, and the subject of the
-    result, such as the frames that were solved."""
+    """SHA-256 by name of the files that the program made in a folder, and subject of the result."""
 
     files: dict[str, str]
     subject: str = ""
@@ -94,8 +96,13 @@ def claim(
 ) -> Path:
     """Check that these files may be written into an output folder, and return it.
 
-    A missing folder is not made yet. `overwrite` allows files of the user with these names, and the
-    result of another subject.
+    A missing folder is not made yet.
+
+    Args:
+        folder: The output folder.
+        names: Files that will be written.
+        overwrite: Allow files of the user with these names, and the result of another subject.
+        subject: Subject of the new result, see `Mark`.
 
     Raises:
         DataError: the folder cannot be written, holds a file of the user or a folder with one of
@@ -105,18 +112,23 @@ def claim(
         existing = next(p for p in (target, *target.parents) if os.path.lexists(p))
         # fails where nothing can be written
         tempfile.TemporaryFile(dir=existing).close()
-        before, states = mark_of(target).subject, {name: _state(target, name) for name in names}
-        taken = [name for name, state in states.items() if state in ("foreign", "blocked")]
-        error: dict[str, Any] = {"where": folder, "hint": "choose another --out, or --overwrite"}
+        before = mark_of(target).subject
+        states = {name: _state(target, name) for name in names}
+        foreign = [name for name, state in states.items() if state in ("foreign", "blocked")]
+        hint = "choose another --out, or --overwrite"
         if subject and before not in ("", subject) and not overwrite:
             what = "output folder holds the result of something else"
-            raise DataError(what, found=before, expected=subject, **error)
-        if taken and not overwrite:
-            what = "output folder holds files that would be overwritten and that this program did"
-            what += " not make, or that were changed since"
-            expected = "a new or empty folder, or that of an earlier result"
-            raise DataError(what, found=", ".join(taken), expected=expected, **error)
-        for name in (name for name in taken if states[name] == "blocked"):
+            raise DataError(what, where=folder, found=before, expected=subject, hint=hint)
+        if foreign and not overwrite:
+            raise DataError(
+                "output folder holds files that would be overwritten and that this program did not"
+                " make, or that were changed since",
+                where=folder,
+                found=", ".join(foreign),
+                expected="a new or empty folder, or that of an earlier result",
+                hint=hint,
+            )
+        for name in (name for name in foreign if states[name] == "blocked"):
             what = "cannot write over a folder, or below a file or link"
             raise DataError(what, where=target / name)
     return Path(folder)
@@ -128,8 +140,13 @@ def staged(
 ) -> Iterator[Path]:
     """An empty folder whose files are moved into `folder` when the block ends without exception.
 
-    On an exception the files of `folder` do not change, and no new folder is left. With `whole` the
-    files of an earlier result are removed. An empty `subject` is that of the earlier result.
+    On an exception the files of `folder` do not change, and no new folder is left.
+
+    Args:
+        folder: The output folder.
+        whole: The new files are a complete result: files of an earlier result are removed.
+        overwrite: Overwrite files that the program did not make.
+        subject: Subject of the new result; empty for that of the earlier result.
 
     Raises:
         DataError: a file cannot be written, or a file of the user has the name of a new one.
@@ -152,8 +169,8 @@ def staged(
             final = target / error.where.relative_to(stage)
             raise DataError(error.what, where=final, found=error.found, hint=error.hint) from error
         finally:
-            # fails for a folder that is not empty
             with suppress(OSError):
+                # fails for a folder that is not empty
                 for path in fresh:
                     path.rmdir()
 
@@ -178,17 +195,20 @@ def _commit(stage: Path, target: Path, whole: bool, subject: str) -> None:
 
 
 def recover(folder: Path) -> None:
-    """Finish the move of complete temporary folders; remove incomplete ones of ended processes."""
+    """Move the files of complete temporary folders to their places; remove incomplete ones.
+
+    The incomplete folders of running processes are kept.
+    """
     with _locked(folder):
         pass
 
 
 @contextmanager
 def _locked(folder: PathLike) -> Iterator[Path]:
-    """The real path of an output folder, recovered, and locked until the block ends, or by a kill.
+    """The real path of an output folder, recovered, and locked until the block ends.
 
-    A missing folder is not locked, nor one in a file system that has no locks, where another
-    process may be moving the same files.
+    A kill releases the lock. A missing folder is not locked, nor one in a file system that has no
+    locks, where another process may be moving the same files.
     """
     target = Path(os.path.realpath(as_path(folder, "output folder")))
     with ExitStack() as stack, _named_errors(folder):
