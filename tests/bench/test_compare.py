@@ -285,3 +285,12 @@ def test_an_error_is_a_row_and_others_go_on(exact, task, tmp_path, stub):
     # an error is no measurement
     assert [row["how"] for row in compared(lambda: task, lambda: task)] == ["returned"] * 2
     assert [row["how"] for row in read_rows(tmp_path / "r.jsonl")] == ["raised"] + ["returned"] * 2
+
+
+def test_rows_are_told_after_every_run_and_names_before(exact, task, tmp_path, stub):
+    stub(lambda solved_task: exact)
+    seen: list[int] = []
+    said: list[str] = []
+    run(task, ["a", "b"], tmp_path, said.append, lambda rows: seen.append(len(rows)))
+    assert seen == [1, 2]
+    assert [line.split()[-3] for line in said[::2]] == ["a", "b"]

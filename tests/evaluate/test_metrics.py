@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -69,6 +71,17 @@ def test_coverage_cap_and_mask():
 def test_negative_and_infinite_estimates_cost_coverage_not_error():
     m = depth_metrics([1.0, -1.0, 0.0, np.inf], [1.0, 1.0, 1.0, 1.0])
     assert (m.mre, m.coverage) == (0.0, 0.25)
+
+
+def test_names_of_scores_are_stable():
+    keys = (
+        "mre median_relative sq_rel rmse log_rmse delta1 delta2 delta3 scale_rule scale cap "
+        "coverage n_pixels"
+    )
+    m = depth_metrics([1.0], [2.0])
+    assert list(vars(m)) == keys.split()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        m.mre = 0.0  # type: ignore[misc]
 
 
 def test_a_preset_finds_no_error_in_a_scaled_truth():

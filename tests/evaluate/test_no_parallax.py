@@ -65,6 +65,7 @@ def test_a_pixel_without_backward_flow_affects_its_neighbourhood_alone():
     ("scene", "width", "said"),
     [
         ("still", 256, True),
+        ("orbit", 256, False),
         ("sheet", 768, False),
         # smaller ones are called a guess: a constant depth explains them to half a pixel
     ],

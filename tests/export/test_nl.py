@@ -1,7 +1,10 @@
-"""The .nl file equals the NLP: read back by CasADi, POUNCE and SCIP."""
+"""The .nl file equals the NLP: read back by CasADi, ASL, POUNCE and SCIP."""
 
 from __future__ import annotations
 
+import json
+import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +12,15 @@ import pytest
 from helpers_model import GAUGES, NORMS, PAPER, TRUNCATED, Tiny, value, wiggle
 from helpers_nl import ReadBack, close, defined_variables
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.export.nl import NLFile, readable_names, write_nl
+from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
 
 pytestmark = pytest.mark.slow
 
@@ -49,7 +58,8 @@ def test_casadi_reads_back_every_formulation(form, tmp_path):
     nlp, layout = tiny.nlp(TRUNCATED if form.norm == "epigraph" else PAPER, form)
     file = write_nl(tmp_path / "soup.nl", nlp, names=readable_names(nlp, layout))
     back = ReadBack(file.path)
-    agrees(nlp, file, back, wiggle(nlp, layout.size, 1, 0.2), 1)
+    for seed, size in ((0, 0.02), (1, 0.2)):
+        agrees(nlp, file, back, wiggle(nlp, layout.size, seed, size), seed)
     assert file.size == file.path.stat().st_size
     nonzeros = file.path.read_text().splitlines()[7]
     assert nonzeros.split()[:2] == [str(nlp.nnzj), str(file.counts["gradient_nonzeros"])]
@@ -136,11 +146,68 @@ def written(tmp_path_factory):
     return nlp, layout, write_nl(folder / "soup.nl", nlp, readable_names(nlp, layout), lam_g)
 
 
-def test_pounce_agrees(written):
-    """Everything that POUNCE reads equals the NLP, after the order of the file."""
+def test_ampls_own_library_agrees(written):
+    """ASL, the reader behind most solvers, through gjh_asl_json: derivatives at the start."""
+    tool = shutil.which("gjh_asl_json")
+    if tool is None:
+        pytest.skip("gjh_asl_json (Debian package gjh-asl-json) is not installed")
+    nlp, _, file = written
+    stub = file.path.with_suffix("")
+    args = ["rows=soup.row", "cols=soup.col", "json=soup.json"]
+    subprocess.run([tool, stub.name, *args], cwd=stub.parent, check=True, capture_output=True)
+    # ASL counts names from the files; the JSON is keyed by them
+    said = json.loads(stub.with_suffix(".json").read_text())
+    stats = said["problem statistics"]
+    assert stats["total no. of variables"] == nlp.nx
+    assert stats["total no. of constraints"] == nlp.ng
+    assert (
+        stats["no. of nonlinear variables in both constraints and objectives"]
+        == file.counts["nonlinear_variables"]["both"]
+    )
+    assert stats["no. of nonzeros in constraints' Jacobian"] == nlp.nnzj
+    cols = stub.with_suffix(".col").read_text().split()
+    rows = stub.with_suffix(".row").read_text().split()
+    J = nlp.jacobian(nlp.x0).toarray()[np.ix_(file.rows, file.variables)]
+    grad = nlp.gradient(nlp.x0)[file.variables]
+    found = np.zeros_like(J)
+    place = {f"{r}_{c}": (i, j) for i, r in enumerate(rows[:-1]) for j, c in enumerate(cols)}
+    flat = _section(said, "constraints' jacobian")
+    for key, v in flat.items():
+        found[place[key]] = v
+    np.testing.assert_allclose(found, J, rtol=1e-10, atol=1e-10)
+    g = np.zeros(nlp.nx)
+    for key, v in _section(said, "gradient").items():
+        g[cols.index(key.removeprefix("E_"))] = v
+    np.testing.assert_allclose(g, grad, rtol=1e-10, atol=1e-10)
+    # the Hessian of f + y g at the duals of the file
+    assert said["supplied starting points"]["dual"] == dict.fromkeys(rows[:-1], 1)
+    H = np.zeros((nlp.nx, nlp.nx))
+    places = {f"{a}_{b}": (i, j) for i, a in enumerate(cols) for j, b in enumerate(cols)}
+    for key, v in _section(said, "lagrangian hessian").items():
+        i, j = places[key]
+        H[i, j] = H[j, i] = v
+    expected = nlp.hessian(nlp.x0, np.ones(nlp.ng)).toarray()[
+        np.ix_(file.variables, file.variables)
+    ]
+    np.testing.assert_allclose(H, expected, rtol=1e-8, atol=1e-8)
+
+
+def _section(tree: dict, name: str) -> dict:
+    """First mapping of that name anywhere in a tree."""
+    todo = [tree]
+    while todo:
+        node = todo.pop()
+        for key, child in node.items():
+            if isinstance(child, dict):
+                if key == name:
+                    return child
+                todo.append(child)
+    raise KeyError(name)
+
+
+def pounce_agrees(nlp: NLP, file: NLFile, x: np.ndarray) -> None:
+    """Everything that POUNCE reads equals the NLP at x, after the order of the file."""
     pounce = pytest.importorskip("pounce", reason="pounce-solver is not installed")
-    nlp, layout, file = written
-    x = wiggle(nlp, layout.size, 3, 0.1)
     back = pounce.read_nl(str(file.path))
     v, r = file.variables, file.rows
     assert (back.n, back.m, back.nnz_jac) == (nlp.nx, nlp.ng, nlp.nnzj)
@@ -158,6 +225,13 @@ def test_pounce_agrees(written):
     i, j = (np.array(k) for k in back.hessian_structure())
     H[i, j] = back.hessian(x[v], lam[r], 0.7)
     close(H + np.tril(H, -1).T, nlp.hessian(x, lam, 0.7).toarray()[np.ix_(v, v)])
+
+
+def test_pounce_agrees(written):
+    pounce = pytest.importorskip("pounce", reason="pounce-solver is not installed")
+    nlp, layout, file = written
+    pounce_agrees(nlp, file, wiggle(nlp, layout.size, 3, 0.1))
+    back = pounce.read_nl(str(file.path))
     x_names, g_names = readable_names(nlp, layout)
     assert list(back.var_names) == [x_names[k] for k in file.variables]
     assert list(back.con_names) == [g_names[k] for k in file.rows]
@@ -176,3 +250,44 @@ def test_scip_reads_it(written):
     at = file.variables.tolist().index(0)
     name = file.path.with_suffix(".col").read_text().split()[at]
     assert named[name].getLbOriginal() == pytest.approx(nlp.lbx[0])
+
+
+# --- terms that only some pairs have -------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def swinging(tmp_path_factory) -> Case:
+    """A box that swings before a room: occlusion shows its order, and its true depth is given."""
+    folder = tmp_path_factory.mktemp("swing")
+    scene = {"kind": "scene", "scene": "swing", "width": 160, "height": 120}
+    np.save(folder / "depth.npy", render_scene("swing", 0, 160, 120).truth.depth_ref)
+    raw = {
+        "input": scene,
+        "flow": {"source": "truth"},
+        "segmentation": {"superpixels": 40, "neighbours": 4},
+        "energy": {"pixel_samples": 4},
+        "depth_prior": {"source": str(folder / "depth.npy")},
+    }
+    return prepare(make_problem(raw))
+
+
+@pytest.mark.parametrize("norm", NORMS)
+def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, norm, tmp_path):
+    data, eps = swinging.data, 2e-5
+    form = swinging.formulation(norm=norm, hessian="exact", compiled=False, eps=eps, eps_pixel=eps)
+    nlp, layout = swinging.nlp(form)
+    file = write_nl(tmp_path / "soup.nl", nlp)
+    back = ReadBack(file.path)
+    x = wiggle(nlp, layout.size, 0, 0.02)
+    agrees(nlp, file, back, x, 0)
+    pounce_agrees(nlp, file, x)
+    # at the start the file has both terms, up to their smoothing
+    exact = oracle.energy(swinging.soup, data, swinging.weights)
+    f = float(back.values(nlp.x0[file.variables])[0])
+    for term in ("depth", "order"):
+        weight = getattr(data, f"{term}_weight")
+        less = replace(data, **{f"{term}_weight": np.zeros_like(weight)})
+        other = build_matrix_nlp(swinging.soup, less, swinging.weights, form)[0]
+        within = eps * getattr(swinging.weights, term) * np.abs(weight).sum()
+        assert exact[term] - within <= f - value(other, other.x0)[0] <= exact[term] + 1e-9
+        assert exact[term] > 2 * within

@@ -79,6 +79,24 @@ def test_a_superpixel_at_rest_gets_a_tiny_translation():
 # --- names, sizes, print -------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_names_are_unique_and_as_many_as_there_are_numbers(gauge, norm):
+    problem = tiny()
+    nlp, layout = problem.nlp(weights_for("paper"), form(gauge=gauge, norm=norm))
+    x, g = nlp.x_names(), nlp.g_names()
+    assert len(x) == len(set(x)) == nlp.nx
+    assert len(g) == len(set(g)) == nlp.ng
+    k = 3 * layout.stride
+    assert x[k : k + 4] == ["lam[3]", "n[3,1]", "n[3,2]", "n[3,3]"]
+    # a name says where the number is
+    soup = layout.unpack(nlp.x0)
+    assert nlp.x0[x.index("R[5,2,1]")] == soup.R[5, 1, 0]
+    assert nlp.x0[x.index("t[7,3]")] * len(problem.seg) == soup.t[7, 2]
+    kinds = {re.sub(r"\[.*", "", name) for name in g}
+    assert {"so3", "normal", "visible", "simplex"} <= kinds
+
+
 @pytest.mark.parametrize(
     ("chart", "plane"), [("depth", ["lam", "s1", "s2"]), ("inverse-depth", ["rho", "g1", "g2"])]
 )

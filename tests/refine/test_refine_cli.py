@@ -13,17 +13,19 @@ import yaml
 from helpers_files import sets
 
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import load_problem
+from soup_nlp.config.problem import load_problem, make_problem
+from soup_nlp.errors import ConfigError
 from soup_nlp.model.energy_data import PAPER_TERMS
 from soup_nlp.pipeline.run import run
 from soup_nlp.refine.particles import KINDS
+from soup_nlp.refine.records import RefineOptions
 from soup_nlp.report.check import check_folder
 
 pytestmark = pytest.mark.slow
 
 SMALL = (
     "input.width=160 input.height=96 segmentation.superpixels=30 segmentation.neighbours=6"
-    " flow.source=truth refine.rounds=3 refine.particles=20 refine.stagnation=0 output.page=false"
+    " flow.source=truth refine.rounds=3 refine.particles=20 refine.stagnation=0"
 )
 
 
@@ -137,3 +139,12 @@ def test_an_interrupted_refinement_keeps_its_best_and_exits_with_1(tmp_path):
     assert len(done.refined.rounds) == 1
     assert not done.good
     assert done.refined.energy["total"] < done.refined.energy_begin["total"]
+
+
+@pytest.mark.parametrize("wrong", ["particles=1", "proposals=neighbours", "round=3", "rounds=-1"])
+def test_the_section_has_the_defaults_of_its_record_and_is_strict(wrong):
+    problem = make_problem({"input": {"kind": "motorcycle"}})
+    assert problem.refine == RefineOptions()
+    assert problem.refine.particles == 50
+    with pytest.raises(ConfigError, match="refine"):
+        make_problem({"input": {"kind": "motorcycle"}}, [f"refine.{wrong}"])

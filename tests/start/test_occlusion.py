@@ -210,3 +210,12 @@ def test_without_its_weight_nothing_is_placed_in_order():
     assert not case.data.order_weight.any()
     answer = solve_soup(case.start.soup, case.data, case.weights, case.formulation(), case.options)
     assert "order" not in answer.energy
+
+
+def test_the_preset_of_the_paper_has_no_order():
+    problem = make_problem(
+        {"name": "p", "preset": "paper", "input": {"kind": "scene", "scene": "swing"}},
+        [],
+        where="t",
+    )
+    assert problem.energy.weights.order == 0
