@@ -71,7 +71,7 @@ results: $(VENV)/.optional
 	$(SOUP) family out/tangent --sizes 100,250 --starts hard --coordinates tangent --overwrite
 	$(SOUP) family out/matrix --sizes 100 --starts hard --overwrite
 	$(SOUP) compare out/tangent out/matrix -o results/solvers --seconds 10 --iterations 500 \
-		--solvers ipopt,ipopt-lbfgs,sqpmethod,uno,fatrop,pounce,lm,soup-nlp --overwrite
+		--solvers ipopt,ipopt-lbfgs,sqpmethod,uno,fatrop,pounce,soup-nlp --overwrite
 
 clean:
 	rm -rf $(VENV) out site

@@ -120,7 +120,7 @@ def export(
 QUICK = "100,250"
 """Default sizes, which take about a minute."""
 
-TABLES = ("index.json", "instancedata.csv", "run.py", "README.md", "LICENSE.txt")
+TABLES = ("index.json", "instancedata.csv", "README.md", "LICENSE.txt")
 """Files of a set beside its instances."""
 
 

@@ -40,14 +40,6 @@ SIZES = (100, 250, 500, 1000, 2000)
 STARTS = ("easy", "hard", "cold")
 STANDARD = "unit-offset/smooth"
 """Default formulation of the family."""
-INITIALS = {
-    "unit-offset": "o",
-    "unit-translation": "t",
-    "tangent": "n",
-    "smooth": "s",
-    "epigraph": "e",
-}
-"""Letter of every word of a formulation."""
 BITS = 20
 """Significant bits of every number of an instance."""
 MIN_EXPONENT = -30
@@ -78,20 +70,13 @@ class Instance:
         return f"{self.problem}-{self.start}"
 
     @property
-    def short(self) -> str:
-        """The same in at most 24 characters, such as `SOUP-street-os-100h`: initials of gauge and
-        norm ("n" for tangent coordinates, of which there are nine), and of the start."""
-        form = "".join(INITIALS[word] for word in self.formulation.split("/"))
-        return f"SOUP-{self.scene}-{form}-{self.size}{self.start[0]}"
-
-    @property
     def problem(self) -> str:
         """The name without the start."""
         return f"SOUP-{self.scene}-{self.formulation.replace('/', '-')}-N{self.size}"
 
 
 def parse_name(name: str) -> Instance:
-    """The instance of a long or short name; a long name without start gets the first start.
+    """The instance of a name; a name without start gets the first start.
 
     Raises:
         ConfigError: the name is not one of the family.
@@ -110,7 +95,7 @@ def parse_name(name: str) -> Instance:
 def _by_name() -> dict[str, Instance]:
     every = select(SIZES, SCENES, formulations())
     first = {i.problem: i for i in every if i.start == STARTS[0]}
-    return first | {name: i for i in every for name in (i.name, i.short)}
+    return first | {i.name: i for i in every}
 
 
 def formulations() -> list[str]:

@@ -11,7 +11,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from soup_nlp import __version__
@@ -19,7 +18,6 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.export.nl import NLFile, readable_names, write_nl
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import examine
-from soup_nlp.family import run_solver
 from soup_nlp.family.describe import CLASSES, classes, classification, qualification
 from soup_nlp.family.frozen import Frozen, load_frozen
 from soup_nlp.family.instances import VERSION, Instance, build_instance, case_of, problems
@@ -70,20 +68,17 @@ def write_family(
         for form in dict.fromkeys(i.formulation for i in members):
             starts = [i for i in members if i.formulation == form]
             shared: Entry = {}
-            programs = []
             for instance in starts:
                 nlp, layout, _ = build_instance(case, record, form, instance.start)
                 names = readable_names(nlp, layout)
                 file = write_nl(folder / f"{instance.name}.nl", nlp, names=names)
                 shared = shared or _solved(folder, case, record, instance, file, known)
                 entries.append(_entry(instance, nlp, file, shared, known))
-                programs.append(nlp)
                 changed = "  NOT the published bytes" * (entries[-1]["published"] is False)
                 say(
                     f"{file.path.name:<52} n {nlp.nx:>6}  m {nlp.ng:>6}"
                     f"  {file.size / 1e6:5.1f} MB{changed}"
                 )
-            write_text(folder / f"{starts[0].problem}.casadi", as_casadi(programs))
     index = {"set": "SOUP", "version": VERSION, "generator": f"soup_nlp {__version__}"}
     write_json(folder / "index.json", {**index, "instances": entries})
     rows = [instance_data(e) for e in entries]
@@ -92,7 +87,6 @@ def write_family(
     writer.writeheader()
     writer.writerows(rows)
     write_text(folder / "instancedata.csv", table.getvalue())
-    write_text(folder / "run.py", Path(run_solver.__file__).read_text(encoding="utf-8"))
     write_text(folder / "README.md", readme(entries))
     write_text(folder / "LICENSE.txt", _file("LICENSE.txt"))
     return entries
@@ -148,7 +142,6 @@ def _entry(
     sha = known["sha256"].get(instance.name)
     return {
         "name": instance.name,
-        "short": instance.short,
         "file": file.path.name,
         "scene": instance.scene,
         "formulation": instance.formulation,
@@ -168,22 +161,6 @@ def _short(value: Any, digits: int = DIGITS) -> float:
     return float(f"{float(value):.{digits}g}")
 
 
-def as_casadi(programs: Sequence[NLP]) -> str:
-    """A program with its starts as CasADi's serialised text: function `nlp` of x to f and g, then
-    lbx, ubx, lbg, ubg, and x0 of every start.
-
-    Variables and rows are in the order of the program, not in that of the .nl file.
-    """
-    nlp = programs[0]
-    x = ca.MX.sym("x", nlp.nx)
-    f, g = nlp.graph.oracle(x, nlp.graph.p)
-    text = ca.StringSerializer()
-    text.pack(ca.Function("nlp", [x], [f, g], ["x"], ["f", "g"]))
-    for vector in (nlp.lbx, nlp.ubx, nlp.lbg, nlp.ubg, *(p.x0 for p in programs)):
-        text.pack(ca.DM(vector))
-    return str(text.encode())
-
-
 def instance_data(entry: Mapping[str, Any]) -> Entry:
     """An entry in the columns of MINLPLib's instancedata.csv, as far as they have a meaning here.
 
@@ -194,7 +171,7 @@ def instance_data(entry: Mapping[str, Any]) -> Entry:
         word: sum(c["rows"] for c in rows if c["class"] == word) for word in CLASSES.values()
     }
     return {
-        "name": entry["short"],
+        "name": entry["name"],
         "file": entry["file"],
         "probtype": "NLP",
         "objsense": "min",
@@ -254,7 +231,7 @@ def _reached(entries: Sequence[Entry]) -> list[str]:
         gap = f"{100 * (objective - best) / abs(best):+.2g} %"
         return f"{f'**{gap}**' if verified else gap}, {seconds:g} of {limit:g} s"
 
-    rows = [[e["short"], *(cell(e, s) for s in solvers)] for e in measured]
+    rows = [[e["name"], *(cell(e, s) for s in solvers)] for e in measured]
     return [
         "",
         "## What solvers reached",

@@ -19,7 +19,7 @@ from soup_nlp.bench.processes import isolated
 from soup_nlp.bench.solvers import runner
 from soup_nlp.bench.solvers.page import frame_of_runs, page
 from soup_nlp.bench.solvers.plugins import PLUGINS, Answer, Task
-from soup_nlp.bench.solvers.runner import available, compare, executable, find_solver, reference
+from soup_nlp.bench.solvers.runner import available, compare, executable, find_solver
 from soup_nlp.errors import DataError, SolverError
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, violations
@@ -156,10 +156,9 @@ def test_a_claim_with_the_gauss_newton_hessian_is_true(task, tmp_path):
     assert row["verified"] == row["claimed"]
 
 
-def test_a_reference_solver_returns_a_point_of_the_epigraph_form():
+def test_a_soup_becomes_a_point_of_the_epigraph_form():
     task = make_task(norm="epigraph")
-    task = replace(task, limits=replace(task.limits, seconds=2.0))
-    x = task.point(reference(task).x)
+    x = task.point(replace(task.soup, t=1.1 * task.soup.t))
     size = task.layout.size
     assert np.abs(x[size:] - task.nlp.x0[size:]).max() > 1e-3
     assert violations(task.nlp, x)["rows"].max() < 1e-6

@@ -186,7 +186,7 @@ def test_command(tmp_path, capsys):
 
 
 def test_files_are_read_before_anything_runs(tmp_path, capsys):
-    words = ["-o", str(tmp_path), "--solvers", "lm,lm", "--seconds", "5", *SMALL]
+    words = ["-o", str(tmp_path), "--solvers", "soup-nlp,soup-nlp", "--seconds", "5", *SMALL]
     assert main(["compare", "orbit", "orbitt.yaml", *words]) == 2
     assert main(["compare", "orbit", *words, "--set", "segmentation.superpixels=0"]) == 2
     assert "superpixels" in capsys.readouterr().err
@@ -204,7 +204,7 @@ def test_an_interrupted_comparison_has_a_page_and_goes_on(tmp_path, monkeypatch,
 
     monkeypatch.setattr(runner, "isolated", second_is_interrupted)
     out = tmp_path / "out"
-    words = ["compare", "orbit", "--solvers", "lm,soup-nlp", "--seconds", "5"]
+    words = ["compare", "orbit", "--solvers", "ipopt-tuned,soup-nlp", "--seconds", "5"]
     words += ["-o", str(out), *SMALL]
     assert main(words) == 130
     assert "1 runs" in (out / "README.md").read_text()

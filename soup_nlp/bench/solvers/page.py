@@ -46,7 +46,6 @@ LIMITS = (
     "Residuals are unscaled and may be ten times the tolerance, as every solver scales its own.",
     "Options are those of `soup_nlp/bench/solvers/plugins.py`, the package's own ones being tuned"
     " on such problems.",
-    "lm, the reference solver on the manifold, claims no optimum; its points are verified alike.",
 )
 COLUMNS = {
     "superpixels": ("N", ""),

@@ -41,7 +41,7 @@ class Task:
         nlp: The NLP with the exact Hessian.
         layout: Its layout.
         soup: Start.
-        data, weights, form: Energy and formulation, for the reference solver, which takes no NLP.
+        data, weights, form: Energy and formulation, for this package, which builds its own NLPs.
         limits: Limits of time, iterations, tolerance and memory.
     """
 

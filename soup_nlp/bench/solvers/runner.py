@@ -1,6 +1,6 @@
 """Solvers by name, and their runs as rows: each in a process of its own, its claim verified.
 
-Solvers are CasADi's plug-ins, programs that read .nl, the reference solver, and this package.
+Solvers are CasADi's plug-ins, programs that read .nl, and this package.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import casadi as ca
 import numpy as np
 
 from soup_nlp.bench.processes import isolated, processor
-from soup_nlp.bench.reference_solver import EPS, levenberg_marquardt
 from soup_nlp.bench.solvers.plugins import (
     PLUGINS,
     WALL_PER_CPU,
@@ -64,18 +63,6 @@ KEY = ("problem", "problem_hash", "superpixels", "formulation", "start")
 # --- solvers -------------------------------------------------------------------------------------
 
 
-def reference(task: Task) -> Answer:
-    """Solve with Levenberg-Marquardt on the manifold; the answer has no multipliers.
-
-    It ends when the energy stops decreasing, and it claims no optimum.
-    """
-    last = task.form.eps
-    eps = [*(e for e in EPS if e > last), last]
-    energy = task.soup, task.data, task.weights, task.form
-    y = levenberg_marquardt(*energy, eps=eps, seconds=0.8 * WALL_PER_CPU * task.limits.seconds)
-    return Answer(y.soup, None, y.status, False, y.iterations)
-
-
 def package(task: Task) -> Answer:
     """Solve as this package does: Ipopt's stages, then the constrained NLP."""
     m = task.limits
@@ -103,7 +90,6 @@ def available() -> dict[str, Solver]:
     if command:
         out["pounce"] = partial(pounce, command)
         out["pounce-tuned"] = partial(pounce, command, near=True)
-    out["lm"] = reference
     out["soup-nlp"] = package
     return out
 
