@@ -185,12 +185,12 @@ STORED = {
 
 
 def stored_scores():
-    """{(pair, flow): (solution, constant)}, of KITTI's pairs by KITTI's convention."""
+    """{(pair, flow): (solution, constant)}; older pages have tables of their own for KITTI."""
     out = {}
     for name in ("rendered", "shared"):
         text = (ROOT / "results" / "accuracy" / f"{name}.md").read_text(encoding="utf-8")
         for part in re.split(r"^## ", text, flags=re.MULTILINE):
-            if part.startswith(("MRE, paper", "MRE, kitti")):
+            if part.startswith(("MRE, paper", "MRE, kitti", "MRE, one")):
                 rows = [[c.strip() for c in line.split("|")[1:-1]] for line in part.splitlines()]
                 head = next(row for row in rows if row[:1] == ["pair, flow"])
                 at = [head.index("solution"), head.index("constant")]

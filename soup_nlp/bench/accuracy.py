@@ -1,10 +1,10 @@
-"""Measurement of one pair: a row with the errors of solution and baselines by convention."""
+"""Measurement of one pair: a row with the errors of solution and baselines."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -18,9 +18,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import (
     ERRORS,
     MEDIAN,
-    PRESETS,
     UNSCALED,
-    Convention,
     DepthMetrics,
     depth_metrics,
     scene_flow_epe,
@@ -58,28 +56,27 @@ def measure_pair(cell: Cell) -> Row:
     """Solve and score one pair.
 
     Raises:
-        SoupError: the pair cannot be solved, or no convention has a true pixel.
+        SoupError: the pair cannot be solved, or has no true depth.
     """
-    return scores(solved(cell), cell.item.presets)
+    return scores(solved(cell))
 
 
 def solved(cell: Cell) -> Run:
     """The run of a pair that can be scored.
 
     Raises:
-        SoupError: the pair cannot be solved, or no convention has a true pixel.
+        SoupError: the pair cannot be solved, or has no true depth.
     """
     begin, item = time.perf_counter(), cell.item
     problem = item.problem(cell.overrides)
     pair = problem.load_pair()
     loaded = time.perf_counter() - begin
     # do not solve a pair that cannot be scored
-    if not any(_applies(pair.truth, PRESETS[name]) for name in item.presets):
+    if not has_depth(pair.truth):
         suite = SUITES[item.suite]
         raise DataError(
             "pair has no true depth",
             where=item.key,
-            found=f"no pixel that counts under {', '.join(item.presets)}",
             expected=suite.layout or None,
             hint=f"get it from {suite.source}" if suite.source else None,
         )
@@ -87,20 +84,16 @@ def solved(cell: Cell) -> Run:
     return replace(result, seconds={**result.seconds, "load": loaded})
 
 
-def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
-    """Metrics by convention and method, flow error, scene flow and sigma of a run.
+def scores(result: Run) -> Row:
+    """Metrics by method, flow error, scene flow and sigma of a run.
 
-    A convention is left out if no true pixel counts under it, or if it needs a depth map and the
-    truth has sparse points. "guess" is the share of the image that is marked as a guess, "within"
-    has the shares of the pixels whose log depth is within one and two sigma.
+    Metrics are of every true pixel after one median scale, without a cap. "guess" is the share of
+    the image that is marked as a guess, "within" has the shares of the pixels whose log depth is
+    within one and two sigma.
     """
     maps, truth, solution = depth_maps(result), result.pair.truth, result.solution
     sigma = result.reconstruction.sigma_ref
-    metrics: dict[str, dict[str, dict[str, float]]] = {}
-    for name in presets:
-        if _applies(truth, PRESETS[name]):
-            metrics[name] = _rows(score_depths(truth, maps, PRESETS[name], sigma=sigma))
-    main = next(iter(metrics), "")
+    metrics = _rows(score_depths(truth, maps, sigma=sigma)) if has_depth(truth) else {}
     return {
         "status": solution.status,
         "good": result.solved,
@@ -111,8 +104,8 @@ def scores(result: Run, presets: Sequence[str] = ("paper",)) -> Row:
         **_sigma(result),
         "flow_error": flow_error(result.pair),
         "metrics": metrics,
-        "scene_flow": _scene_flow(result, metrics[main]["solution"]["scale"]) if main else None,
-        "moving": moving(result.pair, maps["solution"], PRESETS[main]) if main else None,
+        "scene_flow": _scene_flow(result, metrics["solution"]["scale"]) if metrics else None,
+        "moving": moving(result.pair, maps["solution"]) if metrics else None,
     }
 
 
@@ -140,18 +133,11 @@ def _sigma(result: Run) -> Row:
 
 def has_depth(truth: Truth | None) -> bool:
     """Whether there is a depth to compare with."""
-    return truth is not None and (truth.depth_ref is not None or truth.points is not None)
-
-
-def _applies(truth: Truth | None, convention: Convention) -> bool:
-    """Whether a true pixel counts under a convention; a crop needs a depth map."""
     if truth is None:
         return False
     if truth.depth_ref is not None:
-        return convention.counts(truth.depth_ref)
-    if truth.points is None or convention.crop is not None:
-        return False
-    return convention.counts(truth.points[:, 2])
+        return MEDIAN.counts(truth.depth_ref)
+    return truth.points is not None and MEDIAN.counts(truth.points[:, 2])
 
 
 def _rows(scored: Mapping[str, DepthMetrics]) -> dict[str, dict[str, float]]:
@@ -163,8 +149,8 @@ def _rows(scored: Mapping[str, DepthMetrics]) -> dict[str, dict[str, float]]:
     }
 
 
-def moving(pair: Pair, depth: Float, convention: Convention) -> Row | None:
-    """Errors of independently moving pixels and of all other pixels, under one common scale.
+def moving(pair: Pair, depth: Float) -> Row | None:
+    """Errors of independently moving pixels and of all other pixels, under one median scale.
 
     Components move independently if their true motion is not that of the static scene; without
     known motions, all do.
@@ -172,7 +158,6 @@ def moving(pair: Pair, depth: Float, convention: Convention) -> Row | None:
     Args:
         pair: Its truth must have components (0 is the static scene) and dense depth.
         depth: (H, W) z.
-        convention: Rule of the one scale of the whole image, and the pixels that count.
 
     Returns:
         "mre" and "rest", the MRE of moving and of other pixels. None without such a truth or
@@ -186,11 +171,11 @@ def moving(pair: Pair, depth: Float, convention: Convention) -> Row | None:
     if truth.motions is not None:
         near = np.isclose(truth.motions, truth.motions[0], rtol=0, atol=1e-9).all(axis=(1, 2))
         moving_part &= ~np.isin(label, np.flatnonzero(near))
-    counts = convention.mask(gt)
+    counts = MEDIAN.mask(gt)
     moves, static = counts & moving_part, counts & (label >= 0) & ~moving_part
     if not moves.any() or not static.any():
         return None
-    z = depth * depth_metrics(depth, gt, convention).scale
+    z = depth * depth_metrics(depth, gt).scale
     masks = {"mre": moves, "rest": static}
     return {k: depth_metrics(z, gt, UNSCALED, m).mre for k, m in masks.items()}
 

@@ -8,19 +8,18 @@ import numpy as np
 import pandas as pd
 
 from soup_nlp.bench.accuracy import BASELINES, METHODS
-from soup_nlp.bench.study import main_metric, markdown, page_text, panels, provenance, save, titled
-from soup_nlp.evaluate.metrics import ERRORS, PRESETS
+from soup_nlp.bench.study import markdown, metric, page_text, panels, provenance, save, titled
+from soup_nlp.evaluate.metrics import ERRORS, MEDIAN
 
 SURENESS = ["AUSE", "guess", "within 1", "within 2"]
 """Columns on sigma."""
 ABOUT_FAMILIES = (
-    "Means over the pairs, each under its own convention. Moving: pixels that move by themselves,"
+    "Means over the pairs. Moving: pixels that move by themselves,"
     " where a mask or the true motion is known. AUSE: area between the sparsification curve of"
     " sigma and the oracle's, over the MRE; 0 is perfect, 0.8 to 1 is chance. Guess: share of the"
     " image. Within k: share of the pixels whose log depth is within k sigma."
 )
 BETTER = {
-    "main": ("convention", ""),
     "baseline": ("baseline", ""),
     "theirs": ("its MRE", ".4f"),
     "mre": ("the solution's", ".4f"),
@@ -56,15 +55,13 @@ def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = F
     verdict = (
         f"{len(good)} of {len(frame)} pairs measured, {int(good.get('good', good['ok']).sum())}"
         f" converged. The solution beats every baseline on {len(scored) - beaten} of {len(scored)}"
-        " (MRE, each pair's own convention)."
+        " (MRE)."
     )
     about = f"{provenance(frame)}; settings {settings} (one a flow source)."
     blocks = [f"# Accuracy on {name}", note, verdict, about]
-    for convention in dict.fromkeys(p for presets in scored["presets"] for p in presets):
-        blocks += _convention(convention, scored)
-    blocks += [*_families(scored), *_better_baselines(scored)]
-    for convention, group in scored.groupby("main", sort=False):
-        blocks += [f"## The solution, {PRESETS[str(convention)]}", _details(group)]
+    if len(scored):
+        blocks += [f"## MRE, {MEDIAN}", _by_pair(scored), *_families(scored)]
+        blocks += [*_better_baselines(scored), "## The solution", _details(scored)]
     if picture:
         blocks += ["## Sigma", f"![Sparsification by sigma, by family]({name}.png)"]
     return page_text(blocks, frame)
@@ -77,11 +74,11 @@ def beating(frame: pd.DataFrame) -> pd.DataFrame:
     """
     parts = []
     for baseline in BASELINES:
-        part = frame[["title", "main"]].assign(baseline=baseline, mre=frame["mre"])
+        part = frame[["title"]].assign(baseline=baseline, mre=frame["mre"])
         if baseline == "rigid":
-            part["mre"] = main_metric(frame, "solution_rigid").fillna(frame["mre"])
-        part["theirs"] = main_metric(frame, baseline)
-        part["pixels"] = main_metric(frame, baseline, "coverage")
+            part["mre"] = metric(frame, "solution_rigid").fillna(frame["mre"])
+        part["theirs"] = metric(frame, baseline)
+        part["pixels"] = metric(frame, baseline, "coverage")
         parts.append(part[part["theirs"] <= part["mre"]])
     return pd.concat(parts, ignore_index=True)
 
@@ -100,28 +97,12 @@ def _pairs(frame: pd.DataFrame) -> pd.Index:
     return pd.Index(frame["title"], name="pair, flow")
 
 
-def _convention(name: str, frame: pd.DataFrame) -> list[str]:
-    """Tables of the MRE of every method under one convention, by pair, sequence and dataset."""
-    columns = {f"metrics.{name}.{m}.mre": m for m in METHODS}
-    columns |= {f"metrics.{name}.solution.{k}": k for k in ("skill", "coverage")}
-    scored = frame[frame[f"metrics.{name}.solution.mre"].notna()]
-    numbers = scored[[c for c in columns if c in scored]].astype(float).rename(columns=columns)
-    numbers = numbers.dropna(axis=1, how="all")
-    text = PRESETS[name].text
-    blocks = [f"## MRE, {PRESETS[name]}", f"{text[0].upper()}{text[1:]}."]
-    blocks.append(markdown(numbers.set_axis(_pairs(scored))))
-    for level, by in (("sequence", ["suite", "sequence", "flow"]), ("dataset", ["suite", "flow"])):
-        groups = pd.concat([scored[by], numbers], axis=1).groupby(by, sort=False)
-        if 0 < groups.ngroups < len(scored):
-            blocks += [f"Mean per {level}:", _means(groups)]
-    return blocks
-
-
-def _means(groups: pd.api.typing.DataFrameGroupBy, **more: pd.Series) -> str:
-    """Table of the number of pairs and the means of groups, and further columns."""
-    means = groups.mean().assign(**more)
-    means.insert(0, "pairs", groups.size())
-    return markdown(means, {str(c): "" if c == "pairs" else ".4f" for c in means})
+def _by_pair(frame: pd.DataFrame) -> str:
+    """Table of the MRE of every method."""
+    columns = {m: metric(frame, m) for m in METHODS}
+    columns |= {k: metric(frame, name=k) for k in ("skill", "coverage")}
+    numbers = pd.DataFrame(columns).dropna(axis=1, how="all")
+    return markdown(numbers.set_axis(_pairs(frame)))
 
 
 def _families(frame: pd.DataFrame) -> list[str]:
@@ -129,21 +110,24 @@ def _families(frame: pd.DataFrame) -> list[str]:
     by = ["sequence", "flow"]
     shown = frame[[*by, "mre", "constant"]].copy()
     for title, name in {"median": "median_relative", "d<1.25": "delta1", "skill": "skill"}.items():
-        shown[title] = main_metric(frame, name=name)
+        shown[title] = metric(frame, name=name)
     for title, column in {"MRE moving": "moving.mre", "MRE of the rest": "moving.rest"}.items():
         shown[title] = frame[column].astype(float) if column in frame else np.nan
     groups = pd.concat([shown, frame[SURENESS]], axis=1).groupby(by, sort=False)
     if groups.ngroups < 2:
         return []
     worst = frame["title"][groups["mre"].idxmax()].set_axis(groups["mre"].max().index)
-    return ["## By family", ABOUT_FAMILIES, _means(groups, **{"worst pair": worst})]
+    means = groups.mean().assign(**{"worst pair": worst})
+    means.insert(0, "pairs", groups.size())
+    forms = {str(c): "" if c == "pairs" else ".4f" for c in means}
+    return ["## By family", ABOUT_FAMILIES, markdown(means, forms)]
 
 
 def _details(frame: pd.DataFrame) -> str:
     """Table of the solution's other errors, flow error, scene flow, sigma and seconds."""
     heads = ("median", "SqRel", "RMSE", "log-RMSE", "d<1.25", "d<1.25^2", "d<1.25^3")
     errors = zip(heads, ERRORS[1:], strict=True)
-    out = pd.DataFrame({head: main_metric(frame, name=name) for head, name in errors})
+    out = pd.DataFrame({head: metric(frame, name=name) for head, name in errors})
     for column, head in DETAILS.items():
         if column in frame:
             out[head] = frame[column].astype(float)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from textwrap import shorten
@@ -25,17 +24,17 @@ from soup_nlp.storage.rows import Row
 
 METHODS: Mapping[str, Overrides] = MappingProxyType({"preset: paper": PAPER, "defaults": ()})
 """Overrides by the name of a method."""
-DATASETS: Mapping[str, tuple[str, tuple[str, ...], str]] = MappingProxyType(
+DATASETS: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType(
     {
-        "sintel": ("MPI Sintel", ("sintel",), "sintel70"),
-        "vkitti": ("Virtual KITTI", ("vkitti",), "eigen80"),
-        "kitti": ("KITTI", ("kitti2012", "kitti2015"), "eigen80"),
-        "kinect_paper": ("kinect_paper", ("kinect_paper",), ""),
-        "kinect_tshirt": ("kinect_tshirt", ("kinect_tshirt",), ""),
+        "sintel": ("MPI Sintel", ("sintel",)),
+        "vkitti": ("Virtual KITTI", ("vkitti",)),
+        "kitti": ("KITTI", ("kitti2012", "kitti2015")),
+        "kinect_paper": ("kinect_paper", ("kinect_paper",)),
+        "kinect_tshirt": ("kinect_tshirt", ("kinect_tshirt",)),
     }
 )
-"""Title, suites, and metric convention with a depth cap of the paper's datasets. Without data of a
-suite, the families of these names in the suite `shared` are taken."""
+"""Title and suites of the paper's datasets. Without data of a suite, the families of these names in
+the suite `shared` are taken."""
 STUDIED = ("street", "room", MOTORCYCLE.name, "kitti", "kinect_paper")
 """Families whose first pairs all studies have."""
 SHARED = ("driving_synthetic", "tum_fr1", "kitti2015", "kitti_tracking", "rgbd", "deepdeform")
@@ -163,12 +162,12 @@ def _families(
 
 def _dataset(name: str, data: Path | None, limit: int | None) -> list[Item]:
     """At most `limit` pairs of a dataset that have a truth, evenly spaced."""
-    _, suites, cap = DATASETS[name]
+    _, suites = DATASETS[name]
     listed = [i for suite in suites for i in _with_truth(suite, data)]
     listed = listed or _with_truth("shared", data, suites)
     if limit is not None and listed:
         listed = [listed[k] for k in spread(len(listed), limit)]
-    return [replace(i, presets=(*i.presets, cap)) if cap else i for i in listed]
+    return listed
 
 
 def _with_truth(suite: str, data: Path | None, sequences: tuple[str, ...] = ()) -> list[Item]:
@@ -182,7 +181,7 @@ def _with_truth(suite: str, data: Path | None, sequences: tuple[str, ...] = ()) 
         with suppress(SoupError):
             wanted = not sequences or item.sequence in sequences
             if wanted and has_depth(item.problem().load_pair().truth):
-                out.append(replace(item, presets=("paper", "best")))
+                out.append(item)
     return out
 
 
@@ -207,7 +206,7 @@ def measure_paper(cell: Cell) -> Row:
         "exact": [s.energy_start["total"], s.energy["total"]],
         "rounds": [energy["total"] for energy in rounds],
     }
-    return {**scores(result, cell.item.presets), "curve": curve}
+    return {**scores(result), "curve": curve}
 
 
 def write_maps(path: Path, result: Run) -> None:

@@ -20,9 +20,9 @@ from soup_nlp.bench.study import (
     Cell,
     Item,
     Overrides,
-    main_metric,
     markdown,
     measure_cells,
+    metric,
     page_text,
     pivot,
     provenance,
@@ -98,7 +98,7 @@ def pair_loss(frame: pd.DataFrame) -> pd.Series:
 
     With the logarithm, halving the error counts the same on easy and on hard pairs.
     """
-    constant = main_metric(frame, "constant").clip(lower=MIN_MRE)
+    constant = metric(frame, "constant").clip(lower=MIN_MRE)
     loss = np.log(frame["mre"].clip(lower=MIN_MRE) / constant)
     good = frame["ok"].eq(True)
     return loss.where(good).fillna(FAILED_LOSS).clip(upper=FAILED_LOSS)
@@ -189,8 +189,8 @@ def search_page(frame: pd.DataFrame, space: Sequence[str], command: str) -> str:
         f" {trials['score'][DEFAULT]:.3f} of the default.",
         f"{provenance(frame)}.",
         f"    {command}",
-        "Score: mean over pairs of ln(MRE / MRE of a constant depth), MRE under the pair's own"
-        f" convention and at least {MIN_MRE:g}; {FAILED_LOSS:.2f} for a pair that fails. Lower is"
+        "Score: mean over pairs of ln(MRE / MRE of a constant depth), MRE at"
+        f" least {MIN_MRE:g}; {FAILED_LOSS:.2f} for a pair that fails. Lower is"
         " better; -0.69 is half the error of a constant depth.",
         "## What was varied",
         "\n".join(f"- `{text}`" for text in space),

@@ -14,7 +14,7 @@ from scipy.stats import linregress
 
 from soup_nlp.bench.accuracy import scores
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.study import Cell, Item, main_metric, markdown, page_text, provenance, titled
+from soup_nlp.bench.study import Cell, Item, markdown, metric, page_text, provenance, titled
 from soup_nlp.bench.suites import MOTORCYCLE, Options, list_suite
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.folder import prepare_folder, write_folder
@@ -163,7 +163,7 @@ def with_costs(frame: pd.DataFrame) -> pd.DataFrame:
         return frame.iloc[:0]
     out = frame[frame["ok"].eq(True)].copy()
     out["outside"] = out.reindex(columns=[f"cpu.{s}" for s in OUTSIDE]).astype(float).sum(axis=1)
-    out["start"], out["GB"] = main_metric(out, "start"), out["peak_bytes"].astype(float) / 2**30
+    out["start"], out["GB"] = metric(out, "start"), out["peak_bytes"].astype(float) / 2**30
     out["cpu an iteration"] = out["cpu.nlp"] / out["iterations"].clip(lower=1)
     return out
 

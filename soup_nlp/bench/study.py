@@ -39,7 +39,6 @@ class Item:
         name: Name, unique in the suite.
         flow: Flow source.
         input: Section `input` of the problem.
-        presets: Metric conventions of the scores, the main one first.
         needs: Files that must exist.
         true_flow: Whether the pair has a true flow that it may be solved with.
     """
@@ -49,7 +48,6 @@ class Item:
     name: str
     flow: str
     input: Mapping[str, Any] = field(repr=False)
-    presets: tuple[str, ...] = ("paper",)
     needs: tuple[Path, ...] = field(default=(), repr=False)
     true_flow: bool = True
 
@@ -102,7 +100,6 @@ class Cell:
             "flow": self.item.flow,
             "variant": self.variant,
             "overrides": list(self.overrides),
-            "presets": list(self.item.presets),
             "settings": _hash(problem, NOT_SETTINGS),
             "input": _hash(problem.input, PATHS),
         }
@@ -146,8 +143,7 @@ def measure_cells(
 def frame_of(rows: Sequence[Row]) -> pd.DataFrame:
     """A line for each row; dotted names for nested entries, `title` for the pair and its flow.
 
-    `main` is the metric convention of a row, and `mre` and `constant` are the mean relative errors
-    of the solution and of a constant depth under it.
+    `mre` and `constant` are the mean relative errors of the solution and of a constant depth.
     """
     frame = pd.json_normalize(list(rows))
     # columns that every reader expects come first, and are always there
@@ -155,22 +151,17 @@ def frame_of(rows: Sequence[Row]) -> pd.DataFrame:
     frame = frame.reindex(columns=list(dict.fromkeys([*expected, *frame.columns])))
     if "pair" not in frame:
         return frame
-    frame["main"] = [presets[0] for presets in frame["presets"]]
     suites = frame.groupby("pair")["suite"].transform("nunique")
     name = np.where(suites > 1, frame["suite"] + " " + frame["pair"], frame["pair"])
     frame["title"] = [f"{pair}, {flow}" for pair, flow in zip(name, frame["flow"], strict=True)]
-    frame["mre"], frame["constant"] = main_metric(frame), main_metric(frame, "constant")
+    frame["mre"], frame["constant"] = metric(frame), metric(frame, "constant")
     return frame
 
 
-def main_metric(frame: pd.DataFrame, method: str = "solution", name: str = "mre") -> pd.Series:
-    """A metric of every row under its own convention; NaN where it is not known."""
-    out = pd.Series(np.nan, index=frame.index, dtype=float)
-    for convention in frame["main"].unique():
-        column = f"metrics.{convention}.{method}.{name}"
-        if column in frame:
-            out = out.where(frame["main"] != convention, frame[column].astype(float))
-    return out
+def metric(frame: pd.DataFrame, method: str = "solution", name: str = "mre") -> pd.Series:
+    """A metric of every row; NaN where it is not known."""
+    column = f"metrics.{method}.{name}"
+    return frame[column].astype(float) if column in frame else pd.Series(np.nan, frame.index)
 
 
 def pivot(

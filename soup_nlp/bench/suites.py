@@ -17,10 +17,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.storage.files import as_path, is_file, is_folder
 
 RENDERED = ("street", "room", "sheet", "orbit", "still", "banner")
-PAPER, SINTEL = ("paper", "best"), ("sintel70", "paper", "best")
-KITTI, KITTI_SHARED = ("kitti", "eigen80", "best"), ("kitti", "best", "eigen80")
-"""Metric conventions, the main one first."""
-MOTORCYCLE = Item("shared", "motorcycle", "motorcycle", "dis", {"kind": "motorcycle"}, PAPER)
+MOTORCYCLE = Item("shared", "motorcycle", "motorcycle", "dis", {"kind": "motorcycle"})
 """The real pair that needs no data; it comes with scikit-image."""
 SINTEL_FRAMES = MappingProxyType(
     {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}
@@ -61,8 +58,8 @@ Items = Iterator[Item]
 def _item(
     sequence: str, name: str, raw: Mapping[str, Any], needs: Sequence[Path] = (), **fields: Any
 ) -> Item:
-    """A pair whose suite, flow and, unless given, conventions are added by its suite."""
-    return Item("", sequence, name, "", raw, **({"presets": ()} | fields), needs=tuple(needs))
+    """A pair whose suite and flow are added by its suite."""
+    return Item("", sequence, name, "", raw, **fields, needs=tuple(needs))
 
 
 def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: Options) -> Items:
@@ -77,11 +74,10 @@ def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: O
 def _folder(path: Path, family: str = "", kind: str = "folder", **entries: Any) -> Item:
     """A pair in a folder with frame_0.png, named by its family and folder."""
     name = " ".join(dict.fromkeys([family, path.name.removeprefix("pair_")]))
-    presets = KITTI_SHARED if family == "kitti2015" else ()
     true_flow = family in ("kitti2015", "driving_synthetic")
     raw = {"kind": kind, "path": str(path), **entries}
     needs = [path / "frame_0.png"]
-    return _item(family, name, raw, needs, true_flow=true_flow, presets=presets)
+    return _item(family, name, raw, needs, true_flow=true_flow)
 
 
 def _shared(root: Path, o: Options) -> Items:
@@ -90,15 +86,14 @@ def _shared(root: Path, o: Options) -> Items:
     for index in ("000138", "000027"):
         raw = {"kind": "kitti2012", "root": str(root / "kitti2012"), "index": index}
         image = root / "kitti2012" / "training" / "image_0" / f"{index}_10.png"
-        yield _item("kitti2012", f"kitti2012 {index}", raw, [image], presets=KITTI_SHARED)
+        yield _item("kitti2012", f"kitti2012 {index}", raw, [image])
     yield _folder(root / "driving_synthetic", "driving_synthetic")
     for path in sorted((root / "kinect_paper").glob("pair_*")):
         yield _folder(path, "kinect_paper", unit="mm")
     raw = {"kind": "sintel", "root": str(root / "sintel"), "scene": "alley_1"}
     image = root / "sintel" / "training" / "clean" / "alley_1" / "frame_0020.png"
     alley = {**raw, "frame": 20, "step": 5}
-    fields = {"true_flow": False, "presets": SINTEL}
-    yield _item("sintel", "sintel alley_1-0020+5", alley, [image], **fields)
+    yield _item("sintel", "sintel alley_1-0020+5", alley, [image], true_flow=False)
     yield _folder(root / "tum_fr1", "tum_fr1", kind="tum")
     for path in sorted((root / "kitti2015").glob("pair_*")):
         yield _folder(path, "kitti2015")
@@ -172,7 +167,6 @@ class Suite:
         text: Description.
         pairs: Makes the pairs of a root folder.
         flows: Default flow sources.
-        presets: Metric conventions, the main one first.
         folders: Candidates for the root below --data; the first one with a pair is used.
         layout: Contents that the root must have; empty if no data is needed.
         source: Where to get the data.
@@ -182,7 +176,6 @@ class Suite:
     text: str
     pairs: Callable[[Path, Options], Iterable[Item]]
     flows: tuple[str, ...] = ("dis",)
-    presets: tuple[str, ...] = PAPER
     folders: tuple[str, ...] = (".",)
     layout: str = ""
     source: str = ""
@@ -190,8 +183,7 @@ class Suite:
     def items(self, root: Path, o: Options) -> Items:
         """Every wanted pair with every flow, whether its files exist or not."""
         for pair in self.pairs(root, o):
-            presets, sequence = pair.presets or self.presets, pair.sequence or self.name
-            member = replace(pair, suite=self.name, sequence=sequence, presets=presets)
+            member = replace(pair, suite=self.name, sequence=pair.sequence or self.name)
             if o.only and not any(word in pair.name for word in o.only):
                 continue
             for flow in o.flows or self.flows:
@@ -227,7 +219,6 @@ _ALL = (
         "sintel",
         "MPI Sintel, the paper's five sequences, 24 pairs each",
         _sintel,
-        presets=SINTEL,
         folders=(".", "sintel", "MPI-Sintel-complete"),
         layout=(
             "training/clean/SCENE/frame_NNNN.png, training/depth/SCENE/frame_NNNN.dpt,"
@@ -239,7 +230,6 @@ _ALL = (
         "kitti2012",
         "KITTI stereo and flow 2012, 194 training pairs",
         partial(_kitti, "kitti2012", "image_0", 194),
-        presets=KITTI,
         folders=(".", "kitti2012", "data_stereo_flow"),
         layout="training/image_0, training/calib, training/disp_occ, training/flow_occ",
         source="https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php (data_stereo_flow.zip)",
@@ -248,7 +238,6 @@ _ALL = (
         "kitti2015",
         "KITTI scene flow 2015, 200 training pairs",
         partial(_kitti, "kitti2015", "image_2", 200),
-        presets=KITTI,
         folders=(".", "kitti2015", "data_scene_flow"),
         layout="training/image_2, training/calib_cam_to_cam, training/disp_occ_0",
         source=(
@@ -260,7 +249,6 @@ _ALL = (
         "vkitti",
         "Virtual KITTI 1 or 2, the paper's four worlds, 30 morning pairs each",
         _vkitti,
-        presets=KITTI,
         folders=(".", "vkitti", "vkitti1", "vkitti2"),
         layout=(
             "vkitti_1.3.1_rgb/WORLD/morning and _depthgt, _flowgt (version 1), or"

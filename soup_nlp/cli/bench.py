@@ -40,7 +40,7 @@ SIZES: Mapping[str, Any] = {"min": 2, "max": MAX_SUPERPIXELS}
 
 def mre_of(row: Row) -> str:
     """The main error of a row as text for the progress line."""
-    return f"MRE {show(row['metrics'].get(row['presets'][0], {}).get('solution', {}).get('mre'))}"
+    return f"MRE {show(row['metrics'].get('solution', {}).get('mre'))}"
 
 
 def _run(

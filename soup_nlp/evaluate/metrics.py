@@ -1,7 +1,7 @@
 """Errors of an estimated depth and scene flow, with the evaluation protocol beside the number.
 
 A two-view reconstruction has a free global scale, so a depth error means little without the rule
-that chose the scale, the depth cap and the share of the truth that has an estimate. Conventions:
+that chose the scale, the depth cap and the share of the truth that has an estimate. Errors:
 Eigen et al., NIPS 2014 (AbsRel, SqRel, RMSE, log-RMSE, delta); MRE as in "Superpixel Soup" (mean
 relative error, the same number as AbsRel).
 """
@@ -22,12 +22,6 @@ ERRORS = "mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delt
 """Names of the errors of a depth map."""
 
 
-Crop = tuple[float, float, float, float]
-
-GARG_CROP: Crop = (0.40810811, 0.99189189, 0.03594771, 0.96405229)
-"""Rows from and to, columns from and to, as shares of the image (Garg et al., ECCV 2016)."""
-
-
 @dataclass(frozen=True)
 class Convention:
     """A convention of depth evaluation: the pixels that count, and one global scale s.
@@ -41,25 +35,15 @@ class Convention:
         "none": s = 1.
 
     Attributes:
-        name: As in tables.
         scale: Rule of the scale.
         cap: Truth beyond this depth is left out, in the unit of the truth; None for no cap.
-        low: Truth at or below this depth is left out.
-        crop: Part of the image that counts, as shares; None for all of it.
-        clamp: Range that scaled estimates are moved into, as Eigen's protocol does; None for none.
-        text: The convention in a few words.
 
     Raises:
         DataError: the rule is unknown, or the cap is 0, negative, NaN or no number.
     """
 
-    name: str = ""
     scale: Scale = "median"
     cap: float | None = None
-    low: float = 0.0
-    crop: Crop | None = None
-    clamp: tuple[float, float] | None = None
-    text: str = ""
 
     def __post_init__(self) -> None:
         rules = get_args(Scale)
@@ -81,63 +65,22 @@ class Convention:
 
     def __str__(self) -> str:
         rule = "no scale" if self.scale == "none" else f"one {self.scale} scale"
-        cap = "no cap" if self.cap is None else f"{self.low:g} < z <= {self.cap:g}"
-        details = ", Garg crop" if self.crop == GARG_CROP else ", cropped" if self.crop else ""
-        if self.clamp:
-            details += f", estimates clamped to [{self.clamp[0]:g}, {self.clamp[1]:g}]"
-        return f"{self.name}: {rule} per image, {cap}{details}"
+        cap = "no cap" if self.cap is None else f"z <= {self.cap:g}"
+        return f"{rule} per image, {cap}"
 
     def mask(self, truth: ArrayLike) -> Mask:
-        """Pixels of a truth (H, W) or (M,) that count.
-
-        Raises:
-            DataError: a crop needs (H, W).
-        """
+        """Pixels of a truth (H, W) or (M,) that count."""
         gt = np.asarray(truth, np.float64)
         cap = np.inf if self.cap is None else self.cap
-        keep = np.asarray(np.isfinite(gt) & (gt > self.low) & (gt <= cap))
-        if self.crop is not None:
-            if gt.ndim != 2:
-                raise DataError("a crop needs a depth map (H, W)", where=self.name, found=gt.shape)
-            top, bottom, left, right = (
-                int(share * side)
-                for share, side in zip(self.crop, np.repeat(gt.shape, 2), strict=True)
-            )
-            inside = np.zeros(gt.shape, bool)
-            inside[top:bottom, left:right] = True
-            keep &= inside
-        return keep
+        return np.asarray(np.isfinite(gt) & (gt > 0) & (gt <= cap))
 
     def counts(self, truth: ArrayLike) -> bool:
         """Whether any true pixel is left."""
         return bool(self.mask(truth).any())
 
 
-MEDIAN, UNSCALED = Convention("median"), Convention("unscaled", "none")
+MEDIAN, UNSCALED = Convention(), Convention("none")
 """Every true pixel, with one median scale or as it is."""
-
-_IN_USE = (
-    Convention("paper", text="the paper's MRE: every true pixel, one global scale"),
-    Convention("best", "mre", text="the scale that minimises the MRE itself, no cap"),
-    Convention(
-        "sintel70",
-        cap=70.0,
-        text="as two-view work on Sintel, 0 < z <= 70, but the scale is the median of z_gt / z, not"
-        " median z_gt over median z",
-    ),
-    Convention("kitti", text="KITTI uncapped: median scale over every true pixel"),
-    Convention(
-        "eigen80",
-        cap=80.0,
-        low=1e-3,
-        crop=GARG_CROP,
-        clamp=(1e-3, 80.0),
-        text="after Eigen's protocol on KITTI at 80 m, Garg crop, clamped estimates, but the scale"
-        " is the median of z_gt / z, not median z_gt over median z",
-    ),
-)
-PRESETS = {convention.name: convention for convention in _IN_USE}
-"""Conventions in use by name."""
 
 
 @dataclass(frozen=True)
@@ -220,9 +163,8 @@ def depth_metrics(
     coverage = np.count_nonzero(compared) / np.count_nonzero(true)
     z, gt = z[compared], gt[compared]
     s = _scale(z, gt, convention.scale) if z.size else float("nan")
-    z = s * z if convention.clamp is None else np.clip(s * z, *convention.clamp)
     return DepthMetrics(
-        **_errors(z, gt),
+        **_errors(s * z, gt),
         scale_rule=convention.scale,
         scale=float(s),
         cap=None if convention.cap is None else float(convention.cap),

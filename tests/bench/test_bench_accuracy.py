@@ -1,4 +1,4 @@
-"""Accuracy of pairs: contents of rows, metric conventions, the page."""
+"""Accuracy of pairs: contents of rows, the page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from soup_nlp.cli import bench
 from soup_nlp.cli.main import main
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.evaluate.metrics import PRESETS
 from soup_nlp.storage.rows import Row
 
 pytestmark = pytest.mark.slow
@@ -35,7 +34,7 @@ K = np.array([[100.0, 0, 32], [0, 100.0, 24], [0, 0, 1]])
 
 def item(scene: str = "orbit", flow: str = "truth", seed: int = 0) -> Item:
     raw = {"kind": "scene", "scene": scene, "seed": seed, "width": 128, "height": 64}
-    return Item("rendered", scene, f"{scene}-{seed}", flow, raw, ("paper", "best"))
+    return Item("rendered", scene, f"{scene}-{seed}", flow, raw)
 
 
 def row_of(item: Item, overrides: tuple[str, ...] = QUICK) -> Row:
@@ -56,15 +55,11 @@ def test_a_row_has_every_number(orbit_row):
     row = orbit_row
     assert row["ok"], row["error"]
     json.dumps(row, allow_nan=False)
-    for convention in ("paper", "best"):
-        table = row["metrics"][convention]
-        assert set(table) == set(METHODS)
-        assert table["constant"]["skill"] == 0.0
-        # one rigid motion with the true flow is exact on a scene of one component
-        assert table["rigid"]["mre"] < 1e-3
-    for method in ("solution", "start"):
-        best = row["metrics"]["best"][method]["mre"]
-        assert best <= row["metrics"]["paper"][method]["mre"] + 1e-12
+    table = row["metrics"]
+    assert set(table) == set(METHODS)
+    assert table["constant"]["skill"] == 0.0
+    # one rigid motion with the true flow is exact on a scene of one component
+    assert table["rigid"]["mre"] < 1e-3
     assert row["flow_error"]["mean"] < 1e-5
     assert row["scene_flow"]["coverage"] == 1.0
     assert 0 <= row["guess"] <= 1
@@ -86,7 +81,7 @@ def test_a_pair_that_cannot_be_measured_has_a_reason(tmp_path):
         cv2.imwrite(str(tmp_path / f"frame_{k}.png"), np.zeros((48, 64, 3), np.uint8))
     np.savetxt(tmp_path / "K.txt", K)
     raw = {"kind": "folder", "path": str(tmp_path)}
-    row = row_of(Item("kinect_paper", "s", "p", "dis", raw, ("eigen80", "paper")))
+    row = row_of(Item("kinect_paper", "s", "p", "dis", raw))
     assert not row["ok"]
     suite = SUITES["kinect_paper"]
     for words in ("pair has no true depth", suite.layout, suite.source):
@@ -127,10 +122,10 @@ def test_moving_pixels_are_told_apart_under_one_scale():
         *(np.array([[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]]) for _ in range(2)),
         truth=Truth(depth_ref=depth, components=label),
     )
-    errors = moving(pair, estimate, PRESETS["paper"])
+    errors = moving(pair, estimate)
     assert errors == pytest.approx({"mre": 0.5 * 200 / 300, "rest": 0.0}, abs=1e-12)
     still = replace(pair, truth=Truth(depth_ref=depth, components=0 * label))
-    assert moving(still, estimate, PRESETS["paper"]) is None
+    assert moving(still, estimate) is None
 
 
 def broken(cell: Cell) -> Row:
@@ -172,45 +167,38 @@ def test_command_line(tmp_path, capsys, monkeypatch):
     assert "image is missing, where: a/0.png, found: nothing" in capsys.readouterr().out
 
 
-def solved(suite: str, convention: str = "paper", pair: str = "p") -> Row:
-    """A row of one convention, without a solve."""
+def solved(suite: str, pair: str = "p") -> Row:
+    """A row without a solve."""
     metrics = {
         "solution": {"mre": 0.03, "skill": 0.25, "coverage": 1.0},
         "constant": {"mre": 0.04, "coverage": 1.0},
     }
     return {
         **{"key": pair, "ok": True, "good": True, "suite": suite, "pair": pair, "error": None},
-        **{"sequence": "s", "flow": "dis", "presets": [convention], "status": "x", "code": "c"},
-        **{"metrics": {convention: metrics}, "cpu_seconds": 1.0, "settings": "0"},
+        **{"sequence": "s", "flow": "dis", "status": "x", "code": "c"},
+        **{"metrics": metrics, "cpu_seconds": 1.0, "settings": "0"},
     }
 
 
-def test_every_pair_is_in_the_details_of_its_own_convention():
-    text = text_of(solved("shared"), solved("shared", "kitti", "q"))
-    detail = text.split("## The solution, ")[1:]
-    assert [part.partition(":")[0] for part in detail] == ["paper", "kitti"]
-    assert "| p, dis |" in detail[0]
-    assert "| q, dis |" in detail[1]
-    assert "the scale is the median of z_gt / z" in text_of(solved("kitti2015", "eigen80"))
-    # pairs of one name are told apart by their suite
+def test_pairs_of_one_name_are_told_apart_by_their_suite():
     text = text_of(solved("kitti2012"), solved("kitti2015"))
     assert all(f"| kitti{year} p, dis |" in text for year in (2012, 2015))
 
 
 def test_one_rigid_motion_is_compared_on_its_own_pixels():
     row = solved("shared")
-    metrics = row["metrics"]["paper"]
+    metrics = row["metrics"]
     metrics |= {"rigid": {"mre": 0.025, "coverage": 0.6}, "solution_rigid": {"mre": 0.02}}
     assert "beats every baseline on 1 of 1" in text_of(row)
     metrics["solution_rigid"]["mre"] = 0.026
     text = text_of(row)
     assert "beats every baseline on 0 of 1" in text
-    assert "| p, dis | paper | rigid | 0.0250 | 0.0260 | 60.0% | -0.0010 |" in text
+    assert "| p, dis | rigid | 0.0250 | 0.0260 | 60.0% | -0.0010 |" in text
     assert set(BASELINES) <= set(METHODS)
 
 
 def test_sigma_has_columns_and_a_picture_of_its_curves(tmp_path):
-    rows = [solved("shared", pair=p) | {"sequence": p, "guess": 0.1} for p in ("a", "b")]
+    rows = [solved("shared", p) | {"sequence": p, "guess": 0.1} for p in ("a", "b")]
     write_suite(tmp_path / "without.md", frame_of(rows))
     assert not (tmp_path / "without.png").exists()
     for row in rows:

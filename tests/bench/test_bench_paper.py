@@ -29,7 +29,7 @@ QUICK = (*TINY, "solver.exact_iterations=0", "solver.max_iter=1", "refine.rounds
 
 def item(scene: str = "street", width: int = 128, height: int = 64) -> Item:
     raw = {"kind": "scene", "scene": scene, "width": width, "height": height}
-    return Item("rendered", scene, f"{scene}-tiny", "truth", raw, ("paper", "best"))
+    return Item("rendered", scene, f"{scene}-tiny", "truth", raw)
 
 
 def test_departures_are_all_differences_between_preset_and_defaults():
@@ -81,7 +81,7 @@ def fake(cell: Cell) -> Row:
         "status": "Solve_Succeeded",
         "stages": {"flow": 1.0, "nlp": 2.0},
         "iterations": 7,
-        "metrics": {p: dict.fromkeys(methods, told) for p in cell.item.presets},
+        "metrics": dict.fromkeys(methods, told),
         "curve": {
             "names": ["presolve"],
             "values": [[3.0, 2.0, 1.5]],
@@ -127,7 +127,7 @@ def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsy
     assert "| preset: paper | 0.5000 | 0.5000 | 0.5000 | 0.5000 | Solve_Succeeded |" in text
     # datasets that are not there say where they come from
     missing = text[text.index("## What is not here") :]
-    for name, (title, _, _) in DATASETS.items():
+    for name, (title, _) in DATASETS.items():
         assert (f"| {title} |" in missing) == (name != "kinect_paper")
     assert "http://sintel.is.tue.mpg.de" in missing
     assert "Back sequence" in missing

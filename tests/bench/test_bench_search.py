@@ -41,7 +41,7 @@ def fake(cell: Cell) -> dict:
     k = float(settings.get("segmentation.neighbours", "20"))
     mre = 0.02 * (1 + abs(math.log10(cont) + 3) + 0.1 * abs(k - 12))
     metrics = {"solution": {"mre": mre}, "constant": {"mre": 0.4}}
-    return {"metrics": {cell.item.presets[0]: metrics}}
+    return {"metrics": metrics}
 
 
 def broken(cell: Cell) -> dict:
@@ -92,7 +92,7 @@ def test_search_rejects_unknown_parameters(tmp_path, monkeypatch):
 def test_loss_charges_failures():
     cells = [Cell(i) for i in items(0)[:3]]
     rows = [{**c.identity(), "ok": True, "code": "c", **fake(c)} for c in cells]
-    rows[1]["metrics"]["paper"]["solution"]["mre"] = 9.0
+    rows[1]["metrics"]["solution"]["mre"] = 9.0
     rows[2] |= {"ok": False, "metrics": {}}
     loss = pair_loss(frame_of(rows)).tolist()
     assert loss[0] == pytest.approx(math.log(0.076 / 0.4))

@@ -46,7 +46,7 @@ def made(scene: str = "street", superpixels: int = 250, neighbours: int = 10, **
         "status": "Solve_Succeeded",
         "energy": {"total": 51.0},
         "energy_start": {"total": 90.0},
-        "metrics": {"paper": {"start": {"mre": 0.2}, "solution": {"mre": 0.1}}},
+        "metrics": {"start": {"mre": 0.2}, "solution": {"mre": 0.1}},
         "residuals": {"nlp_infeasibility": 1e-9, "dual_infeasibility": 1e-9},
         "peak_bytes": 2**30,
         **changes,

@@ -13,7 +13,6 @@ from hypothesis.extra.numpy import arrays
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute
 from soup_nlp.evaluate.metrics import (
-    PRESETS,
     UNSCALED,
     Convention,
     component_overlaps,
@@ -82,18 +81,6 @@ def test_names_of_scores_are_stable():
     assert list(vars(m)) == keys.split()
     with pytest.raises(dataclasses.FrozenInstanceError):
         m.mre = 0.0  # type: ignore[misc]
-
-
-def test_a_preset_finds_no_error_in_a_scaled_truth():
-    truth = np.random.default_rng(0).uniform(1.0, 15.0, (40, 60))
-    assert {"paper", "sintel70", "kitti", "eigen80", "best"} <= set(PRESETS)
-    # a preset states where its scale is not that of the convention
-    for name in ("sintel70", "eigen80"):
-        assert "median of z_gt / z, not median z_gt over median z" in PRESETS[name].text
-    for name, convention in PRESETS.items():
-        m = depth_metrics(truth / 2.0, truth, convention)
-        assert m.mre == pytest.approx(0.0, abs=1e-12), name
-        assert m.scale == pytest.approx(2.0), name
 
 
 def test_metrics_and_check_agree_at_the_delta_thresholds():
@@ -184,44 +171,16 @@ def test_bad_input(score, words):
         score()
 
 
-def test_eigens_clamp_comes_after_the_scale():
-    """Median ratio 2: 10, 20, 30, 60 become 20, 40, 60, 120, and the last is clamped to 80."""
-    truth = np.full((100, 200), np.nan)
-    estimate = np.full(truth.shape, np.nan)
-    for k, (z, gt) in enumerate([(10.0, 20.0), (20.0, 40.0), (30.0, 60.0), (60.0, 40.0)]):
-        estimate[60, 50 + k], truth[60, 50 + k] = z, gt
-    m = depth_metrics(estimate, truth, PRESETS["eigen80"])
-    assert m.scale == 2.0
-    assert m.n_pixels == 4
-    assert m.mre == pytest.approx((80.0 - 40.0) / 40.0 / 4)
-    assert m.rmse == pytest.approx(np.sqrt((80.0 - 40.0) ** 2 / 4))
-    # from below: an estimate near 0 is clamped to a millimetre
-    estimate[60, 53] = 1e-6
-    m = depth_metrics(estimate, truth, PRESETS["eigen80"])
-    assert m.log_rmse == pytest.approx(np.log(40.0 / 1e-3) / 2)
-
-
-def test_a_depth_equal_to_the_cap_counts():
-    assert PRESETS["sintel70"].mask([70.0, np.nextafter(70.0, 71.0), 0.0]).tolist() == [1, 0, 0]
-
-
-def test_presets_apply_cap_and_crop():
+def test_truth_beyond_the_cap_does_not_count():
+    capped = Convention(cap=70.0)
+    assert capped.mask([70.0, np.nextafter(70.0, 71.0), 0.0]).tolist() == [1, 0, 0]
     truth = np.full((100, 200), 10.0)
     truth[:, 100:] = 75.0
     estimate = np.where(truth == 75.0, 300.0, 20.0)
-    assert depth_metrics(estimate, truth, PRESETS["sintel70"]).mre == pytest.approx(0.0)
-    assert depth_metrics(estimate, truth, PRESETS["sintel70"]).n_pixels == 100 * 100
-    assert depth_metrics(estimate, truth, PRESETS["kitti"]).mre > 0.2
-    eigen = PRESETS["eigen80"]
-    assert eigen.mask(truth).sum() == (99 - 40) * (192 - 7)
-    # the upper part of the image does not count
-    worse = estimate.copy()
-    worse[:40] = 1.0
-    assert depth_metrics(worse, truth, eigen) == depth_metrics(estimate, truth, eigen)
-    assert not PRESETS["sintel70"].counts(np.full((2, 2), 71.0))
-    with pytest.raises(DataError, match="crop"):
-        depth_metrics([1.0], [1.0], eigen)
-    assert all(p.text and p.name in str(p) for p in PRESETS.values())
+    assert depth_metrics(estimate, truth, capped).mre == pytest.approx(0.0)
+    assert depth_metrics(estimate, truth, capped).n_pixels == 100 * 100
+    assert depth_metrics(estimate, truth).mre > 0.2
+    assert not capped.counts(np.full((2, 2), 71.0))
 
 
 def test_overlaps_of_components():
