@@ -67,7 +67,8 @@ results: $(VENV)/.optional
 		--analysis 250 --overwrite
 	$(SOUP) bench speed -o results/speed --scenes street,room,orbit,motorcycle --superpixels 1000,2000 \
 		--neighbours 15 --seeds 0 --overwrite
-	$(SOUP) bench cost -o results/speed --overwrite
+	$(SOUP) bench speed -o results/speed --name cost --scenes street --widths 512,1024,1792 \
+		--superpixels 250,1000,2000 --neighbours 15 --seeds 0 --set refine.enabled=true --overwrite
 	$(SOUP) family out/tangent --sizes 100,250 --starts hard --coordinates tangent --overwrite
 	$(SOUP) family out/matrix --sizes 100 --starts hard --overwrite
 	$(SOUP) compare out/tangent out/matrix -o results/solvers --seconds 10 --iterations 500 \

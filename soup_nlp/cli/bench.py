@@ -15,11 +15,11 @@ from soup_nlp.bench import search as searching
 from soup_nlp.bench import speed as timing
 from soup_nlp.bench.accuracy import measure_pair
 from soup_nlp.bench.accuracy_page import write_suite
+from soup_nlp.bench.chain import chain_page, measure_chain, sequences
 from soup_nlp.bench.paper import make_plan, measure_paper, pairs_found
 from soup_nlp.bench.paper_page import FILES, write_paper
 from soup_nlp.bench.study import Cell, measure_cells, show
 from soup_nlp.bench.suites import MOTORCYCLE, RENDERED, SUITES, Options, list_suite
-from soup_nlp.bench.tables import chain_page, cost_cells, cost_page, measure_chain, sequences
 from soup_nlp.cli import options
 from soup_nlp.cli.options import Words, option
 from soup_nlp.errors import ConfigError
@@ -203,37 +203,32 @@ def speed(
     seeds: Seeds = "0,1",
     pairs: Annotated[str, option("Words of names of pairs of the suite shared.")] = "",
     data: options.Data = None,
-    width: Width = 1024,
+    widths: Annotated[str, option("Columns of rendered scenes.", "--width", "--widths")] = "1024",
     overrides: options.Set = None,
     out: options.Out = Path("out/bench/speed"),
+    name: Annotated[str, option("Name of the page.")] = "table",
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> int:
-    """Time the solver over N and K, each run in a process of its own; resumes what is stored."""
+    """Time solves over N, K and image size, each in a process of its own; resumes what is stored.
+
+    The refinement is left out; --set refine.enabled=true measures whole solves.
+    """
     chosen, known_scenes = options.listed(scenes), [*RENDERED, MOTORCYCLE.name]
     if not chosen or set(chosen) - set(known_scenes):
         raise ConfigError(
             "unknown scene", where="--scenes", found=scenes, expected=", ".join(known_scenes)
         )
+    columns = options.numbers(widths, "--widths", 64, MAX_SIDE)
     items = timing.timed_pairs(
-        chosen, options.numbers(seeds, "--seeds"), width, options.listed(pairs), data
+        chosen, options.numbers(seeds, "--seeds"), columns, options.listed(pairs), data
     )
     n = options.numbers(sizes, "--superpixels", 2, MAX_SUPERPIXELS)
     k = options.numbers(neighbours, "--neighbours", 1, MAX_NEIGHBOURS)
     cells = timing.speed_cells(items, n, k, overrides or [])
     measured = partial(measure_cells, cells, timing.measure_speed)
-    page, write, line = out / "table.md", _text(timing.speed_page), lambda row: row["status"]
+    page, write, line = out / f"{name}.md", _text(timing.speed_page), lambda row: row["status"]
     return _run(page, measured, write, quiet, overwrite, line=line, fresh=True)
-
-
-def cost(
-    out: options.Out = Path("out/bench/speed"),
-    overwrite: options.Overwrite = False,
-    quiet: options.Quiet = False,
-) -> int:
-    """Time and memory of whole solves over N and image size, each in a process of its own."""
-    measured = partial(measure_cells, cost_cells(), measure_pair)
-    return _run(out / "cost.md", measured, _text(cost_page), quiet, overwrite, fresh=True)
 
 
 def chain(

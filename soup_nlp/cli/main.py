@@ -95,7 +95,7 @@ COMMANDS: Mapping[str, str] = {
 }
 """Module and function under `soup_nlp.cli`, by command; in this order the help lists them."""
 BENCH: Mapping[str, str] = {
-    name: f"bench:{name}" for name in ("accuracy", "speed", "cost", "search", "paper", "chain")
+    name: f"bench:{name}" for name in ("accuracy", "speed", "search", "paper", "chain")
 }
 """Module and function of the commands of `soup-nlp bench`."""
 

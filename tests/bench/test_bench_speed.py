@@ -1,4 +1,4 @@
-"""bench speed: plan, exponents and page on artificial rows; one tiny real run."""
+"""bench speed: plan, costs and page on artificial rows; one tiny real run."""
 
 from __future__ import annotations
 
@@ -6,21 +6,12 @@ import os
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 from helpers_rows import square, threads
 
 from soup_nlp.bench.processes import machine
-from soup_nlp.bench.speed import (
-    exponent,
-    growth,
-    speed_cells,
-    speed_page,
-    timed_pairs,
-    with_costs,
-)
+from soup_nlp.bench.speed import speed_cells, speed_page, timed_pairs, with_costs
 from soup_nlp.bench.study import Cell, frame_of
-from soup_nlp.bench.tables import cost_cells, cost_page
 from soup_nlp.cli.main import main
 from soup_nlp.storage.rows import ONE_THREAD, Job, attempt, measure_all, read_rows
 
@@ -59,7 +50,7 @@ def failed(reason: str) -> dict:
 
 
 def test_the_plan_has_every_run_once_small_ones_first():
-    items = timed_pairs(["street", "motorcycle"], [3, 4], 512)
+    items = timed_pairs(["street", "motorcycle"], [3, 4], [512])
     cells = speed_cells(items, [500, 250], [20, 10], ["solver.tol=0.5"])
     assert len({c.identity()["key"] for c in cells}) == len(cells) == 2 * 2 * (2 + 1)
     problems = [c.item.problem(c.overrides) for c in cells]
@@ -91,19 +82,12 @@ def test_rows_of_new_processes(tmp_path, monkeypatch):
     assert {"processor", "cores", "memory", "code"} <= machine().keys()
 
 
-def test_growth_is_the_exponent_of_a_cost():
-    n = np.array([250, 500, 1000, 2000])
-    assert exponent(n, 3e-4 * n**1.4) == pytest.approx(1.4, abs=1e-12)
-    assert np.isnan(exponent([250, 252], [1.0, 2.0]))
-    rows = [made("street", n, k) for n in (250, 500, 1000) for k in (10, 20)]
-    frame = with_costs(frame_of(rows))
-    table = growth(frame)
-    assert table.index.tolist() == [("street", "10"), ("street", "20")]
-    assert table["NLP, CPU s"].iloc[0] == pytest.approx(EXPONENT)
-    assert table["Hessian nonzeros"].iloc[0] == pytest.approx(1.0)
-    assert growth(frame.iloc[:1]).empty
+def test_costs_outside_the_nlp_and_of_the_whole_solve():
+    frame = with_costs(frame_of([made("street", 250)]))
     # loading is not counted, and the NLP is not outside itself
     assert frame["outside"].iloc[0] == 3.0
+    stages = {"load": 50.0, "flow": 2.0, "nlp": 7.0, "nlp_presolve": 6.0, "refine": 1.0}
+    assert with_costs(frame_of([made(stages=stages)]))["whole"].iloc[0] == 10.0
 
 
 def test_the_page_of_runs():
@@ -117,19 +101,6 @@ def test_the_page_of_runs():
     assert "code c0de; overrides of every row: `seed=0`, `refine.enabled=false`." in text
     assert "N 250, K 10: no answer" in text
     assert "N 250, K 10: no answer" in speed_page(frame_of(rows[-1:]))
-
-
-def test_the_page_of_costs_leaves_rendering_out():
-    cells = cost_cells()
-    stages = {"load": 50.0, "flow": 2.0, "nlp": 7.0, "nlp_presolve": 6.0}
-    result = {"ok": True, "error": None, "code": "c", "cpu_seconds": 60.0, "stages": stages}
-    rows = [{**cell.identity(), **result, "peak_bytes": 2**30} for cell in cells]
-    page = cost_page(frame_of(rows))
-    assert "| street 512 x 218, dis | 9 | 9 | 9 |" in page
-    assert page.count("| 1.0 | 1.0 | 1.0 |") == 3
-    failed = [{**cell.identity(), "ok": False, "error": "no room", "code": "c"} for cell in cells]
-    assert "no room" in cost_page(frame_of([{**row, "cpu_seconds": 1.0} for row in failed]))
-    assert [cell.variant for cell in cells[:3]] == ["N = 250", "N = 1000", "N = 2000"]
 
 
 @pytest.mark.parametrize(
@@ -165,4 +136,4 @@ def test_a_real_run_and_its_table(tmp_path):
     assert row["stages"]["output"] > 0
     assert row["cpu"]["nlp"] <= 1.2 * row["stages"]["nlp"]
     assert {"load", "flow", "segmentation", "start", "output"} <= set(row["cpu"])
-    assert "| street |" in (out / "table.md").read_text()
+    assert "| street-s0-128x54 |" in (out / "table.md").read_text()

@@ -13,7 +13,7 @@ import trimesh
 from helpers_chromium import Chromium, find_chromium
 from helpers_result import CAMERA, small_result
 
-from soup_nlp.bench import tables as chain_study
+from soup_nlp.bench import chain as chain_study
 from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem

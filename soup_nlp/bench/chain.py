@@ -1,18 +1,13 @@
-"""The tables of two studies: what one scale for a sequence costs, what a whole solve costs.
-
-`soup-nlp bench chain` measures the error that one scale for a whole sequence causes, `soup-nlp
-bench cost` seconds and memory of whole solves over N and the size of the images.
-"""
+"""`bench chain`: the error that one scale for a whole sequence causes."""
 
 from __future__ import annotations
 
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from soup_nlp.bench.study import Cell, Item, markdown, page_text, pivot, provenance, titled
+from soup_nlp.bench.study import Cell, Item, page_text, provenance, titled
 from soup_nlp.errors import DataError
 from soup_nlp.sequence.score import score
 from soup_nlp.sequence.solve import ROWS, SCENE, solve_chain
@@ -88,41 +83,4 @@ def chain_page(frame: pd.DataFrame) -> str:
         mean = good["cost"].astype(float).mean()
         blocks.append(titled(good.set_axis(pd.Index(good["pair"], name="sequence")), COLUMNS))
         blocks.append(f"Mean cost of one scale: {mean:+.2%} of the MRE.")
-    return page_text(blocks, frame)
-
-
-# --- bench cost ----------------------------------------------------------------------------------
-
-SIZES = ((512, 218), (1024, 436), (1792, 763))
-"""Columns and rows of the images; the largest are just below the limit of the working size."""
-SUPERPIXELS = (250, 1000, 2000)
-TABLES = {
-    "seconds": ("Seconds from the images to the scored depth of both frames", ".0f"),
-    "GB": ("Peak memory, GB", ".1f"),
-    "mre": ("MRE", ".4f"),
-}
-"""Title and format of the tables by column."""
-
-
-def cost_cells() -> list[Cell]:
-    """Rendered streets with the default options, small ones first."""
-    cells = []
-    for (width, height), n in product(SIZES, SUPERPIXELS):
-        source = {"kind": "scene", "scene": "street", "width": width, "height": height}
-        item = Item("rendered", "street", f"street {width} x {height}", "dis", source)
-        cells.append(Cell(item, (f"segmentation.superpixels={n}",), f"N = {n}"))
-    return cells
-
-
-def cost_page(frame: pd.DataFrame) -> str:
-    """Tables with a line for each size and a column for each N; rendering is left out."""
-    blocks = ["# Time and memory", f"{provenance(frame)}. One process with one thread."]
-    good = frame[frame["ok"].eq(True)]
-    if len(good):
-        left_out = ("stages.nlp_", "stages.load")
-        stages = [c for c in good if c.startswith("stages.") and not c.startswith(left_out)]
-        costs = {"seconds": good[stages].sum(axis=1), "GB": good["peak_bytes"] / 2**30}
-        good = good.assign(**costs)
-        for column, (title, form) in TABLES.items():
-            blocks += [f"## {title}", markdown(pivot(good, column, average=False), form)]
     return page_text(blocks, frame)
