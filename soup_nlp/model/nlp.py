@@ -175,8 +175,6 @@ class NLP:
 
     def __str__(self) -> str:
         lines = [f"NLP {self.name}: {self.nx} variables, {self.ng} constraints"]
-        lines += _bound_bars("variables", self.lbx, self.ubx)
-        lines += _bound_bars("constraints", self.lbg, self.ubg)
         for label, nnz, cells in (
             ("Jacobian", self.nnzj, self.nx * self.ng),
             ("Hessian", self.nnzh, self.nx * (self.nx + 1) // 2),
@@ -188,19 +186,3 @@ class NLP:
         return "\n".join(lines)
 
     __repr__ = __str__
-
-
-def _bound_bars(label: str, lower: Float, upper: Float) -> list[str]:
-    """A line with a bar for every kind of bound that occurs."""
-    lo, up = np.isfinite(lower), np.isfinite(upper)
-    fixed = lo & up & (lower == upper)
-    kinds = {
-        "free": ~lo & ~up,
-        "lower": lo & ~up,
-        "upper": ~lo & up,
-        "range": lo & up & ~fixed,
-        "fixed": fixed,
-    }
-    counts = {kind: int(mask.sum()) for kind, mask in kinds.items() if mask.any()}
-    bars = {kind: "#" * max(1, round(20 * c / len(lower))) for kind, c in counts.items()}
-    return [f"  {label:<11} {kind:<6} {bars[kind]:<20} {c}" for kind, c in counts.items()]
