@@ -154,7 +154,7 @@ DEPARTURES = (
     ),
     Departure(
         "pixel units and their weights",
-        (*_IN_PIXELS, "energy.length"),
+        _IN_PIXELS,
         # a truncation given in pixels has no meaning in the paper's units
         with_off=("energy.weights.sigma_arap=.inf",),
         needs="off: E_arap not truncated, since its truncation is in pixels",

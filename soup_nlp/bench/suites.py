@@ -71,11 +71,11 @@ def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: O
             yield _item(scene, f"{scene}-s{seed}-{width}x{height}", raw)
 
 
-def _folder(path: Path, family: str = "", kind: str = "folder", **entries: Any) -> Item:
+def _folder(path: Path, family: str, **entries: Any) -> Item:
     """A pair in a folder with frame_0.png, named by its family and folder."""
     name = " ".join(dict.fromkeys([family, path.name.removeprefix("pair_")]))
     true_flow = family in ("kitti2015", "driving_synthetic")
-    raw = {"kind": kind, "path": str(path), **entries}
+    raw = {"kind": "folder", "path": str(path), **entries}
     needs = [path / "frame_0.png"]
     return _item(family, name, raw, needs, true_flow=true_flow)
 
@@ -94,7 +94,7 @@ def _shared(root: Path, o: Options) -> Items:
     image = root / "sintel" / "training" / "clean" / "alley_1" / "frame_0020.png"
     alley = {**raw, "frame": 20, "step": 5}
     yield _item("sintel", "sintel alley_1-0020+5", alley, [image], true_flow=False)
-    yield _folder(root / "tum_fr1", "tum_fr1", kind="tum")
+    yield _folder(root / "tum_fr1", "tum_fr1", depth_scale=5000.0)
     for path in sorted((root / "kitti2015").glob("pair_*")):
         yield _folder(path, "kitti2015")
     track = root / "kitti_tracking"

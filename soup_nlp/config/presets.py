@@ -41,7 +41,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             },
             "energy": {
                 "units": "paper",
-                "length": "translation",
                 "arap_at_anchors": False,
                 "arap_across": 1.0,
                 "cont_occluded": 1.0,

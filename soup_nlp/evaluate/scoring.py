@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.arrays import Float
+from soup_nlp.data.accept import array_of
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Pair, Truth
-from soup_nlp.errors import DataError, repr_of
+from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import (
     MEDIAN,
     Convention,
@@ -154,18 +155,8 @@ def _map(values: object, what: str) -> Float:
     Raises:
         DataError: the values are no map of numbers.
     """
-    try:
-        array = np.asarray(values)
-    except ValueError:
-        # rows of different lengths
-        array = np.empty(0, object)
-    if array.ndim != 2 or array.dtype.kind not in "fiu":
-        raise DataError(
-            f"{what} is no map",
-            found=repr_of(values),
-            expected="(H, W) numbers, or a file; NaN where unknown",
-        )
-    return array.astype(np.float64)
+    expected = "(H, W) numbers, or a file; NaN where unknown"
+    return array_of(values, what, "evaluate", expected, axes="(H, W)").astype(np.float64)
 
 
 STEPS = 50

@@ -88,10 +88,8 @@ class EnergyOptions(Section):
     """Options of the energy."""
 
     units: Literal["pixel", "paper"] = "pixel"
-    """pixel (every term in pixels, free of scale) or paper (one length unit)."""
-    length: Literal["depth", "translation", "scales"] = "depth"
-    """Unit of length with units: paper. depth: the mean plane distance is 1. translation: the
-    lengths of the initial translations add up to 1. scales: the plane distances add up to 1."""
+    """pixel (every term in pixels, free of scale) or paper (one length unit: the lengths of the
+    initial translations add up to 1)."""
     arap_at_anchors: bool = False
     """Compare motions at the anchors instead of the camera's origin."""
     arap_across: Share = 0.03

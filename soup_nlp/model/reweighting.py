@@ -254,23 +254,18 @@ def within_bending(
     )
 
 
-def in_length(data: EnergyData, soup: Soup, length: str) -> EnergyData:
-    """The same data in the paper's units with another unit of length.
+def in_translations(data: EnergyData, soup: Soup) -> EnergyData:
+    """The same data in the paper's units with the sum of the translations as unit of length.
 
-    `sum_i lam_i = 1` fixes the unit, and the paper does not say what a scale multiplies: the
-    translation t-hat of unit length, or the plane.
+    `sum_i lam_i = 1` fixes the unit, and the paper does not say what a scale multiplies; here it is
+    the translation t-hat of unit length. Translations have the ratio to their plane distances that
+    the start has.
 
     Args:
         data: Data in the paper's units, the mean plane distance being 1.
         soup: Start, for the length of translations.
-        length: "depth": as it is. "translation": the translations add up to 1, each in the ratio
-            to its plane distance that the start has. "scales": the plane distances add up to 1.
     """
-    if length == "depth":
-        return data
-    share = np.ones(len(data))
-    if length == "translation":
-        share = np.maximum(np.linalg.norm(soup.translation, axis=1) / soup.distance, 1e-9)
+    share = np.maximum(np.linalg.norm(soup.translation, axis=1) / soup.distance, 1e-9)
     # lengths have sum_i c_i D_i = 1, shares c add up to 1; the unit is that of sum_i s_i D_i = 1
     unit = float(share.sum())
     return replace(

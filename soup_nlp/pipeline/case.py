@@ -27,9 +27,9 @@ from soup_nlp.model.reweighting import (
     across_components,
     across_discontinuities,
     at_occlusions,
-    in_length,
     in_noise,
     in_pixels,
+    in_translations,
     over_ground,
     with_order,
     with_prior,
@@ -241,7 +241,7 @@ def build_energy(
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, BENDING_ROTATION_PX if whole else None)
     else:
-        data = in_length(data, start.soup, e.length)
+        data = in_translations(data, start.soup)
     if whole:
         return data, bending
     if bends.any():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from functools import wraps
+from html import escape
 from io import BytesIO
 from pathlib import Path
 from typing import Any, ParamSpec
@@ -24,7 +26,7 @@ from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import record_of, recorded_files, rows_in_file
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import pictures
-from soup_nlp.report.result import PAGE, html, load, result_of
+from soup_nlp.report.result import PAGE, load, result_of
 from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.files import as_path, write_text
@@ -299,7 +301,9 @@ class WritableRun(Run):
         """Text and overview, for notebooks."""
         picture = BytesIO()
         self.plot().save(picture, format="png")
-        return html(str(self), picture.getvalue())
+        shown = base64.b64encode(picture.getvalue()).decode()
+        image = f'<img alt="overview" style="max-width:100%" src="data:image/png;base64,{shown}">'
+        return f"<pre>{escape(str(self))}</pre>{image}"
 
 
 def _writable(solve: Callable[Given, Run]) -> Callable[Given, WritableRun]:

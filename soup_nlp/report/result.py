@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +50,6 @@ class Result:
         metre_unit: Name of the unit of the truth.
         min_confidence: Smallest confidence of points in clouds.
         verdict: Verdict that was printed at the end of the solve.
-        overview: The overview as PNG, for a stored result.
     """
 
     tree: ReadTree
@@ -63,17 +60,12 @@ class Result:
     metre_unit: str = "m"
     min_confidence: float = MIN_CONFIDENCE
     verdict: str = ""
-    overview: bytes = b""
 
     def __str__(self) -> str:
         h, w = self.images[0].shape[:2]
         return f"Result({self.name}, {w}x{h}, {self.reconstruction}, {self.components})"
 
     __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        """Text and overview, for notebooks."""
-        return html(str(self), self.overview)
 
     @property
     def name(self) -> str:
@@ -206,13 +198,6 @@ def result_of(run: Run, summary: Mapping[str, Any], verdict: str = "") -> Result
     )
 
 
-def html(text: str, png: bytes) -> str:
-    """Text and picture as HTML."""
-    picture = base64.b64encode(png).decode()
-    shown = f'<img alt="overview" style="max-width:100%" src="data:image/png;base64,{picture}">'
-    return f"<pre>{escape(text)}</pre>" + (shown if png else "")
-
-
 def load(folder: str | Path) -> Result:
     """A result that `solve`, `import` or `Run.save` wrote: depth, points, sigma, motions, scores.
 
@@ -229,7 +214,6 @@ def load(folder: str | Path) -> Result:
     tree, unit = read_h5(path), read_attrs(path).get("truth_unit", "m")
     summary = read_json(folder / "summary.json", "summary.json")
     require_layout(tree)
-    picture = folder / "overview.png"
     try:
         _, _, K_ref, K_next, _ = (require(tree, f"input/{name}") for name in INPUTS)
         soup = Soup(*(require(tree, f"solution/{key}") for key in ("lam", "n", "d", "R", "t")))
@@ -248,7 +232,6 @@ def load(folder: str | Path) -> Result:
             metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
             metre_unit=str(unit),
             verdict=_ending(folder / "log.txt"),
-            overview=picture.read_bytes() if picture.is_file() else b"",
         )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise DataError("result does not hold together", where=folder, found=error) from error

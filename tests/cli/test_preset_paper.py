@@ -17,7 +17,7 @@ from soup_nlp.model import oracle
 from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.layout import TangentLayout
-from soup_nlp.model.reweighting import in_length
+from soup_nlp.model.reweighting import in_translations
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
@@ -36,7 +36,6 @@ PAPER = {
     "start.method": "homography",
     # Eq. 1 to 7: factor 1 of E_arap, the same everywhere; rho and rho_n alone truncate; four terms
     "energy.units": "paper",
-    "energy.length": "translation",
     "energy.arap_at_anchors": False,
     "energy.arap_across": 1.0,
     "energy.cont_occluded": 1.0,
@@ -168,17 +167,12 @@ def test_a_plane_follows_from_its_motion():
     assert np.allclose(plane_of(Motion(R, t), matched), m, atol=1e-9)
 
 
-@pytest.mark.parametrize("length", ["depth", "translation", "scales"])
-def test_the_unit_of_length_is_the_sum_that_it_names(case, length):
+def test_the_unit_of_length_is_the_sum_of_translations(case):
     """E_cont without truncation is a length: in its unit times the unit it is always the same."""
     start, weights = case.start.soup, case.weights.replace(sigma_cont=np.inf)
     bare = build_energy_data(case.segmentation, case.pair.flow, case.pair.K_ref, case.pair.K_next)
-    unit = {
-        "depth": start.distance.mean(),
-        "translation": np.linalg.norm(start.translation, axis=1).sum(),
-        "scales": start.distance.sum(),
-    }[length]
-    data = in_length(bare, start, length)
+    unit = np.linalg.norm(start.translation, axis=1).sum()
+    data = in_translations(bare, start)
     expected = oracle.values("cont", start, bare, weights).sum() * start.distance.mean()
     larger = Soup(2 * start.lam, start.n, start.d, start.R, start.t)
     for soup in (start, larger):

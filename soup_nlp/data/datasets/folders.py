@@ -17,7 +17,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.data.datasets.layout import Folder, FramesInput, PairInput, Resolve, make_pair
 from soup_nlp.data.formats.camera_files import read_intrinsics
 from soup_nlp.data.formats.images import assumed, read_mask
-from soup_nlp.data.formats.map_files import MILLIMETRES, read_depth, read_flow, read_npz
+from soup_nlp.data.formats.map_files import read_depth, read_flow, read_npz
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
@@ -26,9 +26,8 @@ from soup_nlp.storage.files import read_json, read_text
 from soup_nlp.storage.folders import MARK
 
 LAYOUT = (
-    "frame_0.png and frame_1.png (or image_ref.png and image_next.png), K.txt; optional "
-    "K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, flow.flo|png|npy, occluded.png, moving.png, "
-    "points.npz"
+    "frame_0.png, frame_1.png, K.txt; optional K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, "
+    "flow.flo|png|npy, occluded.png, moving.png, points.npz"
 )
 _IMAGES = ".png .jpg .jpeg .tif .tiff .ppm .pgm .bmp"
 _DEPTHS = ".npy .dpt .pfm .png"
@@ -36,10 +35,7 @@ _DEPTHS = ".npy .dpt .pfm .png"
 TUM_SCALE = 5000.0
 """Values per metre of a TUM RGB-D depth image."""
 
-TUM_LAYOUT = (
-    "rgb.txt, depth.txt, rgb/*.png, depth/*.png, optional K.txt or camera.txt (or frame_0.png, "
-    "depth_0.png, K.txt)"
-)
+TUM_LAYOUT = "rgb.txt, depth.txt, rgb/*.png, depth/*.png, optional K.txt or camera.txt"
 _TUM_CAMERAS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
@@ -59,7 +55,7 @@ class FolderInput(FramesInput):
 
     Files, of which the first existing one is used (images may also be jpg, tif, ppm, bmp):
 
-    - `frame_0.png` or `image_ref.png`; `frame_1.png` or `image_next.png`
+    - `frame_0.png`, `frame_1.png`
     - `K.txt`: 3x3 intrinsics, or fx fy cx cy; `K_next.txt` if the next frame's differ
     - optional truth: `depth`, `depth_0` or `depth_ref` (.npy, .dpt, .pfm, 16-bit .png),
       `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded),
@@ -75,11 +71,33 @@ class FolderInput(FramesInput):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        return _plain_folder(Folder(path(self.path), LAYOUT), self)
+        folder = Folder(path(self.path), LAYOUT)
+        _refuse_result(folder)
+        images = [folder.need(*_names(stem, _IMAGES)) for stem in ("frame_0", "frame_1")]
+        K = read_intrinsics(folder.need("K.txt"))
+        K_next = folder.read(read_intrinsics, "K_next.txt")
+        depth, depth_next = (
+            folder.read(read_depth, *_names(stems, _DEPTHS), scale=self.depth_scale)
+            for stems in ("depth depth_0 depth_ref", "depth_next depth_1")
+        )
+        moving = folder.read(read_mask, *_names("moving", _IMAGES))
+        truth = Truth(
+            depth_ref=depth,
+            depth_next=depth_next,
+            flow=folder.read(read_flow, *_names("flow", ".flo .npy .png")),
+            occluded=folder.read(read_mask, *_names("occluded", _IMAGES)),
+            # connected regions of the pixels that move
+            components=None if moving is None else label(moving, connectivity=2).astype(np.int32),
+            points=folder.read(_read_points, "points.npz", unit=self.unit),
+            unit=self.unit,
+        )
+        cameras = [K, K if K_next is None else K_next]
+        name = folder.path.resolve().name
+        return make_pair(images, cameras, truth, name, self.white, cropped=self.cropped)
 
 
-def _plain_folder(folder: Folder, options: FolderInput, usual: float = MILLIMETRES) -> Pair:
-    """The pair of a plain folder; `usual` are the values per unit of a depth without a scale."""
+def _refuse_result(folder: Folder) -> None:
+    """Raise DataError for a folder with a result."""
     marked, summary = folder.find(MARK) is not None, None
     with suppress(DataError):
         summary = read_json(folder.path / "summary.json", "summary.json")
@@ -92,30 +110,6 @@ def _plain_folder(folder: Folder, options: FolderInput, usual: float = MILLIMETR
             hint="move the frames, K.txt and the truth to a folder of their own"
             + (f"; delete {MARK} where no solve has left files" if marked else ""),
         )
-    images = [
-        folder.need(*_names(stems, _IMAGES))
-        for stems in ("frame_0 image_ref", "frame_1 image_next")
-    ]
-    K = read_intrinsics(folder.need("K.txt"))
-    K_next = folder.read(read_intrinsics, "K_next.txt")
-    depth, depth_next = (
-        folder.read(read_depth, *_names(stems, _DEPTHS), scale=options.depth_scale, usual=usual)
-        for stems in ("depth depth_0 depth_ref", "depth_next depth_1")
-    )
-    moving = folder.read(read_mask, *_names("moving", _IMAGES))
-    truth = Truth(
-        depth_ref=depth,
-        depth_next=depth_next,
-        flow=folder.read(read_flow, *_names("flow", ".flo .npy .png")),
-        occluded=folder.read(read_mask, *_names("occluded", _IMAGES)),
-        # connected regions of the pixels that move
-        components=None if moving is None else label(moving, connectivity=2).astype(np.int32),
-        points=folder.read(_read_points, "points.npz", unit=options.unit),
-        unit=options.unit,
-    )
-    cameras = [K, K if K_next is None else K_next]
-    name = folder.path.resolve().name
-    return make_pair(images, cameras, truth, name, options.white, cropped=options.cropped)
 
 
 def _read_points(path: Path, unit: str) -> Float:
@@ -142,8 +136,7 @@ class TumInput(PairInput):
     `rgb.txt` and `depth.txt` list time stamps and files; a depth image belongs to a colour image
     within 20 ms. Without `K.txt` or `camera.txt` the intrinsics are those published for the sensor
     in the name of the folder (freiburg1, 2 or 3), else 525, 525, 319.5, 239.5; lens distortion is
-    not removed. A plain folder (`FolderInput`) with 16-bit `depth_0.png` and `depth_1.png` is
-    loaded as well.
+    not removed.
     """
 
     kind: Literal["tum"]
@@ -160,9 +153,6 @@ class TumInput(PairInput):
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
         folder = Folder(path(self.path), TUM_LAYOUT)
-        if folder.find(*_names("frame_0 image_ref", _IMAGES)) and not folder.find("rgb.txt"):
-            options = FolderInput(kind="folder", path=self.path, depth_scale=self.depth_scale)
-            return _plain_folder(Folder(folder.path, LAYOUT), options, TUM_SCALE)
         images = _tum_list(folder.need("rgb.txt"))
         depths = folder.read(_tum_list, "depth.txt") or []
         numbers = self.frame, self.frame + self.step
@@ -201,21 +191,17 @@ def _tum_camera(folder: Path) -> Float:
 
 def _tum_list(path: Path) -> list[tuple[float, str]]:
     """(time stamp in seconds, name of a file) of each line of rgb.txt or depth.txt."""
-    out = []
-    for number, line in enumerate(read_text(path, "file list").splitlines(), 1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        words = line.split()
-        try:
-            out.append((float(words[0]), words[1]))
-        except (ValueError, IndexError):
-            raise DataError(
-                "line of a file list is not understood",
-                where=f"{path}, line {number}",
-                found=repr(line[:60]),
-                expected="'timestamp file'",
-            ) from None
-    return out
+    lines = [line.split() for line in read_text(path, "file list").splitlines()]
+    try:
+        # a line that starts with # is a comment
+        return [(float(words[0]), words[1]) for words in lines if words and words[0][0] != "#"]
+    except (ValueError, IndexError) as error:
+        raise DataError(
+            "line of a file list is not understood",
+            where=path,
+            found=error,
+            expected="'timestamp file'",
+        ) from None
 
 
 class MotorcycleInput(PairInput):
