@@ -104,7 +104,6 @@ def test_a_page_has_problems_solvers_and_runs():
     assert "a / b" in text
     assert "| a | 10 | f | 9 | 4 | 3 | (1) |" in text
     assert "| b | 10 | f | 9 | 4 | 4 | - |" in text
-    assert "| three | 1 | 1 | 0 | 0 of 1 |" in text
     # one of another content
     other = row("b", "two", 9.0, 2.0) | {"problem_hash": "1"}
     assert "**3 problems" in page([*ROWS, other])

@@ -100,7 +100,6 @@ def page(frame: pd.DataFrame) -> str:
     sections = {
         "By start and size": _by_start(of_family(frame)),
         "By problem": _by_problem(frame),
-        "By solver": _by_solver(frame),
         "By run": _by_run(frame[~begun]),
         "Confirmation: runs that begin at a solution": _by_run(frame[begun]),
         "Limits": "\n".join(f"- {text}" for text in (limit, *LIMITS)),
@@ -152,26 +151,11 @@ def _by_problem(frame: pd.DataFrame) -> str:
     table.index.names = ["problem", "N", "formulation"]
     text = (
         "Exact energy of the point that each solver reached, in brackets where it is feasible (to"
-        f" {FEASIBLE:g}) but not verified.\n\n"
+        f" {FEASIBLE:g}) but not verified. Verified: KKT residuals and exact energy, recomputed"
+        " from the point, are those of an optimum, to one tolerance for all, whether or not the"
+        " solver claims one.\n\n"
     )
     return text + markdown(table.rename(columns={"energy_start": "start"}), ".6g")
-
-
-def _by_solver(frame: pd.DataFrame) -> str:
-    """Table of the numbers of runs, claims and verified claims of each solver."""
-    groups = frame.assign(true=frame["claimed"] & frame["verified"]).groupby("solver")
-    table = groups.agg(
-        runs=("solver", "size"), claimed=("claimed", "sum"), verified=("verified", "sum")
-    )
-    true = groups["true"].sum().astype(str) + " of " + table["claimed"].astype(str)
-    table["claims that were true"] = true.where(table["claimed"] > 0, "-")
-    ends = frame[~frame["claimed"]].groupby("solver")["ended"].agg(lambda e: sorted(e.unique()))
-    table["ended otherwise"] = ends.str.join("; ").reindex(table.index, fill_value="")
-    text = (
-        "Verified: KKT residuals and exact energy, recomputed from the solver's point, are those of"
-        " an optimum, to one tolerance for all, whether or not it claims one.\n\n"
-    )
-    return text + markdown(table, "")
 
 
 def _by_run(frame: pd.DataFrame) -> str:
