@@ -33,8 +33,6 @@ Flow = Annotated[Words, option("Flow source instead of the suite's own; may be r
 Only = Annotated[Words, option("Only pairs whose name holds this word.")]
 Width = Annotated[int, option("Columns of rendered scenes.", min=64, max=MAX_SIDE)]
 Seeds = Annotated[str, option("Seeds of rendered scenes, such as 0,1,2.")]
-AnyCode = Annotated[bool, option("Also take stored rows of other code versions.")]
-Running = dict[str, Any]
 SIZES: Mapping[str, Any] = {"min": 2, "max": MAX_SUPERPIXELS}
 
 
@@ -113,7 +111,6 @@ def accuracy(
     only: Only = None,
     workers: options.Workers = 1,
     name: Annotated[str, option("Name of the files of one suite.")] = "",
-    any_code: AnyCode = False,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> int:
@@ -129,13 +126,12 @@ def accuracy(
     pages = {each: out / f"{name or each}.md" for each in suites}
     pictures = {each: page.with_suffix(".png").name for each, page in pages.items()}
     claim(out, [*(page.name for page in pages.values()), *pictures.values()], overwrite)
-    running: Running = {"workers": workers, "any_code": any_code}
     codes = []
     for each, items in suites.items():
         note = f"Suite `{each}`: {SUITES[each].text}."
         measured = partial(measure_cells, [Cell(item, changes) for item in items], measure_pair)
         write, files = partial(write_suite, note=note), [pictures[each]]
-        codes.append(_run(pages[each], measured, write, quiet, overwrite, files, **running))
+        codes.append(_run(pages[each], measured, write, quiet, overwrite, files, workers=workers))
     return max(codes)
 
 
@@ -151,7 +147,6 @@ def search(
     width: Width = 512,
     only: Only = None,
     workers: options.Workers = 1,
-    any_code: AnyCode = False,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> int:
@@ -164,8 +159,7 @@ def search(
     changes, command = tuple(overrides or ()), _command("search", data, settings)
     measured = partial(searching.search, space, items, trials=trials, overrides=changes)
     write = _text(partial(searching.search_page, space=texts, command=command))
-    running: Running = {"workers": workers, "any_code": any_code}
-    return _run(out / "search.md", measured, write, quiet, overwrite, **running)
+    return _run(out / "search.md", measured, write, quiet, overwrite, workers=workers)
 
 
 def paper(
@@ -176,7 +170,6 @@ def paper(
     limit: Annotated[int | None, option("At most this many pairs a dataset.", min=1)] = None,
     overrides: options.Set = None,
     workers: options.Workers = 1,
-    any_code: AnyCode = False,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> int:
@@ -192,8 +185,7 @@ def paper(
     measured = partial(measure_cells, list(plan.drop_duplicates("key")["cell"]), measure_paper)
     command = _command("paper", data, settings)
     write = partial(write_paper, plan=plan, command=command, note=note)
-    running: Running = {"workers": workers, "any_code": any_code}
-    return _run(out / FILES[0], measured, write, quiet, overwrite, FILES[1:], **running)
+    return _run(out / FILES[0], measured, write, quiet, overwrite, FILES[1:], workers=workers)
 
 
 def speed(

@@ -146,7 +146,6 @@ def measure_all(
     *,
     say: Say | None = None,
     after: Callable[[list[Row]], None] | None = None,
-    any_code: bool = False,
     fresh: bool = False,
 ) -> list[Row]:
     """The row of every job, from the file or else measured.
@@ -161,7 +160,6 @@ def measure_all(
         say: Called with (done, total, row) after every new row.
         after: Called with all rows so far, in the order of the jobs, after every new row and at the
             end.
-        any_code: Also use stored rows of other code versions.
         fresh: Measure every row in a new process with one thread, so that times and peak memory
             are those of the row only.
 
@@ -171,7 +169,7 @@ def measure_all(
     code = code_version()
     names = [_identity(job.name) for job in jobs]
     row_of: dict[str, Row] = {}
-    stored = [r for r in read_rows(path) if any_code or r.get("code") == code]
+    stored = [r for r in read_rows(path) if r.get("code") == code]
     for job, name in zip(jobs, names, strict=True):
         rows = [r for r in stored if not failed(r) and _identity(r, job.name) == name]
         if rows and not job.stale:
