@@ -10,7 +10,7 @@ OUT ?= out/demo
 # compiled modules and tests serve the next run
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test quick lint docs results versions clean
+.PHONY: demo test quick lint docs packages results versions clean
 .DEFAULT_GOAL := demo
 
 $(VENV)/.installed: pyproject.toml
@@ -39,6 +39,9 @@ quick: $(VENV)/.installed
 
 $(VENV)/.docs: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,docs]' && touch $@
+
+# everything that test, quick and docs install, so that they can run beside each other
+packages: $(VENV)/.optional $(VENV)/.docs
 
 # the documentation in site/; a warning is an error
 docs: $(VENV)/.docs
