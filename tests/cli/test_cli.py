@@ -189,7 +189,7 @@ def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch
         (tmp_path / clip).mkdir(parents=True)
         write_pair(tmp_path / clip, render_scene("orbit", seed, 64, 48), ("frame_0", "frame_1"))
     small = ["--superpixels=6", "--neighbours=3", "--no-refine", "-q", "--fov=50"]
-    small += sets("output.page=false")
+    small += sets("output.page=false solver.presolve=false solver.max_iter=1")
 
     def solve(clip: str, *arguments: str) -> int:
         return main(["solve", *(f"{clip}/frame_{k}.png" for k in (0, 1)), *small, *arguments])

@@ -26,7 +26,7 @@ from soup_nlp.storage.progress import interruptible
 pytestmark = pytest.mark.slow
 
 SMALL = sets(
-    "input.width=160 input.height=120 flow.source=truth segmentation.superpixels=30"
+    "input.width=128 input.height=96 flow.source=truth segmentation.superpixels=20"
     " segmentation.neighbours=5 refine.rounds=1"
 )
 

@@ -143,7 +143,7 @@ def test_a_picture_of_12_bits_names_its_key(white, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "code"),
     [
-        ("list >&-", 0),
+        ("--help >&-", 0),
         ("list <&- >&- 2>&-", 0),
         ("show nothing.yaml", 2),
         # no space for the output

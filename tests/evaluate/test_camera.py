@@ -69,7 +69,7 @@ def test_too_few_matches_show_no_error():
 
 def solved(pair: Pair):
     scene = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
-    raw = {"input": scene, "segmentation": {"superpixels": 100}, "refine": {"enabled": False}}
+    raw = {"input": scene, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
     done = run(make_problem(raw), pair=pair)
     shares, flow = certainty(done), done.pair.flow
     camera = done.confidence.evidence.camera
@@ -82,6 +82,7 @@ def orbit():
     return make_problem({"input": scene, "flow": {"source": "truth"}}).load_pair()
 
 
+@pytest.mark.slow
 def test_a_wrong_principal_point_makes_depth_unsure(orbit):
     K = orbit.K_ref.copy()
     K[0, 2] += 32
@@ -98,6 +99,7 @@ def test_a_wrong_principal_point_makes_depth_unsure(orbit):
     assert np.mean(error < 2 * wrong.confidence.sigma) > 0.88
 
 
+@pytest.mark.slow
 def test_two_scenes_are_a_guess():
     size = {"kind": "scene", "width": 320, "height": 136}
     one, other = (
@@ -108,6 +110,7 @@ def test_two_scenes_are_a_guess():
     assert "same scene" in told
 
 
+@pytest.mark.slow
 def test_a_repeated_frame_is_a_guess(orbit):
     done, told = solved(replace(orbit, flow=None, image_next=orbit.image_ref))
     assert not done.good

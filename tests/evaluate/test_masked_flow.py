@@ -9,6 +9,8 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
 from soup_nlp.pipeline.run import run
 
+pytestmark = pytest.mark.slow
+
 SIZE = 320, 136
 
 
@@ -16,7 +18,7 @@ SIZE = 320, 136
 def problem():
     width, height = SIZE
     scene = {"kind": "scene", "scene": "orbit", "seed": 0, "width": width, "height": height}
-    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 100}}
+    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 60}}
     return make_problem(raw | {"refine": {"enabled": False}})
 
 

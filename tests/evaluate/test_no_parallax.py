@@ -15,7 +15,8 @@ from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.pipeline.run import run
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.report.verdict import verdict
 from soup_nlp.start.propose import propose
 from soup_nlp.start.views import FlowFit
@@ -76,9 +77,10 @@ def test_the_verdict_warns_where_depth_is_a_guess(scene, width, said, tmp_path):
         "input": {"kind": "scene", "scene": scene, "seed": 0, "width": width, "height": height},
         "flow": {"source": "truth"},
         "segmentation": {"superpixels": 60, "neighbours": 6},
-        "refine": {"enabled": False},
     }
-    done = run(make_problem(raw))
+    # the start decides it
+    case = prepare(make_problem(raw))
+    done = make_run(case, skipped(case))
     assert done.good != said
     share = re.search(r"(\d+)% is a guess", verdict(done, tmp_path, []))
     assert (share is not None and int(share[1]) > 50) == said

@@ -264,8 +264,8 @@ def swinging(tmp_path_factory) -> Case:
     raw = {
         "input": scene,
         "flow": {"source": "truth"},
-        "segmentation": {"superpixels": 40, "neighbours": 4},
-        "energy": {"pixel_samples": 4},
+        "segmentation": {"superpixels": 32, "neighbours": 3},
+        "energy": {"pixel_samples": 2},
         "depth_prior": {"source": str(folder / "depth.npy")},
     }
     return prepare(make_problem(raw))

@@ -119,14 +119,18 @@ def test_forged_arrays_are_recomputed(place, folder):
         assert re.match(r"25 of 25 beyond .*; worst superpixels \d+ \(2\.0e-02\)", so3.note)
 
 
-@pytest.mark.parametrize(
-    "place",
-    ["versions numpy", "seconds nlp", "start motions", "sizes equalities", "refinement status",
-     "flow", "name", "expected", "metrics", "metrics start", "metrics solution mre", "refinement",
-     "sizes hessian_nonzeros", "depth_png_scale next", "answer_residuals positive",
-     "residuals dual_infeasibility", "delivered"],
+ENTRIES = (
+    "versions numpy", "seconds nlp", "start motions", "sizes equalities", "refinement status",
+    "flow", "name", "expected", "metrics", "metrics start", "metrics solution mre", "refinement",
+    "sizes hessian_nonzeros", "depth_png_scale next", "answer_residuals positive",
+    "residuals dual_infeasibility", "delivered",
 )  # fmt: skip
-@pytest.mark.parametrize("how", ["changed", "removed"])
+
+
+@pytest.mark.parametrize(
+    ("how", "place"),
+    [*(("changed", place) for place in ENTRIES), *(("removed", place) for place in ENTRIES[::3])],
+)
 def test_entries_are_as_written(how, place, folder):
     *above, last = place.split()
     claims = json.loads((folder / "summary.json").read_text())

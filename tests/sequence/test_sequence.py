@@ -236,9 +236,9 @@ def test_similarities_are_found_exactly():
 def test_duplicate_frames_are_bridged(order, tmp_path):
     """A recording that starts, pauses and ends at rest, or rests all the time."""
     for k, frame in enumerate(order):
-        write_png(tmp_path / f"{k}.png", render_scene("orbit", 0, 160, 108, frame).image_ref)
-    np.savetxt(tmp_path / "K.txt", render_scene("orbit", 0, 160, 108).K_ref)
-    fast = ["--superpixels", "30", "--neighbours", "5", "--set", "refine.enabled=false", "-q"]
+        write_png(tmp_path / f"{k}.png", render_scene("orbit", 0, 128, 86, frame).image_ref)
+    np.savetxt(tmp_path / "K.txt", render_scene("orbit", 0, 128, 86).K_ref)
+    fast = ["--superpixels", "16", "--neighbours", "5", "--set", "refine.enabled=false", "-q"]
     assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out"), *fast]) == 0
     told = json.loads((tmp_path / "out" / "chain.json").read_text())
     links = {tuple(link["pairs"]): link for link in told["links"]}
@@ -251,7 +251,7 @@ def test_duplicate_frames_are_bridged(order, tmp_path):
 
 
 SMALL = [
-    *("input.width=160", "input.height=108", "segmentation.superpixels=40", "flow.source=truth"),
+    *("input.width=160", "input.height=108", "segmentation.superpixels=25", "flow.source=truth"),
     *("refine.enabled=false", "segmentation.neighbours=8"),
 ]
 
@@ -352,11 +352,11 @@ def test_warnings_of_pairs_are_printed_as_one_line(tmp_path, capfd):
 def test_frames_without_a_camera_get_one_focal_length(tmp_path):
     names = [str(tmp_path / f"{k}.png") for k in range(3)]
     for k, name in enumerate(names):
-        pair = render_scene("room", 1, 320, 216, k)
+        pair = render_scene("room", 1, 240, 162, k)
         write_png(tmp_path / name, pair.image_ref)
-    fast = ["segmentation.superpixels=60"]
+    fast = ["segmentation.superpixels=40"]
     camera = one_camera(Frames(tuple(names)), fast).camera
-    focal = 160 / np.tan(np.radians(camera["fov"] / 2))
+    focal = 120 / np.tan(np.radians(camera["fov"] / 2))
     assert focal == pytest.approx(pair.K_ref[0, 0], rel=0.1)  # the guess is 1.5 times as long
     assert 0.05 <= camera["focal_sigma"] < 0.2
     # the solve of a pair takes it as it is

@@ -252,7 +252,7 @@ def test_the_nlp_keeps_a_swinging_box_off_the_wall():
     what = {"kind": "scene", "scene": "swing", "seed": 2, "width": 320, "height": 240}
 
     def result(order):
-        raw = {"input": what, "segmentation": {"superpixels": 120}, "refine": {"enabled": False}}
+        raw = {"input": what, "segmentation": {"superpixels": 90}, "refine": {"enabled": False}}
         return run(make_problem(raw | {"energy": {"weights": {"order": order}}}))
 
     held, free = result(10.0), result(0.0)

@@ -43,7 +43,7 @@ def test_a_shift_without_a_turn_keeps_the_focal_length():
 
 
 def test_only_a_guess_is_corrected():
-    scene = {"kind": "scene", "scene": "orbit", "width": 640, "height": 272}
+    scene = {"kind": "scene", "scene": "orbit", "width": 480, "height": 204}
     raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 60}}
     problem = make_problem(raw)
     right = problem.load_pair()

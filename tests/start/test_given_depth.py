@@ -21,6 +21,7 @@ from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.reweighting import with_prior
+from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.summary import certainty, summary
 from soup_nlp.start.components import TIES
@@ -170,9 +171,10 @@ def across_steps(seg: Segmentation, depth: np.ndarray) -> float:
     return float((off > 0.2).mean())
 
 
+@pytest.mark.slow
 def test_superpixels_end_at_steps_of_an_unconfirmed_prior(pan, swing):
     def cut(seen: Seen, prior: np.ndarray | None) -> Segmentation:
-        raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": 150}}
+        raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": 80}}
         return prepare(make_problem(raw), pair=replace(seen.pair, depth_prior=prior)).segmentation
 
     before, after = cut(pan, None), cut(pan, pan.depth)
@@ -183,9 +185,11 @@ def test_superpixels_end_at_steps_of_an_unconfirmed_prior(pan, swing):
     np.testing.assert_array_equal(cut(swing, swing.depth).labels, cut(swing, None).labels)
 
 
-def test_evidence_for_a_prior_is_independent_of_superpixel_count(swing):
+@pytest.mark.slow
+def test_evidence_for_a_prior_is_independent_of_superpixel_count(swing, monkeypatch):
+    monkeypatch.setattr(pipeline_case, "PIECES", 80)
     numbers = []
-    for count in (300, 450):
+    for count in (80, 120):
         raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": count}}
         pair = replace(swing.pair, depth_prior=swing.depth * np.exp(0.2 * WAVE))
         given = prepare(make_problem(raw), pair=pair).given
@@ -224,6 +228,7 @@ def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
     np.testing.assert_allclose(first, second, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_steps_on_image_edges_tell_a_map_of_it():
     rng = np.random.default_rng(0)
     image, depth = np.full((120, 160, 3), 90, np.uint8), np.full((120, 160), 5.0)
@@ -270,7 +275,7 @@ def test_a_prior_that_cannot_be_one_is_refused(swing):
 
 @pytest.mark.slow
 def test_the_prior_is_in_the_energy_and_in_sigma(pan, swing):
-    options = {"segmentation": {"superpixels": 150}, "refine": {"rounds": 1, "particles": 10}}
+    options = {"segmentation": {"superpixels": 60}, "refine": {"enabled": False}}
     none = soup_nlp.solve_pair(swing.pair, **options)
     assert "depth" not in none.energy
     assert none.given is None

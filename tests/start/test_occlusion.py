@@ -146,6 +146,7 @@ def test_a_swinging_object_comes_before_the_wall(swing):
     assert not (start.tie[main] == TIES.index("occlusion")).any()
 
 
+@pytest.mark.slow
 def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
     pair = render_scene("room", 1, 512, 218)
     pair = pair.with_flow(flow_from_truth(pair))
@@ -189,15 +190,15 @@ def made(covers: bool, *options: str):
     return problem, pair
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("covers", [True, False])
 def test_the_nlp_keeps_the_order_and_marks_it_a_guess(covers):
     problem, pair = made(covers)
-    case = prepare(problem, pair=pair)
-    assert (case.start.tie == TIES.index("occlusion")).any()
     done = run(problem, pair=pair)
-    ordered_pairs = case.start.order != 0
-    z = done.soup.depth_across(done.segmentation.pairs, case.data.boundary_ray.mean(axis=1))
-    step = (np.log(z[0] / z[1]) * np.sign(case.start.order))[ordered_pairs]
+    assert (done.start.tie == TIES.index("occlusion")).any()
+    ordered_pairs = done.start.order != 0
+    z = done.soup.depth_across(done.segmentation.pairs, done.data.boundary_ray.mean(axis=1))
+    step = (np.log(z[0] / z[1]) * np.sign(done.start.order))[ordered_pairs]
     assert np.median(step) > 0.2
     assert done.energy["order"] >= 0
     assert (done.reconstruction.sigma_ref > MOST_SIGMA).all()

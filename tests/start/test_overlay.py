@@ -87,6 +87,7 @@ def test_a_still_region_before_a_moving_camera_is_fixed(seg, clean, name):
         assert np.median(np.abs(log - np.median(log))) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["far region", "resting camera", "mover"])
 def test_what_moves_or_is_far_is_not_fixed(seg, what):
     flow = scene_flow(np.zeros(3)) if what == "far region" else scene_flow()

@@ -61,7 +61,7 @@ class Command:
 def commands(root: Path, names: Sequence[str]) -> list[Command]:
     """The commands of the table."""
     overrides = [word for text in TINY for word in ("--set", text)]
-    export = ["export", "orbit", "-q", *overrides]
+    export = ["export", "orbit", "--no-presolve", "-q", *overrides]
     out = {name: root / name for name in NAMES}
     words = {
         "solve": ["solve", "orbit", "-q", *overrides, "--out", str(out["solve"])],
@@ -76,7 +76,7 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         "family": f"family {out['family']} --sizes 100 --scenes orbit --starts cold".split(),
     }
     if "import" in names:
-        run([*export, "--no-presolve", "--out", str(root / "exported")])
+        run([*export, "--out", str(root / "exported")])
         problem = load_problem(root / "exported" / "problem.yaml")
         case = prepare(problem)
         nlp, _ = case.nlp(case.formulation(hessian="exact", compiled=False))
