@@ -191,17 +191,21 @@ def _tum_camera(folder: Path) -> Float:
 
 def _tum_list(path: Path) -> list[tuple[float, str]]:
     """(time stamp in seconds, name of a file) of each line of rgb.txt or depth.txt."""
-    lines = [line.split() for line in read_text(path, "file list").splitlines()]
-    try:
-        # a line that starts with # is a comment
-        return [(float(words[0]), words[1]) for words in lines if words and words[0][0] != "#"]
-    except (ValueError, IndexError) as error:
-        raise DataError(
-            "line of a file list is not understood",
-            where=path,
-            found=error,
-            expected="'timestamp file'",
-        ) from None
+    out = []
+    for number, line in enumerate(read_text(path, "file list").splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split()
+        try:
+            out.append((float(words[0]), words[1]))
+        except (ValueError, IndexError):
+            raise DataError(
+                "line of a file list is not understood",
+                where=f"{path}, line {number}",
+                found=repr(line[:60]),
+                expected="'timestamp file'",
+            ) from None
+    return out
 
 
 class MotorcycleInput(PairInput):
