@@ -17,7 +17,6 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.choice import PIECE_SIZE
 from soup_nlp.start.components import FIXED, SCENE, TIES
 from soup_nlp.start.prior_evidence import FEWEST, LEAST_SIGMA, Evidence, Seen, without_gaps
 from soup_nlp.start.propose import Start
@@ -26,9 +25,8 @@ from soup_nlp.start.views import FlowFit
 HELD, NEAR = 4 / 300, 0.1
 """Weight of the whole image's error beside residuals, as a share of its area; standard deviation of
 the distance up to which a residual counts, relative to the square root of that area."""
-REACH, STEEPEST = 4, 0.5
-"""Pixels to either side between which a prior's slope is a difference, and the largest change of
-relative inverse depth from the middle of a superpixel to its border."""
+REACH = 4
+"""Pixels to either side between which a prior's slope is a difference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +145,7 @@ def _shaped(
         by_prior = views.soup(np.exp(-prior), np.zeros((len(prior), 2)), R, T)
         return soup.taking(by_prior, mask), ~every
     settled, strong = seen.settled(soup, c, prior, sigma)
-    return (settled, strong[mask]) if strong.sum() >= PIECE_SIZE else (soup, every)
+    return settled, strong[mask]
 
 
 def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:
@@ -163,9 +161,7 @@ def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:
     K, index = pair.K_ref, np.arange(len(seg))
     change = along_rows(inverse, K[0, 0]), along_rows(inverse.T, K[1, 1]).T
     out = np.stack([ndimage.median(d, seg.labels, index) for d in change], axis=1)
-    out /= ndimage.mean(inverse, seg.labels, index)[:, None]
-    steep = np.linalg.norm(out, axis=1) * np.sqrt(seg.sizes / np.pi) / K[0, 0]
-    return np.asarray(out / np.maximum(1.0, steep / STEEPEST)[:, None])
+    return np.asarray(out / ndimage.mean(inverse, seg.labels, index)[:, None])
 
 
 def _local(seg: Segmentation, known: Mask, residual: Float, sigma: float) -> tuple[Float, Float]:
@@ -183,7 +179,6 @@ def _local(seg: Segmentation, known: Mask, residual: Float, sigma: float) -> tup
     squared = cdist(seg.anchors, seg.anchors[known], "sqeuclidean")
     weight = np.exp(-0.5 * squared / (NEAR**2 * area)) * seg.sizes[known] / area
     total = HELD + weight.sum(axis=1)
-    gap = np.clip(residual[known], -1.0, 1.0)
-    mean = weight @ gap / total
-    variance = (HELD * sigma**2 + weight @ gap**2) / total - mean**2
+    mean = weight @ residual[known] / total
+    variance = (HELD * sigma**2 + weight @ residual[known] ** 2) / total - mean**2
     return mean, np.sqrt(np.maximum(variance, LEAST_SIGMA**2))
