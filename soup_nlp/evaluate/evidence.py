@@ -19,7 +19,14 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.start.bending import LEAST_GAP, PLAIN_TURN, fit_robustly, turned
+from soup_nlp.start.bending import (
+    LEAST_GAP,
+    PLAIN_TURN,
+    displaced,
+    fit_robustly,
+    trimmed_mean,
+    turned,
+)
 from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.settle import RELIEF
 
@@ -122,7 +129,7 @@ def evidence(
         at = np.flatnonzero((component == c) & valid)
         if len(at) < FEWEST:
             continue
-        errors[:, c] = *_without_depth(data, at), _mean(misfit[at])
+        errors[:, c] = *_without_depth(data, at), trimmed_mean(misfit[at])
         members = np.flatnonzero(component == c)
         sigma[members] = _open_motion(soup, data, members, valid[members], OPEN * noise, camera)
     return Evidence(errors[0], errors[1], errors[2], noise, sigma, wrong)
@@ -147,11 +154,6 @@ def _error(pixel: Float, data: EnergyData, at: Int | slice = slice(None)) -> Flo
     return np.asarray(np.sum(weight * distance, axis=1) / np.maximum(weight.sum(axis=1), 1e-9))
 
 
-def _mean(error: Float) -> float:
-    """Mean error without the largest tenth, which a component may include by mistake."""
-    return float(np.mean(np.sort(error)[: max(1, int(np.ceil(0.9 * len(error))))]))
-
-
 def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float, float]:
     """Errors of superpixels `at` under the best turn alone and the best motion at equal depths."""
     step = max(1, data.pixel_ray[at].shape[0] * data.pixel_ray.shape[1] // pixels)
@@ -159,17 +161,14 @@ def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float
     target = data.pixel_target[at].reshape(-1, 2)[::step]
     root = np.sqrt(data.pixel_weight[at].ravel()[::step] * data.pixel_ray.shape[1])[:, None]
 
-    def shifted(x: Float, ray: Float) -> Float:
-        return ray @ rotation.exp(x[:3]).T + x[3:]
-
     def error(model: Callable[[Float, Float], Float], size: int) -> float:
         def miss(x: Float) -> Float:
             return root * np.nan_to_num(project(data.K_next, model(x, ray)) - target, nan=1e3)
 
         moved = model(fit_robustly(miss, size), data.pixel_ray[at])
-        return _mean(_error(project(data.K_next, moved), data, at))
+        return trimmed_mean(_error(project(data.K_next, moved), data, at))
 
-    return error(turned, PLAIN_TURN), error(shifted, 6)
+    return error(turned, PLAIN_TURN), error(displaced, 6)
 
 
 def _open_motion(

@@ -259,7 +259,7 @@ def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
         key = np.log1p(-np.random.default_rng(seed).random(len(weight))) / weight
         pick = np.sort(np.argpartition(-key, SAMPLES)[:SAMPLES])
         weight = np.ones(len(weight))  # the draw has done the weighting
-    motion = _best_motion(r[pick], q[pick], weight[pick], focal, seed)
+    motion = _best_motion(epipolar.Matches(r[pick], q[pick], weight[pick], focal), seed)
     if motion is None:
         return None
     z, z_next = epipolar.triangulate(motion, r, q)
@@ -271,17 +271,15 @@ def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
     return depth
 
 
-def _best_motion(
-    r: Float, q: Float, weight: Float, focal: float, seed: int
-) -> epipolar.Motion | None:
-    """The motion of rays r, q (M, 3) with the smallest Cauchy cost, or None where there is none."""
+def _best_motion(matches: epipolar.Matches, seed: int) -> epipolar.Motion | None:
+    """The motion of correspondences with the smallest Cauchy cost, or None where there is none."""
     best, lowest = None, np.inf
     for distance in (INLIER, TIGHT * INLIER):
-        motion = epipolar.estimate(epipolar.Matches(r, q, weight, focal), distance, seed)
+        motion = epipolar.estimate(matches, distance, seed)
         if motion is None or not (np.isfinite(motion.R).all() and np.isfinite(motion.t).all()):
             continue
-        off = epipolar.sampson(motion.essential(), r, q, focal) / (TIGHT * INLIER)
-        cost = float(np.sum(weight * np.log1p(off * off)))
+        off = matches.distance(motion) / (TIGHT * INLIER)
+        cost = float(np.sum(matches.weight * np.log1p(off * off)))
         if cost < lowest:
             best, lowest = motion, cost
     return best

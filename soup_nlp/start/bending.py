@@ -84,6 +84,17 @@ def turned(x: Float, ray: Float) -> Float:
     return np.asarray(moved)
 
 
+def displaced(x: Float, ray: Float, inverse: Float | float = 1.0) -> Float:
+    """Rays (..., 3) after the rotation vector x[:3] and the translation x[3:6] times an inverse
+    depth (..., 1)."""
+    return np.asarray(ray @ rotation.exp(x[:3]).T + inverse * x[3:6])
+
+
+def trimmed_mean(error: Float) -> float:
+    """Mean error without the largest tenth, which a component may include by mistake."""
+    return float(np.mean(np.sort(error)[: max(1, int(np.ceil(0.9 * len(error))))]))
+
+
 def fit_robustly(miss: Callable[[Float], Float], size: int) -> Float:
     """(size,) parameters with the least Cauchy loss of `miss`, pixels, by narrowing scales."""
     x = np.zeros(size)

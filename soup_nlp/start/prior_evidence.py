@@ -22,7 +22,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.start.bending import fit_robustly
+from soup_nlp.start.bending import displaced, fit_robustly, trimmed_mean
 from soup_nlp.start.choice import CLIP
 from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Motion
@@ -135,14 +135,13 @@ class Seen(NamedTuple):
 
         def miss(x: Float) -> Float:
             near = inverse / middle + (x[6] if shifted else 0.0)
-            moved = ray @ rotation.exp(x[:3]).T + near[:, None] * x[3:6]
+            moved = displaced(x, ray, near[:, None])
             gap = moved / np.maximum(moved[:, 2:], 1e-3) - target
             return gap[:, :2] * views.focal
 
         x = fit_robustly(miss, 7 if shifted else 6)
-        error = np.sort(np.minimum(np.linalg.norm(miss(x), axis=1), CLIP))
-        mean = float(np.mean(error[: int(np.ceil(0.9 * len(error)))]))
-        return mean, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6] if shifted else 0.0
+        error = trimmed_mean(np.minimum(np.linalg.norm(miss(x), axis=1), CLIP))
+        return error, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6] if shifted else 0.0
 
     def relief(self, c: int) -> float:
         """Error of the flow of a component at one depth, above the noise, pixels."""
@@ -220,8 +219,6 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Eviden
 
     seen = Seen(start, flow)
     value, with_value, whole = without_gaps(pair, flow.seg)
-    if np.ptp(value) < 1e-6 * value.max():
-        return Evidence(kind or "relative", np.log, np.nan, np.inf, False)
     anchor, relief = flow.views.anchor, seen.relief(SCENE)
     known = with_value & seen.usable & (start.component == SCENE)
     determined, tells = relief > seen.tells, relief > seen.tells / 3 and known.sum() >= FEWEST
