@@ -15,7 +15,6 @@ from scipy.spatial.distance import cdist
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.plane import about_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import FIXED, SCENE, TIES
 from soup_nlp.start.prior_evidence import FEWEST, LEAST_SIGMA, Evidence, Seen, without_gaps
@@ -102,11 +101,8 @@ def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tup
     from_prior = ~fixed & ~(main & strong)
     # a superpixel has the translation of its component, whatever its depth
     scaled = replace(soup, lam=soup.lam * np.exp(-off))
-    planes = about_anchor(
-        np.exp(prior), _slopes(np.exp(-evidence.log_depth(whole)), pair, seg), anchor
-    )
-    normal, D = normal_and_distance(planes)
-    tilted = Soup(D, normal, np.ones(n), soup.R, scaled.translation / D[:, None])
+    slope = _slopes(np.exp(-evidence.log_depth(whole)), pair, seg) * flow.views.radius[:, None]
+    tilted = flow.views.soup(np.exp(-prior), slope, soup.R, scaled.translation)
     soup = scaled.taking(tilted, ~strong).normalised()
     tie = np.where(from_prior & ~main, TIES.index("given depth"), start.tie)
     # without a flow to weigh it against, terms on shape must not undo the prior
