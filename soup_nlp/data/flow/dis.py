@@ -4,6 +4,7 @@ A coarse-to-fine search loses large displacements with a change of scale, such a
 ground near a driving camera. The dominant homographies of a first flow explain most of such a
 motion. The flow is therefore computed again on images that a homography aligns: the remaining
 displacements are small. The new flow is used where its round trip closes better than the first one.
+What still has no flow may be small surfaces that move far (`soup_nlp.data.flow.tiles`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error, sampled
+from soup_nlp.data.flow.tiles import with_tiles
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
@@ -142,7 +144,8 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
 
     The flow is computed in both directions, and again after each of the dominant homographies
     (`PLANES`) has aligned the images. The better one is used for each pixel (`guided_flow`), since
-    displacements near a driving camera are too large for a coarse-to-fine search alone.
+    displacements near a driving camera are too large for a coarse-to-fine search alone. Small
+    surfaces that move far are searched for by their tiles (`with_tiles`).
 
     The confidence follows from the round-trip error (`confidence_of`). A wrong but consistent flow,
     as on weak texture, keeps its confidence. An image without contrast (standard deviation below
@@ -191,6 +194,7 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
     try:
         forward, backward = match(ref, nxt)
         uv, gap = guided_flow(ref, nxt, match, forward, backward)
+        uv, gap = with_tiles(ref, nxt, match, uv, gap)
     except cv2.error as error:
         raise DataError(
             "DIS flow failed", where=f"images {width}x{height}", found=str(error).strip()
