@@ -80,6 +80,7 @@ def test_truth_of_float32_is_no_warning():
     assert truth.depth_ref.dtype == np.float64
 
 
+@pytest.mark.slow
 def test_options_may_be_records_and_progress_is_reported(capsys):
     pair, seen = render_scene("orbit", 0, 64, 48), []
     options = {"segmentation": SegmentationOptions(**SMALL), "refine": {"enabled": False}}
@@ -134,6 +135,7 @@ def test_a_stored_result_has_the_arrays_of_its_run(run, saved, tmp_path):
         soup_nlp.load(tmp_path)
 
 
+@pytest.mark.slow
 def test_heavy_packages_are_imported_on_use():
     heavy = ("matplotlib", "trimesh", "pandas", "skimage.segmentation", "scipy.stats")
     code = f"import sys, soup_nlp.cli.solve; print([m for m in {heavy} if m in sys.modules])"

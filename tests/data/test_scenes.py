@@ -347,6 +347,7 @@ def test_same_seed_same_bytes_other_seed_other_scene(name):
     assert a.truth.flow.tobytes() != c.truth.flow.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(65, 131), (160, 50)])
 @pytest.mark.parametrize("name", FIRST)
 def test_any_size(name, size):

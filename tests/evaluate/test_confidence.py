@@ -259,7 +259,13 @@ def sure_of(case, data=None, weights=None):
     return confidence(rec, case.pair, case.start, *energy)
 
 
-def test_an_undetermined_superpixel_has_the_sigma_of_the_prior(small_room):
+@pytest.fixture(scope="module")
+def sure(small_room):
+    """The uncertainty of the start of the small room."""
+    return sure_of(small_room)
+
+
+def test_an_undetermined_superpixel_has_the_sigma_of_the_prior(small_room, sure):
     blind = 25
     weight = small_room.data.pixel_weight.copy()
     weight[blind] = 0.0
@@ -268,19 +274,20 @@ def test_an_undetermined_superpixel_has_the_sigma_of_the_prior(small_room):
     sigma = sure_of(small_room, data, loose).sigma
     inside = small_room.segmentation.labels == blind
     np.testing.assert_allclose(sigma[inside], SIGMA_PRIOR, rtol=0.02)
-    assert sure_of(small_room).sigma[inside].mean() < 0.9 * SIGMA_PRIOR
+    assert sure.sigma[inside].mean() < 0.9 * SIGMA_PRIOR
 
 
 @pytest.mark.slow
-def test_the_background_of_a_camera_at_rest_is_a_guess(small_room):
+def test_the_background_of_a_camera_at_rest_is_a_guess(small_room, sure):
     scene = {"kind": "scene", "scene": "still", "width": 256, "height": 128}
     still = prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
     moves = still.pair.truth.components > 0
     at_rest = sure_of(still).sigma > MOST_SIGMA
     assert at_rest[~moves].mean() > 0.8
-    assert sure_of(small_room).guessed < 0.2
+    assert sure.guessed < 0.2
 
 
+@pytest.mark.slow
 def test_a_guessed_or_wrong_focal_length_makes_depth_unsure():
     scene = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
     raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 100}}
@@ -348,8 +355,8 @@ def test_systematic_uncertainty_is_added_at_any_noise(bends):
     assert calibrated(spread, 0.1, added=np.inf)[0] == pytest.approx(SIGMA_PRIOR)
 
 
-def test_other_components_are_less_sure_than_the_reference(small_room):
-    sure, start = sure_of(small_room), small_room.start
+def test_other_components_are_less_sure_than_the_reference(small_room, sure):
+    start = small_room.start
     sizes = small_room.segmentation.sizes
     scale = scale_by_contact(sure.marginals, start, sizes, np.ones(len(sizes)))
     reference = start.tie == TIES.index("reference")
@@ -364,8 +371,8 @@ def test_other_components_are_less_sure_than_the_reference(small_room):
     np.testing.assert_allclose(sure.component_sigma, expected)
 
 
-def test_a_scale_is_open_where_contact_implies_too_fast_motion(small_room):
-    sure, start = sure_of(small_room), small_room.start
+def test_a_scale_is_open_where_contact_implies_too_fast_motion(small_room, sure):
+    start = small_room.start
     tied = start.tie != TIES.index("reference")
     fast = int(start.component[tied][0])
     moving = start.component == fast
@@ -381,9 +388,10 @@ def test_a_scale_is_open_where_contact_implies_too_fast_motion(small_room):
     np.testing.assert_array_equal(scale(5.0)[~moving], usual[~moving])
 
 
-def test_what_floats_above_the_ground_is_unsure_by_the_ratio(small_room):
+@pytest.mark.slow
+def test_what_floats_above_the_ground_is_unsure_by_the_ratio(small_room, sure):
     inside = small_room.segmentation.labels == 25
-    usual = sure_of(small_room).sigma
+    usual = sure.sigma
     assert usual[inside].mean() < 0.1
 
     def sigma(log_ratio):
@@ -398,13 +406,13 @@ def test_what_floats_above_the_ground_is_unsure_by_the_ratio(small_room):
         np.testing.assert_array_equal(floats[~inside], usual[~inside])
 
 
-def test_a_camera_at_rest_leaves_a_guess_in_its_order(small_room):
+def test_a_camera_at_rest_leaves_a_guess_in_its_order(small_room, sure):
     rests = replace(small_room, start=replace(small_room.start, at_rest=True))
-    moving, resting = sure_of(small_room).sigma, sure_of(rests).sigma
+    moving, resting = sure.sigma, sure_of(rests).sigma
     least = GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)
     assert least <= resting.min() <= resting.max() <= SIGMA_PRIOR
-    sure = moving < MOST_SIGMA
-    assert np.all(np.diff(resting[sure][np.argsort(moving[sure])]) > -1e-9)
+    sharp = moving < MOST_SIGMA
+    assert np.all(np.diff(resting[sharp][np.argsort(moving[sharp])]) > -1e-9)
     assert np.unique(resting).size > 1000
 
 

@@ -135,6 +135,7 @@ def programs(draw):
     return {"x": x, "f": outputs[0], "g": ca.vertcat(*outputs[1:])}, at
 
 
+@pytest.mark.slow
 @settings(max_examples=120)
 @given(program=programs())
 def test_random_programs_read_back(program, tmp_path_factory):

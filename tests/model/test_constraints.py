@@ -288,6 +288,7 @@ def smooth_answer(name: str, gauge: str, ratio: float) -> tuple[NLP, MatrixLayou
     return nlp, layout, stage.x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "gauge", "ratio"),
     [

@@ -42,6 +42,7 @@ def test_a_shift_without_a_turn_keeps_the_focal_length():
     assert sigma > 0.85 * GUESS_SIGMA
 
 
+@pytest.mark.slow
 def test_only_a_guess_is_corrected():
     scene = {"kind": "scene", "scene": "orbit", "width": 480, "height": 204}
     raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 60}}

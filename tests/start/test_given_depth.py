@@ -85,6 +85,7 @@ def test_inverse_depth_with_a_shift_is_found(swing):
     assert np.abs(swing.error(start)).mean() < 0.1
 
 
+@pytest.mark.slow
 def test_planes_lean_as_the_given_depth_does_inside_superpixels(pan):
     """They are twice as near to it as level planes; a step inside a superpixel tilts none."""
     labels, K = pan.seg.labels, pan.pair.K_ref
@@ -133,6 +134,7 @@ def test_orientation_is_held_inside_a_plane_and_released_at_creases(pan):
     np.testing.assert_array_equal(flat, data.orient_weight)
 
 
+@pytest.mark.slow
 def test_a_prior_scales_objects_beside_a_determined_background():
     """It moves the background by less than its own error, and has the steps at outlines."""
     road = Seen("street")

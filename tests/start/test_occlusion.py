@@ -94,6 +94,7 @@ def test_a_vote_needs_several_strips_and_agreement():
     assert not vote(np.full(len(seg.pairs), 20.0), 0 * region, seg).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("covers", [True, False])
 def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     pair, seg = sliding(covers)
@@ -123,6 +124,7 @@ def swing() -> tuple[Pair, Segmentation]:
     )
 
 
+@pytest.mark.slow
 def test_a_swinging_object_comes_before_the_wall(swing):
     pair, seg = swing
     before = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart()))
@@ -204,6 +206,7 @@ def test_the_nlp_keeps_the_order_and_marks_it_a_guess(covers):
     assert (done.reconstruction.sigma_ref > MOST_SIGMA).all()
 
 
+@pytest.mark.slow
 def test_without_its_weight_nothing_is_placed_in_order():
     problem, pair = made(True, "energy.weights.order=0")
     case = prepare(problem, pair=pair)

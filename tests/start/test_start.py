@@ -194,6 +194,7 @@ def test_two_cameras_with_different_intrinsics():
 # --- same seed, same start -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_start_is_a_function_of_its_seed():
     pair, seg, _ = cut(corner_scene(CAMERA, motion((0, 3, 0), (-0.15, 0.02, 0.1))))
     noise = np.random.default_rng(99).normal(0, 0.3, pair.flow.uv.shape)
@@ -243,6 +244,7 @@ def test_a_superpixel_without_parallax_borrows_its_depth(corner):
     assert 0.3 < z[far] / np.median(z[seg.knn[far]]) < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["zero flow", "one superpixel", "eight pixels"])
 def test_flow_that_determines_no_depth_is_finite_and_flagged(corner, what):
     pair, seg, _ = corner
@@ -281,6 +283,7 @@ PLANE_LABELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANE_LABELS)
 def test_one_plane_in_superpixels_of_any_shape_is_finite(name):
     pair = plane_world(plane_pose(3.0, yaw=20, pitch=10), CAMERA, 64, 48)
