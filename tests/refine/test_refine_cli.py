@@ -142,7 +142,7 @@ def test_an_interrupted_refinement_keeps_its_best_and_exits_with_1(tmp_path):
 
 
 @pytest.mark.parametrize("wrong", ["particles=1", "proposals=neighbours", "round=3", "rounds=-1"])
-def test_the_section_has_the_defaults_of_its_record_and_is_strict(wrong):
+def test_the_section_is_strict_and_has_its_records_defaults(wrong):
     problem = make_problem({"input": {"kind": "motorcycle"}})
     assert problem.refine == RefineOptions()
     assert problem.refine.particles == 50

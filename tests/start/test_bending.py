@@ -33,12 +33,10 @@ from soup_nlp.start.bending import (
 )
 from soup_nlp.start.choice import LEAST_NOISE, dominant, rigid_choice
 from soup_nlp.start.merge import gather
-from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow
 
-SEEDED = SeededStart()
 UNORDERED = "energy.weights.order=0"  # leaves out the order that occlusion shows
 SHEET = Path(__file__).parents[2] / "problems" / "sheet.yaml"
 

@@ -165,7 +165,7 @@ def test_superpixels_that_join_region_and_ground_do_not_count():
     np.testing.assert_allclose(off[body], -np.log(0.8), atol=0.03)
 
 
-def test_a_quarter_of_the_image_may_be_a_table_that_rests():
+def test_a_quarter_of_the_image_may_be_a_resting_table():
     seg, K, ray, Z = street(1.0)
     row, column = np.divmod(np.arange(len(Z)), 30)
     table = (row >= 4) & (row <= 16) & (column >= 5) & (column <= 24)
