@@ -213,7 +213,9 @@ def provenance(frame: pd.DataFrame) -> str:
     seconds = frame["cpu_seconds"].astype(float).sum()
     where = f"{date.today()}, {platform.machine()}"
     first, *others = frame.get("overrides", pd.Series([[]])).tolist() or [[]]
-    common = [f"`{o}`" for o in first if all(o in overrides for overrides in others)]
+    # of two overrides of a key the later one counts
+    last = {o.partition("=")[0]: o for o in first}.values()
+    common = [f"`{o}`" for o in last if all(o in overrides for overrides in others)]
     changes = f"overrides of every row: {', '.join(common) or 'none'}"
     return f"{where}, {seconds:.0f} CPU seconds in all; code {code}; {changes}"
 

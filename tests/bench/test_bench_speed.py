@@ -103,6 +103,11 @@ def test_the_page_of_runs():
     assert "N 250, K 10: no answer" in speed_page(frame_of(rows[-1:]))
 
 
+def test_the_page_names_the_last_override_of_a_key():
+    twice = made(overrides=["seed=0", "refine.enabled=false", "refine.enabled=true"])
+    assert "every row: `seed=0`, `refine.enabled=true`." in speed_page(frame_of([twice]))
+
+
 @pytest.mark.parametrize(
     "words",
     [
