@@ -4,8 +4,8 @@ At the coarse scales at which a large displacement is small, a small surface has
 the image without usable flow are therefore searched for in the next image, each by itself. The
 matches become flow only where several tests agree, since a wrong flow costs more than none: a match
 is distinct and mutual, neighbouring tiles agree, the flow that begins at their displacement closes
-its round trip on most of their area, and it ends where no other flow ends. The last test rejects
-what is hidden in the next image: what looks like it there is mostly explained already.
+its round trip on most of their area, and it ends where no flow known before ends. This last test
+rejects what is hidden in the next image: what looks like it there is mostly explained already.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import FloatMap, Image
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error, sampled
+from soup_nlp.geometry.graph import connected
 
 LEAST_SHRINK, SEARCH_SIDE = 2, 768
 """The images are searched at half their size, or smaller: at most at this longer side, pixels."""
@@ -137,11 +138,10 @@ def _surfaces(matches: NDArray[np.int_]) -> list[NDArray[np.int_]]:
     """Groups of overlapping or touching tiles with similar displacements (`AGREE`)."""
     if len(matches) < GROUP:
         return []
-    apart = np.abs(matches[:, None] - matches[None])
-    near = (apart[..., :2] <= TILE // 2).all(axis=-1)
-    near &= np.linalg.norm(apart[..., 2:], axis=-1) <= AGREE
-    count, label = connected_components(near)
-    groups = [matches[label == i] for i in range(count)]
+    links = cKDTree(matches[:, :2]).query_pairs(TILE // 2, p=np.inf, output_type="ndarray")
+    gap = np.linalg.norm(np.diff(matches[links, 2:], axis=1)[:, 0], axis=1)
+    label = connected(links[gap <= AGREE], len(matches))
+    groups = [matches[label == i] for i in range(label.max() + 1)]
     return [group for group in groups if len(group) >= GROUP]
 
 
