@@ -230,6 +230,15 @@ def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
     np.testing.assert_allclose(first, second, atol=1e-9)
 
 
+def test_ordinal_values_count_by_their_order_alone(pan):
+    (start, given), (_, other) = (pan.by(v, "ordinal") for v in (pan.depth, np.exp(pan.depth)))
+    assert given.evidence.kind == "ordinal"
+    assert given.evidence.used
+    np.testing.assert_allclose(given.log_depth, other.log_depth, atol=0.02)
+    assert 0.4 < np.std(given.log_depth) < 0.55  # the spread of a usual scene
+    assert np.abs(pan.error(start)).mean() < np.abs(pan.error(pan.start)).mean()
+
+
 @pytest.mark.slow
 def test_steps_on_image_edges_tell_a_map_of_it():
     rng = np.random.default_rng(0)
