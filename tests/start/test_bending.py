@@ -98,12 +98,13 @@ def test_sheet_bends_and_can_be_told_not_to():
     assert not case("sheet", "start.bending=false").start.bending
 
 
-@pytest.mark.parametrize("count", [100, 600])
+@pytest.mark.parametrize("count", [60, 600])
 @pytest.mark.parametrize(
     ("scene", "least", "most"), [("sheet", 0.9, 1), ("banner", 0.2, 0.4), ("street", 0, 0)]
 )
 def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least, most, count):
-    start = case(scene, f"segmentation.superpixels={count}").start
+    wide = "input.width=512", "input.height=218"
+    start = prepare(problem(scene, f"segmentation.superpixels={count}", *wide)).start
     assert least <= start.bends.mean() <= most
 
 
@@ -240,7 +241,7 @@ def test_depth_within_three_noises_of_the_flow_is_not_seen():
     at = choice.label == 0
     turn = fit_turn(flow.views.subset(np.flatnonzero(at)), ANY_TURN)[1]
     gain = float(np.median(turn - choice.fit.cost[at, 0]))
-    assert gain > 0.5
+    assert gain > 320 / 512  # 1 px at 512 columns
     for noise, sees in ((gain / 3.1, True), (gain / 2.9, False)):
         residual = np.full(len(c), noise * np.sqrt(REFERENCE / len(c)))
         assert (turn_alone(flow._replace(residual=residual), choice) is None) == sees
