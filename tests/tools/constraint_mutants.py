@@ -83,23 +83,34 @@ MUTANTS = [
 ]  # fmt: skip
 
 
-def killer(root: Path, mutant: Mutant) -> str:
-    """The first test that fails with a mutant; nothing if it survives."""
-    path = root / "soup_nlp" / mutant.module
-    text = path.read_text()
-    if text.count(mutant.old) != 1:
-        raise SystemExit(f"{mutant.what}: {mutant.module} has not one {mutant.old!r}")
-    path.write_text(text.replace(mutant.old, mutant.new))
-    words = ["-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
-    done = subprocess.run(
-        [sys.executable, *words, "tests/model/test_constraints.py"],
-        cwd=root,
-        env=os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    path.write_text(text)
+def copied(place: Path) -> Path:
+    """A copy of the package and its tests, to be changed."""
+    for name in ("soup_nlp", "tests", "problems"):
+        shutil.copytree(ROOT / name, place / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", place)
+    return place
+
+
+def killer(root: Path, module: Path, text: str, tests: str) -> str:
+    """The first fast test that fails where a module of a copy has another text; "" if none does."""
+    before = module.read_text()
+    module.write_text(text)
+    words = ["-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", tests]
+    surroundings = {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(
+            [sys.executable, *words],
+            cwd=root,
+            env=os.environ | surroundings,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=900,
+        )
+    except subprocess.TimeoutExpired:
+        return "endless"
+    finally:
+        module.write_text(before)
     found = re.search(r"^FAILED \S+::(\S+)", done.stdout, re.M)
     return found[1] if found else "" if done.returncode == 0 else "does not run"
 
@@ -108,12 +119,14 @@ def main() -> int:
     """Print a row per mutant."""
     alive = 0
     with tempfile.TemporaryDirectory(prefix="soup_mutants_") as place:
-        root = Path(place)
-        for name in ("soup_nlp", "tests", "problems"):
-            shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
-        shutil.copy(ROOT / "pyproject.toml", root)
+        root = copied(Path(place))
         for mutant in MUTANTS:
-            found = killer(root, mutant)
+            module = root / "soup_nlp" / mutant.module
+            text = module.read_text()
+            if text.count(mutant.old) != 1:
+                raise SystemExit(f"{mutant.what}: {mutant.module} has not one {mutant.old!r}")
+            text = text.replace(mutant.old, mutant.new)
+            found = killer(root, module, text, "tests/model/test_constraints.py")
             alive += not found
             print(f"{mutant.what:<34} {found or 'SURVIVES'}", flush=True)
     print(f"{len(MUTANTS) - alive} of {len(MUTANTS)} killed")

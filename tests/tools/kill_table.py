@@ -29,7 +29,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import write_sol
@@ -98,28 +97,17 @@ def clip(root: Path) -> Path:
     return folder
 
 
-def start(words: Sequence[str]) -> int:
+def start(words: Sequence[str]) -> subprocess.Popen[bytes]:
     """Run a command in a process and session of its own."""
-    sys.stdout.flush()
-    pid = os.fork()
-    if pid:
-        return pid
-    os.setsid()
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    with open(os.devnull, "w") as nothing:
-        os.dup2(nothing.fileno(), 1)
-        os.dup2(nothing.fileno(), 2)
-    code = 99
-    with contextlib.suppress(BaseException):
-        code = main(list(words))
-    os._exit(code)
+    nothing = subprocess.DEVNULL
+    command = [sys.executable, "-m", "soup_nlp", *words]
+    return subprocess.Popen(command, stdout=nothing, stderr=nothing, start_new_session=True)
 
 
 def run(words: Sequence[str]) -> tuple[int, float]:
     """Exit code and seconds of an undisturbed run."""
     begin = time.perf_counter()
-    _, status = os.waitpid(start(words), 0)
-    return os.waitstatus_to_exitcode(status), time.perf_counter() - begin
+    return start(words).wait(), time.perf_counter() - begin
 
 
 def busy(folder: Path) -> bool:
@@ -140,7 +128,7 @@ def disturbed(
         # rows that are stored are not measured again
         path.unlink()
     stale = busy(command.folder)
-    pid = start(command.words)
+    process = start(command.words)
     begin = time.perf_counter()
     waiting, until = writing, begin + delay
     while waiting or time.perf_counter() < until:
@@ -150,13 +138,12 @@ def disturbed(
         stale = stale and now
         if waiting and now and not stale:
             waiting, until = False, time.perf_counter() + delay
-        if os.waitpid(pid, os.WNOHANG)[0]:
+        if process.poll() is not None:
             return "before", time.perf_counter() - begin
     for number in numbers:
-        os.kill(pid, number)
+        process.send_signal(number)
         time.sleep(0.02)
-    _, status = os.waitpid(pid, 0)
-    code = os.waitstatus_to_exitcode(status)
+    code = process.wait()
     spent = time.perf_counter() - begin
     return signal.Signals(-code).name if code < 0 else f"exit {code}", spent
 
@@ -197,7 +184,7 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         (root / "tmp").mkdir()
-        os.environ["TMPDIR"] = tempfile.tempdir = str(root / "tmp")
+        os.environ["TMPDIR"] = str(root / "tmp")
         every = commands(root, names)
         try:
             for command in every:
@@ -220,7 +207,6 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
                 bad = broken(folder)
                 told(rows, command=name, signal="none", ended=ended, broken=bad, left=left)
         finally:
-            tempfile.tempdir = None
             del os.environ["TMPDIR"]
     return rows
 
