@@ -207,9 +207,8 @@ def hints(
 
 def limits(result: Result) -> list[str]:
     """What limits a result and what to try, in the words of the verdict; at least one sentence."""
-    s, uv = result.summary, result.array("input/flow")
-    shares = dict.fromkeys((*SHARES, "guess"), 0.0) | s.get("certainty", {})
-    lines, focal = [], s.get("focal_sigma", 0.0)
+    s, shares = result.summary, result.summary["certainty"]
+    lines = []
     if not s["converged"] and s["status"] != "Skipped":
         lines.append(f"The NLP did not converge ({s['status']}): try a larger solver.max_iter.")
     if shares["guess"] >= SHARE:
@@ -217,8 +216,7 @@ def limits(result: Result) -> list[str]:
     if result.bends.any():
         share = float(result.bends[result.labels].mean())
         lines.append(f"{share:.0%} of the image bends: its relief is weakly determined.")
-    if uv is not None:
-        by_camera = focal, s.get("camera_error")
-        told = hints(uv, result.flow_confidence, shares, *by_camera)
-        lines += [f"Try {text}." for text in told]
+    by_camera = s["focal_sigma"], s["camera_error"]
+    told = hints(result.flow, result.flow_confidence, shares, *by_camera)
+    lines += [f"Try {text}." for text in told]
     return lines or ["Nothing stands out: flow, parallax and convergence are good."]

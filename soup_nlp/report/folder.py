@@ -54,7 +54,7 @@ FILES = (
     *("depth_ref.png", "depth_next.png", *PICTURES.values(), "overview.png", PAGE),
     *("motions.json", "trajectory.tum", "points_ref.ply", "points_next.ply"),
 )
-"""Files of a result folder. error.png needs a dense truth, confidence.png a known uncertainty."""
+"""Files of a result folder; error.png needs a dense truth."""
 
 FAILED = "failed.log"
 """Log of a solve that failed; the next result removes it."""

@@ -80,13 +80,15 @@ def write_ply(
 def write_cloud(path: PathLike, result: Result, frame: int) -> int:
     """Write the points of the reference image in frame 0 or 1 as PLY; returns their number.
 
-    Properties beside position, normal and colour: `confidence` of the flow, `component`, and
-    `sigma_log_depth` if it is known. Points that are not `result.sure` are left out.
+    Properties beside position, normal and colour: `confidence` of the flow, `component` and
+    `sigma_log_depth`. Points that are not `result.sure` are left out.
     """
     keep = result.sure
-    scalars = {"confidence": result.flow_confidence, "component": result.components.of_pixel}
-    if result.sigma is not None:
-        scalars["sigma_log_depth"] = result.sigma
+    scalars = {
+        "confidence": result.flow_confidence,
+        "component": result.components.of_pixel,
+        "sigma_log_depth": result.sigma,
+    }
     name = ("reference", "next")[frame]
     comments = [
         f"{result.name}: points of the reference image in the {name} frame",

@@ -288,11 +288,8 @@ def surface_cells(result: Result, step: int) -> Mask:
 
 def _sigma(result: Result) -> NDArray[np.uint8]:
     """(H, W) sigma as a byte, see `make_scene`."""
-    sigma = result.array("depth/sigma_ref")
-    if sigma is None:
-        return np.zeros(result.labels.shape, np.uint8)
-    byte = np.rint(np.clip(sigma / 0.5, 0, 1) * 254)
-    return np.where(np.isfinite(sigma), byte, 255).astype(np.uint8)
+    byte = np.rint(np.clip(result.sigma / 0.5, 0, 1) * 254)
+    return np.where(np.isfinite(result.sigma), byte, 255).astype(np.uint8)
 
 
 def _far(z: Float) -> tuple[float, float]:

@@ -100,13 +100,12 @@ def pictures(result: Result) -> dict[str, Picture]:
         *_flow(result),
         *_depths(result),
     ]
-    error, sigma = relative_error(result), result.array("depth/sigma_ref")
+    error = relative_error(result)
     if error is not None:
         title = "depth error relative to the truth; grey = no truth"
         drawn.append(_shares("error", title, _enlarged(error), "inferno", ERROR_TICKS))
-    if sigma is not None:
-        title = "expected depth error (1 sigma); bright = a guess"
-        drawn.append(_shares("confidence", title, sigma, "viridis", SIGMA_TICKS))
+    title = "expected depth error (1 sigma); bright = a guess"
+    drawn.append(_shares("confidence", title, result.sigma, "viridis", SIGMA_TICKS))
     drawn.append(_normals(result))
     return {picture.name: picture for picture in drawn}
 
@@ -138,22 +137,16 @@ def _parts(result: Result) -> list[Picture]:
 
 
 def _unsure(result: Result, count: int) -> Mask:
-    """(count,) True for components most of whose pixels have a guess as depth, or no sigma."""
-    sigma = result.array("depth/sigma_ref")
-    if sigma is None:
-        return np.zeros(count, bool)
+    """(count,) True for components most of whose pixels have a guess as depth."""
     part = result.components.of_superpixel[result.labels].ravel()
-    guess = np.bincount(part, ~(sigma.ravel() <= MOST_SIGMA), minlength=count)
+    guess = np.bincount(part, ~(result.sigma.ravel() <= MOST_SIGMA), minlength=count)
     return np.asarray(guess > 0.5 * np.bincount(part, minlength=count))
 
 
 def _flow(result: Result) -> list[Picture]:
     """Flow and its confidence."""
-    uv, confidence = result.array("input/flow"), result.array("input/confidence")
-    if uv is None or confidence is None:
-        return []
-    sure = np.clip(confidence, 0, 1).astype(float)
-    used = np.where((sure > 0)[..., None], uv.astype(float), np.nan)
+    sure = np.clip(result.flow_confidence, 0, 1).astype(float)
+    used = np.where((sure > 0)[..., None], result.flow.astype(float), np.nan)
     limit = flow_limit(used)
     title = "flow from the reference to the next frame; black = unusable"
     rim = f"hue = direction, white = 0 px, rim = {limit:.3g} px, darker = longer"
@@ -169,17 +162,14 @@ def _flow(result: Result) -> list[Picture]:
 
 def _depths(result: Result) -> list[Picture]:
     """Depths of both frames, of the start and of the truth, with one colour scale."""
-    truth, delivered = result.array("truth/depth_ref"), result.array("depth/ref")
-    assert delivered is not None
-    near, far = depth_range(truth if truth is not None else delivered * result.scale)
+    truth, stored = result.true_depth, result.tree["depth"]
+    near, far = depth_range(stored["ref"] * result.scale if truth is None else truth)
     bar, out = depth_bar(near, far, f" {result.length}"), []
     for array, name, title, scored, more in DEPTHS:
-        z, score = result.array(f"depth/{array}"), result.summary["metrics"].get(scored, {})
-        if z is None:
-            continue
+        score = result.summary["metrics"].get(scored, {})
         # the next frame has the scale of the solution
         scaled = score if name == "depth_start" else result.summary["metrics"].get("solution", {})
-        colours = colourise_depth(z * float(scaled.get("scale") or 1.0), near, far)
+        colours = colourise_depth(stored[array] * float(scaled.get("scale") or 1.0), near, far)
         mre = score.get("mre")
         said = "" if mre is None else f", MRE {mre:.3f}"
         out.append(Picture(name, f"{title}{said}{more}", colours, bar))
@@ -207,8 +197,8 @@ def _enlarged(values: AnyFloat) -> AnyFloat:
 
 def relative_error(result: Result) -> AnyFloat | None:
     """(H, W) |z_gt - s z| / z_gt of the reference frame, NaN where unknown; None without truth."""
-    truth, z = result.array("truth/depth_ref"), result.array("depth/ref")
-    if truth is None or z is None or "solution" not in result.summary["metrics"]:
+    truth, z = result.true_depth, result.tree["depth"]["ref"]
+    if truth is None or "solution" not in result.summary["metrics"]:
         return None
     known = (truth > 0) & (z > 0)
     error = np.full(truth.shape, np.nan)

@@ -83,6 +83,11 @@ class Result:
         return self.tree["input"]["K_ref"], self.tree["input"]["K_next"]
 
     @property
+    def flow(self) -> NDArray[np.floating]:
+        """(H, W, 2) flow from the reference to the next frame, pixels."""
+        return np.asarray(self.tree["input"]["flow"])
+
+    @property
     def flow_confidence(self) -> NDArray[np.floating]:
         """(H, W) confidence of the flow, 0 to 1."""
         return np.asarray(self.tree["input"]["confidence"])
@@ -104,6 +109,11 @@ class Result:
         return {name: stored[key] for name, key in DEPTHS.items() if key in stored}
 
     @property
+    def true_depth(self) -> Float | None:
+        """(H, W) true z of the reference frame, NaN where unknown; None without dense truth."""
+        return self.tree["truth"].get("depth_ref")
+
+    @property
     def points(self) -> tuple[Float, Float]:
         """(H, W, 3) points of the reference image in the camera coordinates of both frames."""
         return self.reconstruction.points_ref, self.reconstruction.points_next
@@ -121,15 +131,14 @@ class Result:
         return f"{UNIT}; about {self.metre:.6g} {self.metre_unit} by the truth of this pair"
 
     @property
-    def sigma(self) -> Float | None:
-        """(H, W) standard deviation of log depth of the reference frame; None if unknown."""
+    def sigma(self) -> Float:
+        """(H, W) standard deviation of log depth of the reference frame."""
+        assert self.reconstruction.sigma_ref is not None
         return self.reconstruction.sigma_ref
 
     @property
     def confidence(self) -> Float:
-        """(H, W) confidence of the depth from 0 (unknown) to 1 (certain); 1 without sigma."""
-        if self.sigma is None:
-            return np.ones(self.flow_confidence.shape)
+        """(H, W) confidence of the depth from 0 (unknown) to 1 (certain)."""
         return np.maximum(1.0 - self.sigma / NO_CONFIDENCE, 0.0)
 
     @property
@@ -162,11 +171,6 @@ class Result:
     def bending(self) -> bool:
         """Whether the whole image bends; then no component is rigid."""
         return bool(self.bends.all())
-
-    def array(self, path: str) -> NDArray[Any] | None:
-        """The array at "a/b" of the tree; None if there is none."""
-        group, name = path.split("/")
-        return self.tree.get(group, {}).get(name)
 
     def soup(self, key: str) -> Float:
         """An array of the delivered soup: lam, n, d, R or t."""
@@ -227,7 +231,7 @@ def load(folder: str | Path) -> Result:
         return Result(
             tree=tree,
             summary=summary,
-            reconstruction=replace(rec, sigma_ref=tree["depth"].get("sigma_ref")),
+            reconstruction=replace(rec, sigma_ref=require(tree, "depth/sigma_ref")),
             components=find_components(soup, seg, part, K_ref, K_next, borrowed),
             metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
             metre_unit=str(unit),

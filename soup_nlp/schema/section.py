@@ -51,9 +51,9 @@ def explain(
     where = ", ".join(x for x in (source, next(origins, ""), f"key {key}") if x)
     others = len(by_key) - 1
     suffix = f" (and {others} more {'mistake' if others == 1 else 'mistakes'})" if others else ""
-    sections = _sections(model, tree)
     if kind == "extra_forbidden":
-        keys = {p: [k for k in s.model_fields if k != "base"] for p, s in sections.items()}
+        sections = _sections(model, tree).items()
+        keys = {p: [k for k in s.model_fields if k != "base"] for p, s in sections}
         allowed = sorted(keys.get(path[:-1], []))
         homes = [".".join((*p, path[-1])) for p, names in keys.items() if path[-1] in names]
         return ConfigError(
@@ -67,14 +67,13 @@ def explain(
         hint = None if kind == "missing" else "every input has a kind; soup-nlp list names examples"
         return ConfigError("missing key" + suffix, where=where, expected=key, hint=hint)
     hint = nearest(printable(value, 60), [word for item in mistakes for word in _words(item)])
-    ranges = _range(sections.get(path[:-1]), path[-1]) if path else ""
     if kind == "string_type" and isinstance(value, int | float):
         hint = f'write it in quotes: "{value}" (YAML drops leading zeros)'
     return ConfigError(
         "value does not fit" + suffix,
         where=where,
         found=_SHORT.repr(value),
-        expected=", or ".join(dict.fromkeys(_expected(item, ranges) for item in mistakes)),
+        expected=", or ".join(dict.fromkeys(map(_expected, mistakes))),
         hint=hint,
     )
 
@@ -110,10 +109,6 @@ def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Keys, typ
     return out
 
 
-def _number(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:g}"
-
-
 def _tags(model: type[BaseModel]) -> tuple[str, ...]:
     """Values of `kind` that a section stands for."""
     kinds: Any = model.model_fields["kind"].annotation
@@ -133,23 +128,7 @@ def _words(item: Mapping[str, Any]) -> list[str]:
     return re.findall(r"'([^']*)'", str(context.get("expected_tags", text)))
 
 
-def _range(model: type[BaseModel] | None, key: str) -> str:
-    """Smallest and largest allowed number of a field; empty if it is not bounded."""
-    info = model.model_fields.get(key) if model else None
-    if info is None:
-        return ""
-    bounds: dict[str, Any] = {}
-    choices = getattr(info.annotation, "__args__", ())
-    for item in (*info.metadata, *(x for c in choices for x in getattr(c, "__metadata__", ()))):
-        # the bounds of the field, or those of its types
-        for part in (item, *getattr(item, "metadata", ())):
-            limits = ((name, getattr(part, name, None)) for name in ("ge", "gt", "le", "lt"))
-            bounds |= {name: value for name, value in limits if value is not None}
-    low, high = (bounds.get(a, bounds.get(b)) for a, b in (("ge", "gt"), ("le", "lt")))
-    return f"{_number(low)} to {_number(high)}" if low is not None and high is not None else ""
-
-
-def _expected(item: Mapping[str, Any], ranges: str = "") -> str:
+def _expected(item: Mapping[str, Any]) -> str:
     """The allowed values of a mistake, without pydantic's `Input should be`."""
     if words := _words(item):
         return ("one of " if len(words) > 1 else "") + ", ".join(words)
@@ -159,9 +138,7 @@ def _expected(item: Mapping[str, Any], ranges: str = "") -> str:
         return f"a list of {item['ctx']['min_length']} or more"
     if item["type"] == "too_long":
         return f"a list of {item['ctx']['max_length']} or fewer"
-    text = str(item["msg"]).removeprefix("Input should be ").removeprefix("Value error, ")
-    bounded = item["type"].startswith(("greater_than", "less_than")) and ranges
-    return f"{text} ({ranges})" if bounded else text
+    return str(item["msg"]).removeprefix("Input should be ").removeprefix("Value error, ")
 
 
 Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]

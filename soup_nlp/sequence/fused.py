@@ -89,17 +89,11 @@ def movers(chain: Chain, frame: int) -> Cloud:
     return _joined(clouds)
 
 
-def _sigma(chain: Chain, frame: int) -> Float:
-    """(H, W) standard deviation of the log depth of a frame; 0 if it is unknown."""
-    result = chain.pairs[frame].result
-    return np.zeros(result.sure.shape) if result.sigma is None else result.sigma
-
-
 def _cloud(chain: Chain, frame: int, mask: Mask, label: int) -> Cloud:
     """The points of a mask."""
     out = np.recarray(int(mask.sum()), POINT)
     out.points, out.colours = chain.points(frame)[mask], chain.image(frame)[mask]
-    out.sigma, out.label = _sigma(chain, frame)[mask], label
+    out.sigma, out.label = chain.pairs[frame].result.sigma[mask], label
     return out
 
 
@@ -128,5 +122,5 @@ def _contradicts(chain: Chain, cloud: Cloud, frame: int) -> Mask:
     inside, v, u, z = projected(chain, cloud.points, frame)
     with np.errstate(invalid="ignore"):
         in_front = z < IN_FRONT * chain.depth(frame)[v, u]
-    more_certain = _sigma(chain, frame)[v, u] <= cloud.sigma
+    more_certain = chain.pairs[frame].result.sigma[v, u] <= cloud.sigma
     return np.asarray(chain.pairs[frame].static[v, u] & inside & in_front & more_certain)

@@ -6,19 +6,17 @@
 from __future__ import annotations
 
 import json
-import math
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, is_dataclass
 from fnmatch import fnmatchcase
 from io import BytesIO
-from os import PathLike as _PathLike
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from pydantic_core import to_jsonable_python
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import PathLike, read_bytes, write_bytes, write_text
@@ -197,22 +195,15 @@ def plain(obj: object) -> Any:
     Raises:
         DataError: a type that JSON does not have.
     """
-    if obj is None or isinstance(obj, str | bool | int):
-        return obj
-    if isinstance(obj, float):
-        return float(obj) if math.isfinite(obj) else None
+    return to_jsonable_python(obj, inf_nan_mode="null", fallback=_builtin)
+
+
+def _builtin(obj: object) -> Any:
+    """An object of a type that pydantic does not know as one that it knows."""
     if isinstance(obj, np.generic | np.ndarray):
-        return plain(obj.tolist())
-    if is_dataclass(obj) and not isinstance(obj, type):
-        return plain(asdict(obj))
+        return obj.tolist()
     if isinstance(obj, Mapping):
-        return {str(plain(key)): plain(value) for key, value in obj.items()}
-    if isinstance(obj, list | tuple):
-        return [plain(value) for value in obj]
-    if isinstance(obj, set | frozenset):
-        return sorted((plain(value) for value in obj), key=str)
-    if isinstance(obj, _PathLike):
-        return str(obj)
+        return dict(obj)
     raise DataError(
         "value cannot be written as JSON",
         found=type(obj).__name__,

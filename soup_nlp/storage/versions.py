@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,7 +19,6 @@ _PACKAGES = {
     "skimage": "scikit-image",
     "h5py": "h5py",
 }
-_OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
 
 
 @cache
@@ -38,10 +38,6 @@ def versions() -> dict[str, str]:
     out = {"soup_nlp": __version__, "python": platform.python_version()}
     for name, package in _PACKAGES.items():
         out[name] = "unknown"
-        for candidate in _OPENCV if name == "opencv" else (package,):
-            try:
-                out[name] = version(candidate)
-                break
-            except PackageNotFoundError:
-                continue
+        with suppress(PackageNotFoundError):
+            out[name] = version(package)
     return out

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from soup_nlp.evaluate.metrics import depth_metrics
@@ -41,7 +43,7 @@ def small_result() -> Result:
     return Result(
         tree={"input": {**pair, "confidence": (u / 100).astype(np.float32)}},
         summary={"name": "board"},
-        reconstruction=reconstruct(soup, labels, K, K),
+        reconstruction=replace(reconstruct(soup, labels, K, K), sigma_ref=0.001 * (u + v)),
         components=find_components(soup, seg, mine.astype(int), K, K),
         metrics={"solution": depth_metrics(1.0, 10.0)},
     )

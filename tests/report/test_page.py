@@ -179,8 +179,8 @@ def test_the_page_can_be_left_out(small_run, folder):
 
 def test_a_component_whose_depth_is_a_guess_is_striped(shown):
     def stripes(sigma):
-        tree = with_array(shown, "depth/sigma_ref", sigma)
-        own = pictures(replace(shown, tree=tree))["components"]
+        rec = replace(shown.reconstruction, sigma_ref=sigma)
+        own = pictures(replace(shown, reconstruction=rec))["components"]
         return (own.image == 255).all(axis=2), own.title
 
     sigma = np.full(shown.labels.shape, 0.02)
@@ -197,7 +197,7 @@ def test_limits_name_what_is_wrong(shown):
     good = " ".join(limits(shown))
     assert "did not converge" not in good
     tree = with_array(shown, "input/confidence", np.zeros_like(shown.flow_confidence))
-    shares = {"guess": 0.3, "unseen": 0.2, "rest": 0.004, "flat": 0.06, "weak": 0.036}
+    shares = {"guess": 0.3, "unseen": 0.2, "rest": 0.004, "flat": 0.06, "weak": 0.036, "scale": 0}
     told = {
         **shown.summary, "status": "Time_Limit", "converged": False, "certainty": shares
     }  # fmt: skip
@@ -208,15 +208,6 @@ def test_limits_name_what_is_wrong(shown):
         " constant depth explains the flow nearly as well, 4% little information.",
         "Try a better flow (--flow); frames farther apart in time.",
     ]
-
-
-def test_a_result_without_sigma_has_no_such_mode(shown):
-    depth = {k: v for k, v in shown.tree["depth"].items() if k != "sigma_ref"}
-    bare = replace(shown, tree={**shown.tree, "depth": depth})
-    found = pictures(bare)
-    assert "confidence" not in found
-    names = [mode["name"] for mode in data_of(page(bare, found))["modes"]]
-    assert names == [name for name in MODES if name != "confidence"]
 
 
 def test_sparse_truth_is_drawn_larger():

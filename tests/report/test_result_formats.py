@@ -60,6 +60,7 @@ def test_ply_is_read_by_trimesh(tmp_path, result, frame):
     raw = cloud.metadata["_ply_raw"]["vertex"]["data"]
     np.testing.assert_array_equal(raw["confidence"], result.flow_confidence[keep])
     np.testing.assert_array_equal(raw["component"], board()[keep])
+    np.testing.assert_allclose(raw["sigma_log_depth"], result.sigma[keep], rtol=FLOAT32)
     normals = np.stack([raw[name] for name in ("nx", "ny", "nz")], axis=1)
     turned = [0, 0, -1.0] @ np.array([np.eye(3), CAMERA.R])[frame].T
     np.testing.assert_allclose(
@@ -69,13 +70,6 @@ def test_ply_is_read_by_trimesh(tmp_path, result, frame):
     assert "unit: soup unit" in head
     assert "about 10 m" in head
     assert f"camera of the {('reference', 'next')[frame]} frame, x right, y down, z ahead" in head
-
-
-def test_ply_has_the_uncertainty_where_it_is_known(tmp_path, result):
-    rec = replace(result.reconstruction, sigma_ref=np.full((60, 80), 0.25))
-    write_formats(tmp_path, replace(result, reconstruction=rec), ["ply"])
-    head = (tmp_path / "points_ref.ply").read_bytes().split(b"end_header")[0]
-    assert b"property float sigma_log_depth" in head
 
 
 @pytest.mark.parametrize("frame", [0, 1])
