@@ -14,7 +14,7 @@ from scipy import sparse
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluate.information import Information, information
-from soup_nlp.export.nl import NLFile, readable_names, suffixes_of, write_nl
+from soup_nlp.export.nl import NLFile, suffixes_of, write_nl
 from soup_nlp.export.verify import examine
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Coordinates, Formulation
@@ -154,14 +154,13 @@ def export_case(
     nlp, layout = case.nlp(form)
     target = claim(folder, EXPORT_FILES, overwrite, case.problem.subject)
     with staged(target, True, overwrite, case.problem.subject) as new:
-        names = readable_names(nlp, layout)
         duals = examine(nlp, nlp.x0, None) if presolved else None
         if duals is not None and not duals.dual <= STATIONARY:
             # multipliers of a point that is not stationary mislead
             duals = None
-        kinds, segments = suffixes_of(nlp, names)
+        kinds, segments = suffixes_of(nlp)
         lam_g = None if duals is None else duals.lam_g
-        file = write_nl(new / f"{STUB}.nl", nlp, names, lam_g, segments if suffixes else ())
+        file = write_nl(new / f"{STUB}.nl", nlp, lam_g, segments if suffixes else ())
         if "casadi" in formats:
             for function in FUNCTIONS:
                 # the file writer of CasADi ignores a full disk
@@ -179,7 +178,7 @@ def export_case(
         if "h5" in formats or "casadi" in formats:
             attrs = {k: manifest[k] for k in ("name", "problem_hash", "formulation", "smoothing")}
             info = information(case.soup, case.data, case.weights, form)
-            _write_start_h5(new / f"{STUB}.h5", nlp, names, attrs, info)
+            _write_start_h5(new / f"{STUB}.h5", nlp, attrs, info)
         files = {path.name for path in new.iterdir()} - {"problem.yaml"}
         manifest["files"] = sorted(files, key=EXPORT_FILES.index)
         write_json(new / MANIFEST, manifest)
@@ -220,13 +219,7 @@ def fingerprint(case: Case, nlp: NLP, layout: MatrixLayout | TangentLayout) -> d
     }
 
 
-def _write_start_h5(
-    path: Path,
-    nlp: NLP,
-    names: tuple[list[str], list[str]],
-    attrs: dict[str, object],
-    info: Information,
-) -> None:
+def _write_start_h5(path: Path, nlp: NLP, attrs: dict[str, object], info: Information) -> None:
     """Write bounds, parameters, names, and values at the start with their sparsity.
 
     The Hessian is that of the NLP with lam_f = 1 and lam_g = 1; `info` is the Gauss-Newton
@@ -244,8 +237,8 @@ def _write_start_h5(
     tree = {
         **{key: np.asarray(value, float).ravel() for key, value in vectors.items()},
         "p": nlp.graph.p,
-        "x_names": names[0],
-        "g_names": names[1],
+        "x_names": nlp.x_names(),
+        "g_names": nlp.g_names(),
         "at_start": {
             "f": nlp.value(x),
             "g": nlp.constraints(x),

@@ -23,8 +23,6 @@ from soup_nlp.errors import ExportError
 from soup_nlp.export.body import NlBody
 from soup_nlp.export.program import Program, make_program, orders
 from soup_nlp.export.template import number
-from soup_nlp.model.kernel import Group
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.storage.files import as_path, write_bytes, write_text
 
@@ -68,7 +66,6 @@ class Suffix:
 def write_nl(
     path: str | Path,
     nlp: NLP,
-    names: tuple[Sequence[str], Sequence[str]] | None = None,
     lam_g: Float | None = None,
     suffixes: Sequence[Suffix] = (),
 ) -> NLFile:
@@ -77,7 +74,6 @@ def write_nl(
     Args:
         path: The .nl file; written whole or not at all.
         nlp: The NLP; its Hessian does not matter.
-        names: Names of variables and constraints; default those of the NLP.
         lam_g: (ng,) multipliers of the start in CasADi's sign, for the segment of initial duals.
         suffixes: Suffixes of variables and rows.
 
@@ -86,7 +82,7 @@ def write_nl(
         DataError: the folder cannot be written.
     """
     path = as_path(path, "file", error=ExportError)
-    names = names or (nlp.x_names(), nlp.g_names())
+    names = nlp.x_names(), nlp.g_names()
     program = make_program(nlp.groups, nlp.nx, nlp.ng, nlp.thetas())
     variables, rows = orders(program)
     body = NlBody(program, np.argsort(variables), np.argsort(rows))
@@ -217,58 +213,19 @@ def linear(J: sparse.csr_matrix, G: sparse.csr_matrix) -> Iterator[str]:
             yield from (f"{c} {number(v)}" for c, v in zip(columns, values))
 
 
-# --- readable names and suffixes -----------------------------------------------------------------
+# --- suffixes ------------------------------------------------------------------------------------
 
 
-def readable_names(nlp: NLP, layout: MatrixLayout | TangentLayout) -> tuple[list[str], list[str]]:
-    """Unique names of variables and constraints of an exported NLP.
-
-    The first index is the superpixel; for an edge or a neighbour pair the first two indices are the
-    two superpixels. A further index counts from 1: the rows of R'R = I in the order 11 12 22 13 23
-    33, rim rays (in matrix coordinates 1 is the anchor), or sampled pixels.
-    """
-    x_names, g_names = nlp.x_names(), nlp.g_names()
-    for group in nlp.groups:
-        table, kernel = group.table, group.kernel
-        owner = _owners(group, layout)
-        if owner is None:
-            continue
-        labels = _labels(owner)
-        for j in np.flatnonzero(table.index[0] >= layout.size):
-            name = kernel.x[int(j)].name()
-            for k, label in zip(table.index[:, j].tolist(), labels):
-                x_names[k] = f"{name}[{label}]"
-        if not kernel.nc:
-            continue
-        repeated = len(np.unique(table.rows)) < table.rows.size
-        for c in range(kernel.nc):
-            for k, label in zip(table.rows[:, c].tolist(), labels):
-                stem = g_names[k].partition("[")[0]
-                if repeated:
-                    g_names[k] = stem
-                elif stem.startswith("epigraph") or kernel.nc == 1:
-                    g_names[k] = f"{stem}[{label}]"
-                else:
-                    g_names[k] = f"{stem}[{label},{c + 1}]"
-    return x_names, g_names
-
-
-def suffixes_of(
-    nlp: NLP, names: tuple[list[str], list[str]]
-) -> tuple[dict[str, list[str]], list[Suffix]]:
+def suffixes_of(nlp: NLP) -> tuple[dict[str, list[str]], list[Suffix]]:
     """Suffixes of variables and rows, for solvers that exploit structure.
 
     "superpixel" is 1 + the first superpixel of a variable or row. "kind" is 1 + the place of its
     name's stem (`R`, `so3`) in the lists that are returned beside. "scaling_factor" is the inverse
     of a natural step of a variable at the start (Ipopt's `nlp_scaling_method=user-scaling`).
-
-    Args:
-        nlp: The program.
-        names: From `readable_names`.
     """
     kinds: dict[str, list[str]] = {}
     out = []
-    for of, axis in zip(("variables", "rows"), names):
+    for of, axis in zip(("variables", "rows"), (nlp.x_names(), nlp.g_names())):
         stems = [name.partition("[")[0] for name in axis]
         kinds[of] = list(dict.fromkeys(stems))
         kind_number = {stem: k + 1 for k, stem in enumerate(kinds[of])}
@@ -281,28 +238,3 @@ def suffixes_of(
             factor[group.table.index[:, 0]] = np.sqrt(group.table.data[:, 0])
             out.append(Suffix("scaling_factor", "variables", factor))
     return kinds, out
-
-
-def _owners(group: Group, layout: MatrixLayout | TangentLayout) -> Int | None:
-    """(E, 1 or 2) superpixels of each element; None if it has no variables of superpixels."""
-    index = group.table.index
-    inside = index < layout.count * layout.stride
-    if group.kernel.name == "ridge" or not inside[:, 0].all():
-        return None
-    superpixel = np.where(inside, index // layout.stride, index[:, :1] // layout.stride)
-    first = superpixel[:, 0]
-    second = np.where(superpixel == first[:, None], -1, superpixel).max(axis=1)
-    return np.column_stack([first, second]) if (second >= 0).all() else first[:, None]
-
-
-def _labels(owner: Int) -> list[str]:
-    """Labels `i` or `i,k`; `i,3` for the third of several elements of a superpixel."""
-    labels = [",".join(map(str, row)) for row in owner.tolist()]
-    if len(set(labels)) == len(labels):
-        return labels
-    seen: dict[str, int] = {}
-    out = []
-    for label in labels:
-        seen[label] = seen.get(label, 0) + 1
-        out.append(f"{label},{seen[label]}")
-    return out

@@ -15,7 +15,7 @@ import numpy as np
 
 from soup_nlp import __version__
 from soup_nlp.data.pair import Pair
-from soup_nlp.export.nl import NLFile, readable_names, write_nl
+from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import examine
 from soup_nlp.family.describe import CLASSES, classes, classification, qualification
@@ -69,9 +69,8 @@ def write_family(
             starts = [i for i in members if i.formulation == form]
             shared: Entry = {}
             for instance in starts:
-                nlp, layout, _ = build_instance(case, record, form, instance.start)
-                names = readable_names(nlp, layout)
-                file = write_nl(folder / f"{instance.name}.nl", nlp, names=names)
+                nlp, _, _ = build_instance(case, record, form, instance.start)
+                file = write_nl(folder / f"{instance.name}.nl", nlp)
                 shared = shared or _solved(folder, case, record, instance, file, known)
                 entries.append(_entry(instance, nlp, file, shared, known))
                 changed = "  NOT the published bytes" * (entries[-1]["published"] is False)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
-from soup_nlp.model.elements import Element, Norms
+from soup_nlp.model.elements import Element, Layout, Norms
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP
@@ -27,12 +28,20 @@ _SYMBOLS = ca.SX.sym("theta", len(THETA))
 
 
 class Block(NamedTuple):
-    """Consecutive variables or constraint rows of one kind, with their bounds."""
+    """Consecutive variables or constraint rows of one kind.
+
+    Attributes:
+        label: Of the kind.
+        size: Their number.
+        lower, upper: Bounds of each.
+        places: Makes what their names have in brackets; "" for none.
+    """
 
     label: str
     size: int
     lower: float
     upper: float
+    places: Callable[[], list[str]]
 
 
 def _bounds(blocks: list[Block]) -> tuple[Float, Float]:
@@ -42,7 +51,27 @@ def _bounds(blocks: list[Block]) -> tuple[Float, Float]:
 
 
 def _names(blocks: list[Block]) -> list[str]:
-    return [f"{b.label}[{i}]" for b in blocks for i in range(b.size)]
+    return [f"{b.label}[{place}]" if place else b.label for b in blocks for place in b.places()]
+
+
+def _of_elements(superpixels: Int) -> list[str]:
+    """`i` or `i,k` for every element (E, a); `i,3` for the third of several of a superpixel."""
+    labels = [",".join(map(str, row)) for row in superpixels.tolist()]
+    if len(set(labels)) == len(labels):
+        return labels
+    seen: Counter[str] = Counter()
+    out = []
+    for label in labels:
+        seen[label] += 1
+        out.append(f"{label},{seen[label]}")
+    return out
+
+
+def _of_superpixels(size: int, count: int) -> list[str]:
+    """`i` for every superpixel, or `i,1` and so on for `count` rows of each."""
+    if count == 1:
+        return [str(i) for i in range(size)]
+    return [f"{i},{c + 1}" for i in range(size) for c in range(count)]
 
 
 @dataclass
@@ -51,48 +80,39 @@ class Builder:
 
     Attributes:
         form: Norm, Hessian and smoothing.
-        first_slack: Number of variables before the slack variables.
+        layout: Of the variables before the slack variables.
+        view: Makes a View of a superpixel's variables, the data row, its position in the element
+            and the option.
+        option: Gauge or chart.
     """
 
     form: Formulation
-    first_slack: int
+    layout: Layout
+    view: Callable[..., View]
+    option: str
     groups: list[Group] = field(default_factory=list)
     slacks: list[Block] = field(default_factory=list)
     rows: list[Block] = field(default_factory=list)
 
-    def new_slacks(self, label: str, count: int) -> Int:
-        """Indices of `count` fresh slack variables, at least 0."""
-        first = self.first_slack + sum(b.size for b in self.slacks)
-        self.slacks.append(Block(label, count, 0.0, np.inf))
-        return first + np.arange(count)
-
-    def new_rows(self, label: str, count: int, lower: float, upper: float = np.inf) -> Int:
-        """Indices of `count` fresh constraint rows with bounds."""
-        first = sum(b.size for b in self.rows)
-        self.rows.append(Block(label, count, lower, upper))
-        return first + np.arange(count)
-
-    def add_norms(
-        self, name: str, element: Element, view: Callable[..., View], option: str, stride: int
-    ) -> None:
+    def add_norms(self, name: str, element: Element) -> None:
         """Add an energy term: kernel of its norms in solver form, and its table.
 
         Args:
             name: Of the kernel.
-            element: Data columns, indices of variables and the norms.
-            view: Makes a View of local variables (stride,), the data row, the position of a
-                superpixel and the option.
-            option: Gauge or chart.
-            stride: Variables per superpixel.
+            element: Superpixels, data columns and the norms.
         """
-        size = len(element.index)
+        size, arity = element.superpixels.shape
         if not size:
             return
-        fields = tuple(element.fields.items())
-        term = name, element.norms, fields, element.arity, view, option, stride
+        fields, layout = tuple(element.fields.items()), self.layout
+        term = name, element.norms, fields, arity, self.view, self.option, layout.stride
         kernel, slacks = _kernel(*term, self.form.norm)
-        index = [element.index, *(self.new_slacks(f"s_{k}", size)[:, None] for k in slacks)]
-        rows = [self.new_rows(f"epigraph_{k}", size, 0.0) for k in slacks]
+        places = partial(_of_elements, element.superpixels)
+        index, rows = [layout.of(i) for i in element.superpixels.T], []
+        for norm in slacks:
+            own = Block(f"s_{norm}", size, 0.0, np.inf, places)
+            index.append(layout.size + _added(self.slacks, own)[:, None])
+            rows.append(_added(self.rows, own._replace(label=f"epigraph_{norm}")))
         data = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
         table = Table(
             np.concatenate(index, axis=1), data, np.array(rows, np.int64).reshape(-1, size).T
@@ -112,22 +132,25 @@ class Builder:
         data: Float | None = None,
         total: bool = False,
     ) -> None:
-        """Add a constraint kernel with its table and rows.
+        """Add a constraint kernel of every superpixel with its table and rows.
 
         Args:
             name: Of the kernel; the rows are named without a prefix "t_".
             x: (k,) symbols of the variables.
             body: (r,) constraints.
-            index: (E, k) variables of every element.
+            index: (N, k) variables of every superpixel.
             lower: Bound of every row.
             upper: Bound of every row.
             row: (m,) symbols of the data, if there are any.
-            data: (E, m) data of every element.
-            total: Whether the elements add up to one row (r = 1).
+            data: (N, m) data of every superpixel.
+            total: Whether the superpixels add up to one row (r = 1).
         """
         size, count = len(index), body.numel()
-        fresh = self.new_rows(name.removeprefix("t_"), 1 if total else size * count, lower, upper)
-        rows = np.broadcast_to(fresh.reshape(-1, count), (size, count))
+        number, places = size * count, partial(_of_superpixels, size, count)
+        if total:
+            number, places = 1, partial(list, [""])
+        block = Block(name.removeprefix("t_"), number, lower, upper, places)
+        rows = np.broadcast_to(_added(self.rows, block).reshape(-1, count), (size, count))
         symbols = ca.SX.sym("none", 0) if row is None else row
         kernel = Kernel(name, x, symbols, _SYMBOLS, constraints=body)
         table = Table(index, np.zeros((size, 0)) if data is None else data, rows)
@@ -144,17 +167,19 @@ class Builder:
         index, none = np.arange(len(metric))[:, None], np.zeros((len(metric), 0), np.int64)
         self.groups.append(Group(kernel, Table(index, metric[:, None], none)))
 
-    def finish(
-        self, name: str, x0: Float, lbx: Float, ubx: Float, names: Callable[[], list[str]]
-    ) -> NLP:
+    def finish(self, name: str, x0: Float, lbx: Float, ubx: Float) -> NLP:
         """The NLP of everything that was added, its slack variables at their best values.
+
+        In the names of variables and rows the first index is the superpixel; for an edge or a
+        neighbour pair the first two are its two superpixels. A further index counts from 1: the
+        rows of R'R = I in the order 11 12 22 13 23 33, rim rays (in matrix coordinates 1 is the
+        anchor), or sampled pixels.
 
         Args:
             name: Of the NLP.
-            x0: (first_slack,) start.
-            lbx: (first_slack,) lower bounds.
-            ubx: (first_slack,) upper bounds.
-            names: Makes the names of these variables.
+            x0: Start of the layout's variables.
+            lbx: Their lower bounds.
+            ubx: Their upper bounds.
         """
         lower, upper = _bounds(self.slacks)
         lbx, ubx = np.concatenate([lbx, lower]), np.concatenate([ubx, upper])
@@ -170,11 +195,18 @@ class Builder:
             ubg=ubg,
             theta=dict(zip(THETA, (f.eps, f.eps_pixel, f.theta, f.ridge))),
             hessian_kind=f.hessian,
-            x_names=lambda: names() + _names(self.slacks),
+            x_names=lambda: self.layout.names() + _names(self.slacks),
             g_names=lambda: _names(self.rows),
             compiled=f.compiled,
         )
         return _with_slacks(nlp) if self.slacks else nlp
+
+
+def _added(blocks: list[Block], block: Block) -> Int:
+    """Append a block; the numbers of its variables or rows among those of all blocks."""
+    first = sum(b.size for b in blocks)
+    blocks.append(block)
+    return first + np.arange(block.size)
 
 
 @lru_cache(maxsize=200)

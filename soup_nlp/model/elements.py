@@ -42,32 +42,29 @@ class Norms(NamedTuple):
 
 @dataclass(frozen=True)
 class Element:
-    """One kind of element: its local superpixel views and where their variables are.
+    """One kind of element.
 
     Attributes:
-        index: (E, a) superpixels, or once placed (E, a k) variables, of every element.
+        superpixels: (E, a) of every element.
         columns: (E, ...) data by column.
         norms: Makes the norms from the a views, a data row, eps and eps_pixel.
-        arity: Superpixels of an element, a.
     """
 
-    index: Int
+    superpixels: Int
     columns: dict[str, Float]
     norms: Norms
-    arity: int
 
     @property
     def fields(self) -> dict[str, int]:
         """Width of every data column."""
         return {k: int(np.prod(v.shape[1:], dtype=int)) for k, v in self.columns.items()}
 
-    def placed(self, layout: Layout) -> Element:
-        """The element with a layout's variables in the place of superpixels, and its columns."""
+    def viewed(self, layout: Layout) -> Element:
+        """The element with the columns that a layout's views need."""
         columns = dict(self.columns)
-        for a, i in enumerate(self.index.T):
+        for a, i in enumerate(self.superpixels.T):
             columns |= {f"{k}_{a}": v for k, v in layout.columns(i).items()}
-        index = np.concatenate([layout.of(i) for i in self.index.T], axis=1)
-        return replace(self, index=index, columns=columns)
+        return replace(self, columns=columns)
 
 
 def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]:
@@ -82,7 +79,7 @@ def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]
         The paper's terms, and those of `data.terms` that have a factor.
     """
     used = [k for k in data.terms if k in PAPER_TERMS or getattr(w, k) > 0]
-    return {name: ELEMENTS[name](data, w).placed(layout) for name in used}
+    return {name: ELEMENTS[name](data, w).viewed(layout) for name in used}
 
 
 def _truncations(count: int, **sigma: float) -> dict[str, Float]:
@@ -117,7 +114,7 @@ def _arap(data: EnergyData, w: Weights) -> Element:
         **_rays(data, e),
         **_pixel(data, data.edge_unit),
     }
-    return Element(e, columns, Norms(terms.arap, (data.arap_at_anchors,)), 2)
+    return Element(e, columns, Norms(terms.arap, (data.arap_at_anchors,)))
 
 
 def _proj(data: EnergyData, w: Weights) -> Element:
@@ -135,7 +132,7 @@ def _proj(data: EnergyData, w: Weights) -> Element:
     }
     places = tuple(zip(*(index.tolist() for index in nonzero)))
     norms = Norms(terms.reprojection, (places,), in_pixels=True)
-    return Element(owner, columns, norms, 1)
+    return Element(owner, columns, norms)
 
 
 def _cont(data: EnergyData, w: Weights) -> Element:
@@ -148,7 +145,7 @@ def _cont(data: EnergyData, w: Weights) -> Element:
         "rays": data.boundary_ray.reshape(len(pairs), 3 * data.boundary_ray.shape[1]),
         **_pixel(data, data.pair_unit),
     }
-    return Element(pairs, columns, Norms(terms.continuity), 2)
+    return Element(pairs, columns, Norms(terms.continuity))
 
 
 def _prior(data: EnergyData, w: Weights) -> Element:
@@ -160,7 +157,7 @@ def _prior(data: EnergyData, w: Weights) -> Element:
     }
     if data.prior_relief.any():
         columns["relief"] = data.prior_relief
-    return Element(data.edges, columns, Norms(terms.prior), 2)
+    return Element(data.edges, columns, Norms(terms.prior))
 
 
 def _depth(data: EnergyData, w: Weights) -> Element:
@@ -171,7 +168,7 @@ def _depth(data: EnergyData, w: Weights) -> Element:
         "change": data.depth_change[used],
         **_rays(data, edges),
     }
-    return Element(edges, columns, Norms(terms.depth), 2)
+    return Element(edges, columns, Norms(terms.depth))
 
 
 def _order(data: EnergyData, w: Weights) -> Element:
@@ -185,7 +182,7 @@ def _order(data: EnergyData, w: Weights) -> Element:
         "ray": data.boundary_ray[used].mean(axis=1),
         **_rays(data, pairs),
     }
-    return Element(pairs, columns, Norms(terms.order), 2)
+    return Element(pairs, columns, Norms(terms.order))
 
 
 def _orient(data: EnergyData, w: Weights) -> Element:
@@ -193,7 +190,7 @@ def _orient(data: EnergyData, w: Weights) -> Element:
         "weight": w.orient * data.orient_weight,
         **_truncations(len(data.pairs), sigma=w.sigma_orient),
     }
-    return Element(data.pairs, columns, Norms(terms.orientation), 2)
+    return Element(data.pairs, columns, Norms(terms.orientation))
 
 
 ELEMENTS: Mapping[str, Callable[[EnergyData, Weights], Element]] = {
@@ -205,4 +202,4 @@ ELEMENTS: Mapping[str, Callable[[EnergyData, Weights], Element]] = {
     "depth": _depth,
     "order": _order,
 }
-"""Elements of every term of `energy_data.TERMS`, before they are placed in a layout."""
+"""Elements of every term of `energy_data.TERMS`, without the columns of a layout."""

@@ -37,10 +37,10 @@ def build_matrix_nlp(
     """
     n = len(data)
     layout = MatrixLayout(data.share, form.gauge)
-    b = Builder(form, layout.size)
+    b = Builder(form, layout, matrix_view, form.gauge)
     stride = layout.stride
     for name, element in elements(data, weights, layout).items():
-        b.add_norms(name, element, matrix_view, form.gauge, stride)
+        b.add_norms(name, element)
 
     _add_constraints(b, layout, data, form)
     x0 = layout.pack(soup)
@@ -50,7 +50,7 @@ def build_matrix_nlp(
     if form.gauge == "unit-translation":
         lbx[np.arange(n) * stride + 4] = MIN_SCALE
         lbx[layout.tau] = 1e-8
-    return b.finish("soup", x0, lbx, ubx, layout.names), layout
+    return b.finish("soup", x0, lbx, ubx), layout
 
 
 def _add_constraints(b: Builder, layout: MatrixLayout, data: EnergyData, form: Formulation) -> None:

@@ -43,9 +43,9 @@ def build_tangent_nlp(
     base = layout
     layout = TangentLayout.about(soup, data, chart) if base is None else base
     chart = layout.chart
-    b = Builder(form, 9 * n)
+    b = Builder(form, layout, tangent_view, chart)
     for name, element in elements(data, weights, layout).items():
-        b.add_norms(f"t_{name}", element, tangent_view, chart, 9)
+        b.add_norms(f"t_{name}", element)
     exact = base is not None or (not data.local_units and chart == "depth")
     _add_simplex(b, soup, layout, slanted=exact)
     # visibility as in the constrained NLP, divided by the anchor's facing 1 / |m| and in chart
@@ -74,7 +74,7 @@ def build_tangent_nlp(
     # wide: visibility bounds the slopes, as in the constrained NLP, which has no such box
     lower[:, 1:3], upper[:, 1:3] = -20 * form.depth_ratio, 20 * form.depth_ratio
     x0 = _visible(layout.pack(soup), off, form.depth_ratio, chart)
-    return b.finish("presolve", x0, lower.ravel(), upper.ravel(), layout.names), layout
+    return b.finish("presolve", x0, lower.ravel(), upper.ravel()), layout
 
 
 def majorant(form: Formulation) -> Formulation:

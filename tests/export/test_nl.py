@@ -14,7 +14,7 @@ from helpers_nl import ReadBack, close, defined_variables
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.export.nl import NLFile, readable_names, write_nl
+from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.matrix import build_matrix_nlp
@@ -56,7 +56,7 @@ def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> 
 def test_casadi_reads_back_every_formulation(form, tmp_path):
     tiny = Tiny()
     nlp, layout = tiny.nlp(TRUNCATED if form.norm == "epigraph" else PAPER, form)
-    file = write_nl(tmp_path / "soup.nl", nlp, names=readable_names(nlp, layout))
+    file = write_nl(tmp_path / "soup.nl", nlp)
     back = ReadBack(file.path)
     for seed, size in ((0, 0.02), (1, 0.2)):
         agrees(nlp, file, back, wiggle(nlp, layout.size, seed, size), seed)
@@ -96,8 +96,8 @@ def test_shared_expressions_are_written_once(tmp_path):
 
 
 def test_variables_and_rows_are_ordered_by_class(tmp_path):
-    nlp, layout = Tiny().nlp(PAPER, FORMS[0])
-    file = write_nl(tmp_path / "soup.nl", nlp, names=readable_names(nlp, layout))
+    nlp, _ = Tiny().nlp(PAPER, FORMS[0])
+    file = write_nl(tmp_path / "soup.nl", nlp)
     in_rows, in_objective, both = file.counts["nonlinear_variables"].values()
     names = np.array((tmp_path / "soup.col").read_text().split())
     # n and R are in SO(3) and |n| = 1 and in the energy; lam (simplex: linear) and t in the energy
@@ -115,25 +115,6 @@ def test_variables_and_rows_are_ordered_by_class(tmp_path):
     assert file.counts["nonlinear_variables"]["both"] < file.counts["nonlinear_variables"]["rows"]
 
 
-@pytest.mark.parametrize("form", FORMS, ids=form_id)
-def test_names_are_unique_and_point_to_their_rows(form):
-    nlp, layout = Tiny().nlp(TRUNCATED, form)
-    x_names, g_names = readable_names(nlp, layout)
-    assert len(set(x_names)) == nlp.nx
-    assert len(set(g_names)) == nlp.ng
-    assert {"R[7,2,1]", "lam[3]", "n[11,3]"} <= set(x_names)
-    # moving R[7] changes rows of superpixel 7 alone, but for edges
-    column = x_names.index("R[7,2,1]")
-    hit = np.flatnonzero(nlp.jacobian(nlp.x0).toarray()[:, column])
-    touched = [g_names[k] for k in hit]
-    assert {"so3[7,1]", "so3[7,2]", "so3[7,4]"} <= set(touched)
-    for name in touched:
-        owners = name.partition("[")[2].rstrip("]").split(",")
-        assert "7" in owners[:2], name
-    assert {"simplex", "so3[0,1]", "so3[11,6]", "normal[3]", "visible[5,1]"} <= set(g_names)
-    assert ("translation[4]" in g_names) == (form.gauge == "unit-translation")
-
-
 # --- foreign readers -----------------------------------------------------------------------------
 
 
@@ -143,7 +124,7 @@ def written(tmp_path_factory):
     nlp, layout = Tiny().nlp(TRUNCATED, form)
     folder = tmp_path_factory.mktemp("foreign")
     lam_g = np.full(nlp.ng, -1.0)
-    return nlp, layout, write_nl(folder / "soup.nl", nlp, readable_names(nlp, layout), lam_g)
+    return nlp, layout, write_nl(folder / "soup.nl", nlp, lam_g)
 
 
 def test_ampls_own_library_agrees(written):
@@ -232,7 +213,7 @@ def test_pounce_agrees(written):
     nlp, layout, file = written
     pounce_agrees(nlp, file, wiggle(nlp, layout.size, 3, 0.1))
     back = pounce.read_nl(str(file.path))
-    x_names, g_names = readable_names(nlp, layout)
+    x_names, g_names = nlp.x_names(), nlp.g_names()
     assert list(back.var_names) == [x_names[k] for k in file.variables]
     assert list(back.con_names) == [g_names[k] for k in file.rows]
 

@@ -16,7 +16,7 @@ from scipy import sparse
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.export.nl import readable_names, write_nl
+from soup_nlp.export.nl import write_nl
 from soup_nlp.family.describe import check_sol, degree, rank, write_results
 from soup_nlp.family.frozen import (
     decoded,
@@ -169,8 +169,8 @@ def test_the_package_has_a_record_of_every_size():
 def test_an_instance_has_the_published_bytes(scene, tmp_path):
     instance = Instance(scene, STANDARD, 100, "hard")
     record = load_frozen(scene, 100)
-    nlp, layout, _ = build_instance(case_of(record), record, STANDARD, "hard")
-    file = write_nl(tmp_path / "x.nl", nlp, names=readable_names(nlp, layout))
+    nlp = build_instance(case_of(record), record, STANDARD, "hard")[0]
+    file = write_nl(tmp_path / "x.nl", nlp)
     assert file.sha256 == published()["sha256"][instance.name]
 
 

@@ -184,7 +184,8 @@ def exact_terms(
     view, option = (matrix_view, layout.gauge) if matrix else (tangent_view, layout.chart)
     out = {}
     for name, element in elements(data, weights, layout).items():
-        variables = ca.SX.sym("x", layout.stride * element.arity)
+        size, arity = element.superpixels.shape
+        variables = ca.SX.sym("x", layout.stride * arity)
         row = {k: ca.SX.sym(k, count) for k, count in element.fields.items()}
         parts = ca.vertsplit(variables, layout.stride)
         views = [view(part, row, a, option) for a, part in enumerate(parts)]
@@ -194,11 +195,10 @@ def exact_terms(
             y = square / 2 if n.kind == "half_square" else ca.sqrt(square)
             cut = y if n.sigma is None else ca.fmin(y, n.sigma)
             total += n.weight * ((1 - n.leak) * cut + n.leak * y)
-        f = ca.Function("f", [variables, ca.vertcat(*row.values())], [total]).map(
-            len(element.index)
-        )
-        table = np.column_stack([c.reshape(len(c), -1) for c in element.columns.values()])
-        out[name] = float(np.asarray(f(x[element.index].T, table.T)).sum())
+        f = ca.Function("f", [variables, ca.vertcat(*row.values())], [total]).map(size)
+        table = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
+        index = np.concatenate([layout.of(i) for i in element.superpixels.T], axis=1)
+        out[name] = float(np.asarray(f(x[index].T, table.T)).sum())
     return out
 
 

@@ -81,7 +81,7 @@ def test_a_superpixel_at_rest_gets_a_tiny_translation():
 
 @pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_names_are_unique_and_as_many_as_there_are_numbers(gauge, norm):
+def test_names_are_unique_and_point_to_their_numbers(gauge, norm):
     problem = tiny()
     nlp, layout = problem.nlp(weights_for("paper"), form(gauge=gauge, norm=norm))
     x, g = nlp.x_names(), nlp.g_names()
@@ -93,8 +93,14 @@ def test_names_are_unique_and_as_many_as_there_are_numbers(gauge, norm):
     soup = layout.unpack(nlp.x0)
     assert nlp.x0[x.index("R[5,2,1]")] == soup.R[5, 1, 0]
     assert nlp.x0[x.index("t[7,3]")] * len(problem.seg) == soup.t[7, 2]
-    kinds = {re.sub(r"\[.*", "", name) for name in g}
-    assert {"so3", "normal", "visible", "simplex"} <= kinds
+    assert {"simplex", "so3[0,1]", "so3[11,6]", "normal[3]", "visible[5,1]"} <= set(g)
+    assert ("translation[4]" in g) == (gauge == "unit-translation")
+    # moving R[7] changes rows of superpixel 7 alone, but for edges
+    hit = np.flatnonzero(nlp.jacobian(nlp.x0).toarray()[:, x.index("R[7,2,1]")])
+    touched = [g[k] for k in hit]
+    assert {"so3[7,1]", "so3[7,2]", "so3[7,4]"} <= set(touched)
+    for name in touched:
+        assert "7" in name.partition("[")[2].rstrip("]").split(",")[:2], name
 
 
 @pytest.mark.parametrize(
