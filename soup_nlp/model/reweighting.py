@@ -20,23 +20,38 @@ CREASE = 0.01
 degrees: 0.005 and 0.02 differ by at most 0.0006 in the mean relative error of robot."""
 
 
-def across_components(data: EnergyData, component: Int, factor: float) -> EnergyData:
-    """The same data with E_arap and E_prior times `factor` on edges between two components.
+def across(
+    data: EnergyData,
+    group: Int,
+    *,
+    arap: float = 1.0,
+    prior: float = 1.0,
+    cont: float = 1.0,
+    orient: float = 1.0,
+) -> EnergyData:
+    """The same data with terms times a factor each between superpixels of different groups.
 
     As-rigid-as-possible holds inside a component. Across components it pulls a component that the
     camera's motion explains at a wrong depth to that depth: with equal motions such an edge costs
     nothing. The prior would pull a component to its background, against the contact that fixes its
-    scale.
+    scale. At a flow discontinuity, moreover, one surface passes in front of another: their gap in
+    depth is real, and they need not face the same way.
 
     Args:
         data: Data of the pair.
-        component: (N,) group of every superpixel, as the start finds them.
-        factor: 1 is the paper's energy.
+        group: (N,) component or surface of every superpixel, as the start finds them.
+        arap: Factor of E_arap; 1 is the paper's energy, as for the others.
+        prior: Factor of E_prior.
+        cont: Factor of E_cont.
+        orient: Factor of E_orient.
     """
-    i, k = data.edges.T
-    factors = np.where(component[i] == component[k], 1.0, factor)
+    split, edges = (group[a] != group[b] for a, b in (data.pairs.T, data.edges.T))
     return replace(
-        data, edge_weight=factors * data.edge_weight, prior_weight=factors * data.prior_weight
+        data,
+        edge_weight=np.where(edges, arap, 1.0) * data.edge_weight,
+        prior_weight=np.where(edges, prior, 1.0) * data.prior_weight,
+        pair_weight=np.where(split, cont, 1.0) * data.pair_weight,
+        orient_weight=np.where(split, orient, 1.0) * data.orient_weight,
     )
 
 
@@ -157,30 +172,6 @@ def at_occlusions(
     z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
     hidden = (component[i] != component[k]) & (z.min(axis=0) < (1 - gap) * z.max(axis=0))
     return replace(data, pair_weight=np.where(hidden, factor, 1.0) * data.pair_weight)
-
-
-def across_discontinuities(
-    data: EnergyData, surface: Int, *, arap: float = 1.0, cont: float = 1.0, orient: float = 1.0
-) -> EnergyData:
-    """The same data with terms times a factor each from one surface to another.
-
-    At a flow discontinuity one surface passes in front of another: their gap in depth is real, and
-    they need neither move alike nor face the same way. Terms between them flatten both surfaces.
-
-    Args:
-        data: Data of the pair.
-        surface: (N,) surface of every superpixel, as the start finds them.
-        arap: Factor of E_arap; 1 is the paper's energy, as for the others.
-        cont: Factor of E_cont.
-        orient: Factor of E_orient.
-    """
-    split, edges = (surface[a] != surface[b] for a, b in (data.pairs.T, data.edges.T))
-    return replace(
-        data,
-        edge_weight=np.where(edges, arap, 1.0) * data.edge_weight,
-        pair_weight=np.where(split, cont, 1.0) * data.pair_weight,
-        orient_weight=np.where(split, orient, 1.0) * data.orient_weight,
-    )
 
 
 def in_pixels(

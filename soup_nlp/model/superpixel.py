@@ -60,16 +60,15 @@ class View:
         """`point` of the anchor's own ray."""
         return self.point(ray) if self.depth is None else self.depth * ray
 
-    def move(self, point: ca.SX) -> ca.SX:
-        """Next-frame point of a reference-frame point."""
-        return self.R @ point + self.lam * self.t
-
     def next_gap(self, X: ca.SX, other: View, Y: ca.SX) -> ca.SX:
-        """`self.move(X) - other.move(Y)`, as a sum of small differences."""
+        """Difference of the next-frame points `R X + lam t` of X and, by another view, of Y.
+
+        It is a sum of small differences.
+        """
         return self._turned_gap(self.R, X, other, Y)
 
     def stretch(self, X: ca.SX, other: View, Y: ca.SX) -> ca.SX:
-        """`|X - Y| - |self.move(X) - other.move(Y)|`.
+        """`|X - Y|` less the distance of their next-frame points, see `next_gap`.
 
         From the small difference of both vectors: lengths of what is far away, in units of the
         depth of something near, have rounding that held the dual infeasibility at 1e-5.

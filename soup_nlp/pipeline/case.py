@@ -24,8 +24,7 @@ from soup_nlp.model.energy_options import (
     bending_weights,
 )
 from soup_nlp.model.reweighting import (
-    across_components,
-    across_discontinuities,
+    across,
     at_occlusions,
     in_noise,
     in_pixels,
@@ -219,7 +218,7 @@ def build_energy(
     )
     data = without_flow(in_noise(data, start.noise), start.wrong)
     prior_weight, bending = data.prior_weight, bending_weights(e.weights, len(seg))
-    data = across_components(data, start.component, e.arap_across)
+    data = across(data, start.component, arap=e.arap_across, prior=e.arap_across)
     data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * prior_weight)
     parts = start.component
     if start.order is not None and e.weights.order > 0:
@@ -237,7 +236,7 @@ def build_energy(
     data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)
     if whole:
         pieces = start.surface * (int(start.component.max()) + 1) + start.component
-        data = across_discontinuities(data, pieces, **ACROSS_DISCONTINUITIES)
+        data = across(data, pieces, **ACROSS_DISCONTINUITIES)
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, BENDING_ROTATION_PX if whole else None)
     else:

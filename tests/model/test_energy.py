@@ -39,12 +39,7 @@ from soup_nlp.model.energy_data import (
 )
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.reweighting import (
-    across_components,
-    across_discontinuities,
-    in_noise,
-    in_pixels,
-)
+from soup_nlp.model.reweighting import across, in_noise, in_pixels
 from soup_nlp.start.choice import limited_noise
 
 # --- invariances ---------------------------------------------------------------------------------
@@ -325,15 +320,13 @@ def test_prior_is_measured_in_the_noise_of_the_flow(error, noise):
     np.testing.assert_allclose(data.prior_weight, noise * problem.data.prior_weight)
 
 
-def test_ties_across_components_keep_a_share_of_weight():
+def test_ties_across_groups_keep_a_share_of_weight():
     data, count = tiny("pixels").data, len(tiny().soup)
     part = np.arange(count) % 2
     (a, b), (i, k) = data.edges.T, data.pairs.T
     apart, split = part[a] != part[b], part[i] != part[k]
-    one = across_components(data, part, 0.3)
-    two = across_discontinuities(data, part, arap=0.3, cont=0.2, orient=0.1)
-    for found in (one, two):
-        expected = np.where(apart, 0.3, 1.0) * data.edge_weight
-        np.testing.assert_allclose(found.edge_weight, expected, rtol=1e-14)
-    np.testing.assert_allclose(two.pair_weight, np.where(split, 0.2, 1.0) * data.pair_weight)
-    np.testing.assert_allclose(two.orient_weight, np.where(split, 0.1, 1.0) * data.orient_weight)
+    found = across(data, part, arap=0.4, prior=0.3, cont=0.2, orient=0.1)
+    np.testing.assert_allclose(found.edge_weight, np.where(apart, 0.4, 1.0) * data.edge_weight)
+    np.testing.assert_allclose(found.prior_weight, np.where(apart, 0.3, 1.0) * data.prior_weight)
+    np.testing.assert_allclose(found.pair_weight, np.where(split, 0.2, 1.0) * data.pair_weight)
+    np.testing.assert_allclose(found.orient_weight, np.where(split, 0.1, 1.0) * data.orient_weight)
