@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
-import pickle
 import platform
 import resource
 import signal
@@ -13,7 +12,9 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,7 @@ def isolated(
 
     Args:
         work: Function without arguments; its return value must pickle.
-        folder: Existing folder for the return value and the output.
+        folder: Existing folder for the output.
         seconds: Limit of the wall time.
         memory: Bytes that the process may have in addition to those of this one.
         cpu_seconds: Limit of the CPU time of the process and of each of its children, or None.
@@ -72,40 +73,48 @@ def isolated(
         raise SolverError(
             "comparing needs a system that forks processes", found=sys.platform, expected="POSIX"
         )
-    target = folder / "value.pickle"
-    target.unlink(missing_ok=True)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.perf_counter()
     context = multiprocessing.get_context("fork")
-    process = context.Process(target=_child, args=(work, target, memory, cpu_seconds))
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_child, args=(work, sender, folder, memory, cpu_seconds))
     with one_thread():
         process.start()
-    late = True
+    # the end of the process is then the end of the pipe
+    sender.close()
+    answer = None
     try:
-        process.join(seconds + GRACE)
-        late = process.is_alive()
+        late = not receiver.poll(seconds + GRACE)
+        if not late:
+            with suppress(EOFError, OSError):
+                answer = receiver.recv()
+            process.join(GRACE)
     finally:
-        if late:
-            process.kill()
-            process.join()
+        process.kill()
+        process.join()
     spent = time.perf_counter() - begin
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     code = process.exitcode or 0
     process.close()
-    try:
-        how, value, peak = pickle.loads(target.read_bytes())
-    except (OSError, EOFError, pickle.UnpicklingError):
+    if answer is None:
         word = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         late = late or word in ("SIGXCPU", "SIGKILL" if cpu >= (cpu_seconds or cpu + 1) else "")
-        how, value, peak = "killed: time" if late else f"crashed: {word}", None, 0
+        answer = "killed: time" if late else f"crashed: {word}", None, 0
+    how, value, peak = answer
     return ProcessResult(how, value, spent, cpu, peak)
 
 
-def _child(work: Callable[[], Any], target: Path, memory: int, cpu_seconds: float | None) -> None:
+def _child(
+    work: Callable[[], Any],
+    sender: Connection,
+    folder: Path,
+    memory: int,
+    cpu_seconds: float | None,
+) -> None:
     end_with_parent()
     # the output of the work goes to a file in its folder
-    with target.with_name("output.log").open("wb") as log:
+    with (folder / "output.log").open("wb") as log:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
     limit = psutil.Process().memory_info().vms + memory
@@ -129,9 +138,7 @@ def _child(work: Callable[[], Any], target: Path, memory: int, cpu_seconds: floa
         answer = ("killed: memory", None) if "bad_alloc" in str(error) else ("raised", text)
     scopes = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
     peak = max(resource.getrusage(scope).ru_maxrss for scope in scopes)
-    part = target.with_suffix(".part")
-    part.write_bytes(pickle.dumps((*answer, peak * 1024)))
-    part.rename(target)
+    sender.send((*answer, peak * 1024))
 
 
 def processor() -> str:
