@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from types import MappingProxyType
 
 import numpy as np
 
@@ -30,20 +29,18 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.pipeline.run import run
 from soup_nlp.storage.rows import Row
 
-METHODS: Mapping[str, str] = MappingProxyType(
-    {
-        "solution": "what the product delivers",
-        "solution_90": "the same, on the 90 % of the true pixels where sigma is least",
-        "solution_70": "the same, on 70 %",
-        "nlp": "the NLP alone, before refinement",
-        "start": "the start: shared motions, scales by contact",
-        "unorganised": "independent superpixels: each with a translation of length 1, no assembly",
-        "solution_rigid": "the solution, only where one rigid motion has a depth",
-        "rigid": "one rigid motion, triangulated; only where it has a depth",
-        "rigid_filled": "the same, holes filled from the nearest pixel",
-        "constant": "a constant depth",
-    }
-)
+METHODS: Mapping[str, str] = {
+    "solution": "what the product delivers",
+    "solution_90": "the same, on the 90 % of the true pixels where sigma is least",
+    "solution_70": "the same, on 70 %",
+    "nlp": "the NLP alone, before refinement",
+    "start": "the start: shared motions, scales by contact",
+    "unorganised": "independent superpixels: each with a translation of length 1, no assembly",
+    "solution_rigid": "the solution, only where one rigid motion has a depth",
+    "rigid": "one rigid motion, triangulated; only where it has a depth",
+    "rigid_filled": "the same, holes filled from the nearest pixel",
+    "constant": "a constant depth",
+}
 """Descriptions of the depth maps, in the order of the tables."""
 
 BASELINES = ("unorganised", "rigid", "rigid_filled", "constant")

@@ -7,7 +7,6 @@ from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from textwrap import shorten
-from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -22,17 +21,15 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.storage.files import atomic_path
 from soup_nlp.storage.rows import Row
 
-METHODS: Mapping[str, Overrides] = MappingProxyType({"preset: paper": PAPER, "defaults": ()})
+METHODS: Mapping[str, Overrides] = {"preset: paper": PAPER, "defaults": ()}
 """Overrides by the name of a method."""
-DATASETS: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType(
-    {
-        "sintel": ("MPI Sintel", ("sintel",)),
-        "vkitti": ("Virtual KITTI", ("vkitti",)),
-        "kitti": ("KITTI", ("kitti2012", "kitti2015")),
-        "kinect_paper": ("kinect_paper", ("kinect_paper",)),
-        "kinect_tshirt": ("kinect_tshirt", ("kinect_tshirt",)),
-    }
-)
+DATASETS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "sintel": ("MPI Sintel", ("sintel",)),
+    "vkitti": ("Virtual KITTI", ("vkitti",)),
+    "kitti": ("KITTI", ("kitti2012", "kitti2015")),
+    "kinect_paper": ("kinect_paper", ("kinect_paper",)),
+    "kinect_tshirt": ("kinect_tshirt", ("kinect_tshirt",)),
+}
 """Title and suites of the paper's datasets. Without data of a suite, the families of these names in
 the suite `shared` are taken."""
 STUDIED = ("street", "room", MOTORCYCLE.name, "kitti", "kinect_paper")

@@ -171,7 +171,7 @@ def _study(folder: Path, name: str, rows: pd.DataFrame) -> list[str]:
         blocks += [f"{method}, MRE after median scale, no cap:", markdown(drawn[method])]
     if name == "ablation":
         terms = ["arap", "+ proj", "+ cont", "+ orient"]
-        printed = pd.DataFrame.from_dict(dict(ABLATION), orient="index", columns=terms)
+        printed = pd.DataFrame.from_dict(ABLATION, orient="index", columns=terms)
         blocks += ["Published MRE:", markdown(printed.rename_axis("sequence"))]
         blocks.append(f"Copied, not measured: {SOURCE}.")
     _plot_lines(folder / f"{name}.png", drawn, name, study.text)

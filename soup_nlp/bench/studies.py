@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from types import MappingProxyType
 from typing import Any
 
 from soup_nlp.bench.study import Overrides
@@ -43,49 +42,47 @@ class Study:
     published: str = ""
 
 
-STUDIES: Mapping[str, Study] = MappingProxyType(
-    {
-        "ablation": Study(
-            "what each term of the energy adds (the paper's ablation table)",
-            {
-                "arap": without("proj", "cont", "orient", "prior"),
-                "+ proj": without("cont", "orient", "prior"),
-                "+ cont": without("orient", "prior"),
-                "+ orient": without("prior"),
-                "+ prior": (),
-            },
-        ),
-        "superpixels": Study(
-            "number of superpixels",
-            over("segmentation.superpixels", (100, 250, 500, 1000, 2000)),
-            "Published as a figure: the error hardly falls beyond 1,000 superpixels.",
-        ),
-        "neighbours": Study(
-            "K of the K-NN graph",
-            over("segmentation.neighbours", (4, 8, 12, 15, 20)),
-            "Published as pictures of one pair (K = 4 and 20); K from 15 to 20 is used.",
-        ),
-        "pattern": Study(
-            "SLIC against a regular grid",
-            over("segmentation.method", ("slic", "grid")),
-            "Published for one frame with 1,000 superpixels: slic 0.0912, grid 0.1442. Copied, not"
-            f" measured: {SOURCE}.",
-        ),
-        "flow": Study(
-            "flow: the truth, the truth with noise of 0.1 to 2 pixels, DIS",
-            over("flow.source", ["truth", *(f"truth+noise:{px}" for px in NOISE_PX), "dis"]),
-            "Published as a figure of RMSE in metres on Sintel.",
-        ),
-        "stages": Study(
-            "NLP and refinement, alone and together",
-            {
-                "NLP": ("refine.enabled=false",),
-                "refinement": ("refine.from_start=true",),
-                "both": (),
-            },
-        ),
-    }
-)
+STUDIES: Mapping[str, Study] = {
+    "ablation": Study(
+        "what each term of the energy adds (the paper's ablation table)",
+        {
+            "arap": without("proj", "cont", "orient", "prior"),
+            "+ proj": without("cont", "orient", "prior"),
+            "+ cont": without("orient", "prior"),
+            "+ orient": without("prior"),
+            "+ prior": (),
+        },
+    ),
+    "superpixels": Study(
+        "number of superpixels",
+        over("segmentation.superpixels", (100, 250, 500, 1000, 2000)),
+        "Published as a figure: the error hardly falls beyond 1,000 superpixels.",
+    ),
+    "neighbours": Study(
+        "K of the K-NN graph",
+        over("segmentation.neighbours", (4, 8, 12, 15, 20)),
+        "Published as pictures of one pair (K = 4 and 20); K from 15 to 20 is used.",
+    ),
+    "pattern": Study(
+        "SLIC against a regular grid",
+        over("segmentation.method", ("slic", "grid")),
+        "Published for one frame with 1,000 superpixels: slic 0.0912, grid 0.1442. Copied, not"
+        f" measured: {SOURCE}.",
+    ),
+    "flow": Study(
+        "flow: the truth, the truth with noise of 0.1 to 2 pixels, DIS",
+        over("flow.source", ["truth", *(f"truth+noise:{px}" for px in NOISE_PX), "dis"]),
+        "Published as a figure of RMSE in metres on Sintel.",
+    ),
+    "stages": Study(
+        "NLP and refinement, alone and together",
+        {
+            "NLP": ("refine.enabled=false",),
+            "refinement": ("refine.from_start=true",),
+            "both": (),
+        },
+    ),
+}
 """Studies by name."""
 
 
@@ -235,14 +232,12 @@ COMPARISON: Mapping[str, Mapping[str, float | None]] = {
 """MRE by dataset and method; None where the paper prints none. KITTI is the odometry set 00-09
 with LiDAR truth, not the stereo and flow sets of the suites."""
 
-ABLATION: Mapping[str, tuple[float, float, float, float]] = MappingProxyType(
-    {
-        "alley_1": (0.2248, 0.2022, 0.1697, 0.1606),
-        "ambush_4": (0.2381, 0.2093, 0.1701, 0.1676),
-        "mountain_1": (0.2127, 0.1923, 0.1492, 0.1405),
-        "sleeping_1": (0.2418, 0.2026, 0.1912, 0.1823),
-    }
-)
+ABLATION: Mapping[str, tuple[float, float, float, float]] = {
+    "alley_1": (0.2248, 0.2022, 0.1697, 0.1606),
+    "ambush_4": (0.2381, 0.2093, 0.1701, 0.1676),
+    "mountain_1": (0.2127, 0.1923, 0.1492, 0.1405),
+    "sleeping_1": (0.2418, 0.2026, 0.1912, 0.1823),
+}
 """MRE with E_arap, + E_proj, + E_cont, + E_orient (the paper's ablation table)."""
 
 _KINECT = "Measured rows are of the pairs in the folder, whichever those are"

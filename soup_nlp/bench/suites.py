@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from soup_nlp.bench.study import Item
@@ -19,11 +18,9 @@ from soup_nlp.storage.files import as_path, is_file, is_folder
 RENDERED = ("street", "room", "sheet", "orbit", "still", "banner")
 MOTORCYCLE = Item("shared", "motorcycle", "motorcycle", "dis", {"kind": "motorcycle"})
 """The real pair that needs no data; it comes with scikit-image."""
-SINTEL_FRAMES = MappingProxyType(
-    {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}
-)
+SINTEL_FRAMES = {"alley_1": 50, "ambush_4": 33, "mountain_1": 50, "sleeping_1": 50, "temple_2": 50}
 """Number of frames of the paper's sequences."""
-VKITTI_FRAMES = MappingProxyType({"0001": 447, "0002": 233, "0006": 270, "0018": 339})
+VKITTI_FRAMES = {"0001": 447, "0002": 233, "0006": 270, "0018": 339}
 """Number of frames of the paper's worlds."""
 
 
@@ -275,7 +272,7 @@ _ALL = (
         for thing, text in (("paper", "paper"), ("tshirt", "T-shirt"))
     ),
 )
-SUITES: Mapping[str, Suite] = MappingProxyType({s.name: s for s in _ALL})
+SUITES: Mapping[str, Suite] = {s.name: s for s in _ALL}
 """Suites by name."""
 
 
