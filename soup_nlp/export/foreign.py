@@ -16,7 +16,7 @@ from soup_nlp.evaluate import recompute
 from soup_nlp.export.artefact import CHOICES, fingerprint, read_manifest
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import Sol, read_sol
-from soup_nlp.export.verify import ENERGY_SLACK, Kind, Limits, examine, kind, violations
+from soup_nlp.export.verify import ENERGY_SLACK, FEASIBLE, Kind, examine, kind, violations
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
@@ -26,16 +26,12 @@ from soup_nlp.pipeline.record import Case, Run
 from soup_nlp.pipeline.run import make_run
 from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.kkt import residuals
-from soup_nlp.solve.stages import Solution
+from soup_nlp.solve.stages import Solution, multipliers
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import recover
 
 SAME = 1e-7
 """Largest relative difference of the fingerprints of an export and of the present problem."""
-KKT_LIMIT = 1e-6
-"""Largest violation of a constraint in a verified answer."""
-LIMITS = Limits()
-"""Limits of the other KKT residuals: the defaults of `compare`."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ class Imported:
         # start of the solver, which after a presolve is not the proposal
         start = self.manifest["exact_energy_at_start"]["total"]
         return (
-            f"solver      {sol.headline or 'no message'} ({sol.status}, code {sol.code}): {word}\n"
+            f"{sol}: {word}\n"
             f"energy      start {start:.6g}  solution {s.energy['total']:.6g}\n"
             f"{'':<12}of the solution: {terms}\n"
             f"residuals   {'  '.join(f'{k} {v:.1e}' for k, v in s.residuals.items())}"
@@ -112,8 +108,8 @@ def sol_table(imported: Imported) -> list[Kind]:
     facing = run.problem.formulation.min_facing
     with np.errstate(all="ignore"):
         violated = recompute.constraints(state, run.data.rim_ray, facing)
-    rows = [kind(k, v, KKT_LIMIT, superpixels=k != "simplex") for k, v in violated.items()]
-    return rows + [kind(k, v, KKT_LIMIT, False) for k, v in imported.violations.items()]
+    rows = [kind(k, v, FEASIBLE, superpixels=k != "simplex") for k, v in violated.items()]
+    return rows + [kind(k, v, FEASIBLE, False) for k, v in imported.violations.items()]
 
 
 def foreign_run(
@@ -126,19 +122,14 @@ def foreign_run(
 ) -> Run:
     """A run whose solution is the answer of another solver.
 
-    It has converged if the solver claims success, the recomputed KKT residuals are within LIMITS
-    and KKT_LIMIT, and the exact energy is not above that of the proposal.
+    It has converged if the solver claims success, the recomputed KKT residuals are those of an
+    optimum, and the exact energy is not above that of the proposal.
     """
     r = examine(nlp, answer.x, answer.lam_g)
     point = layout.unpack(answer.x)
     soup = point.retracted()
     start, energy = (oracle.energy(s, case.data, case.weights) for s in (case.start.soup, soup))
-    good = (
-        answer.solved
-        and r.within(LIMITS)
-        and r.primal <= KKT_LIMIT
-        and energy["total"] <= (1 + ENERGY_SLACK) * start["total"]
-    )
+    good = answer.solved and r.optimal and energy["total"] <= (1 + ENERGY_SLACK) * start["total"]
     off = f"violation {r.primal:.1e}, dual {r.dual:.1e}, compl. {r.complementarity:.1e}"
     status = "Solve_Succeeded" if good else f"{answer.status}, {off}"
     stage = Stage(
@@ -154,11 +145,6 @@ def foreign_run(
         history={},
         calls={},
     )
-    parts = {
-        f"lam_g_{group.kernel.name}": r.lam_g[np.unique(group.table.rows)]
-        for group in nlp.groups
-        if group.kernel.nc
-    }
     rest = residuals(nlp, soup, stage, case.data, form.min_facing)
     # a run holds its last iterate in matrices
     matrices = MatrixLayout(case.data.share, form.gauge).pack(point)
@@ -170,7 +156,7 @@ def foreign_run(
         energy_start=start,
         energy=energy,
         residuals=rest,
-        multipliers={"lam_x": r.lam_x, **parts},
+        multipliers=multipliers(nlp, stage),
         nlp=nlp.sizes(),
         description=str(nlp),
         seconds={},

@@ -39,6 +39,9 @@ class Sol:
     x: Float = field(repr=False)
     lam_g: Float | None = field(repr=False)
 
+    def __str__(self) -> str:
+        return f"solver      {self.headline or 'no message'} ({self.status}, code {self.code})"
+
     @property
     def headline(self) -> str:
         """First line of the message, or ""."""

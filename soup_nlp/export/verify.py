@@ -19,6 +19,8 @@ ENERGY_SLACK = 1e-3
 """Allowed relative increase of the exact energy over the proposal, due to the smoothing."""
 ACTIVE = 1e-5
 """Distance of a row to a bound, relative to 1 + |bound|, up to which it is active."""
+FEASIBLE = 1e-6
+"""Largest violation of a constraint in a verified answer."""
 DAMPING = 1e-12
 """Damping of least-squares multipliers relative to the mean square gradient of a row."""
 
@@ -65,6 +67,11 @@ class Residuals:
     multipliers: str
     lam_x: Float = field(repr=False)
     lam_g: Float = field(repr=False)
+
+    @property
+    def optimal(self) -> bool:
+        """Whether the point of a .sol file is verified: within the limits that `compare` has."""
+        return self.primal <= FEASIBLE and self.within(Limits())
 
     def within(self, limits: Limits) -> bool:
         """Whether the residuals are small enough for a verified answer."""

@@ -191,7 +191,7 @@ class _Solve:
             energy_start=oracle.energy(self.start, self.data, self.weights),
             energy=oracle.energy(final, self.data, self.weights),
             residuals=residuals(nlp, final, stage, self.data, self.form.min_facing),
-            multipliers=_multipliers(nlp, stage),
+            multipliers=multipliers(nlp, stage),
             nlp=nlp.sizes(),
             description=str(nlp),
             seconds={**self.laps.wall, "compile": compiler_seconds() - compiling},
@@ -254,8 +254,8 @@ class _Solve:
         return {"start": tilted.normalised(data.share).retracted()}
 
 
-def _multipliers(nlp: NLP, stage: Stage) -> dict[str, Float]:
-    """lam_g cut into its kinds of constraint, and lam_x."""
+def multipliers(nlp: NLP, stage: Stage) -> dict[str, Float]:
+    """lam_g of a stage cut into its kinds of constraint, and lam_x."""
     out = {"lam_x": stage.lam_x}
     for group in nlp.groups:
         if group.kernel.nc:

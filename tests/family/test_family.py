@@ -219,7 +219,7 @@ def test_a_best_point_is_read_back_as_an_answer(folder):
     assert verdict.objective == verdict.best
     assert verdict.residuals.primal < 1e-14
     assert verdict.residuals.dual > 1e-3
-    assert not verdict.verified
+    assert not verdict.residuals.optimal
     assert "gap +0.00e+00" in str(verdict)
 
 
