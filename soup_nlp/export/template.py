@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError
 from soup_nlp.model.kernel import Group
-from soup_nlp.model.operations import NAMES, OPERATIONS
+from soup_nlp.model.operations import NAMES, OPERATIONS, instructions
 
 PLUS, SUM = "o0", "o54"
 """Opcodes of a sum of two terms, and of more, which is followed by their number."""
@@ -87,14 +87,10 @@ def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
     function = ca.Function("f", [kernel.x, kernel.row, kernel.theta], [ca.densify(outputs)])
     graph = _Graph(roots=[-1] * outputs.numel())
     work: dict[int, int] = {}
-    for k in range(function.n_instructions()):
-        op, inputs = function.instruction_id(k), function.instruction_input(k)
+    for op, (target, *place), inputs, value in instructions(function):
         if op == ca.OP_OUTPUT:
-            graph.roots[function.instruction_output(k)[1]] = work[inputs[0]]
-            continue
-        target = function.instruction_output(k)[0]
-        if op == ca.OP_CONST:
-            value = function.instruction_constant(k)
+            graph.roots[place[0]] = work[inputs[0]]
+        elif op == ca.OP_CONST:
             work[target] = graph.constant(("const", value), np.asarray(value, float))
         elif op == ca.OP_INPUT and inputs[0] == 0:
             work[target] = graph.node((0, inputs[1]))

@@ -110,9 +110,9 @@ class Builder:
         places = partial(_of_elements, element.superpixels)
         index, rows = [layout.of(i) for i in element.superpixels.T], []
         for norm in slacks:
-            own = Block(f"s_{norm}", size, 0.0, np.inf, places)
-            index.append(layout.size + _added(self.slacks, own)[:, None])
-            rows.append(_added(self.rows, own._replace(label=f"epigraph_{norm}")))
+            slack = Block(f"s_{norm}", size, 0.0, np.inf, places)
+            index.append(layout.size + _added(self.slacks, slack)[:, None])
+            rows.append(_added(self.rows, Block(f"epigraph_{norm}", size, 0.0, np.inf, places)))
         data = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
         table = Table(
             np.concatenate(index, axis=1), data, np.array(rows, np.int64).reshape(-1, size).T

@@ -54,20 +54,17 @@ def _cpu() -> str:
     return "\n".join(sorted(set(lines)))
 
 
-def shared_library(
-    content: str, source: Callable[[], str], compiler: str | None = None
-) -> Path | None:
+def shared_library(content: str, source: Callable[[], str]) -> Path | None:
     """A shared library of C code, from the cache where its content was compiled before.
 
     Args:
         content: What the source depends on.
         source: Writes it.
-        compiler: Path of the C compiler; default `find_compiler()`.
 
     Returns:
         Path; None without a compiler that works (logged).
     """
-    compiler = compiler or find_compiler()
+    compiler = find_compiler()
     if compiler is None:
         return None
     key = hashlib.sha256("\0".join([content, compiler, *FLAGS, _cpu()]).encode()).hexdigest()[:24]

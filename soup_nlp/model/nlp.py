@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy import sparse
@@ -12,7 +12,7 @@ from scipy import sparse
 from soup_nlp.arrays import Float
 from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group, Hessian
-from soup_nlp.model.pattern import Pattern, hessian_pattern, jacobian_pattern
+from soup_nlp.model.pattern import Pattern, hessian_entries, jacobian_entries
 from soup_nlp.model.sums import Sum, summed
 from soup_nlp.model.symbolic import Graph
 
@@ -97,21 +97,21 @@ class NLP:
                 target["jac"] = next(jacobian)
             targets.append(target)
         functions = [g.kernel.first_order() for g in self.groups]
-        return summed(self.groups, functions, targets, self._sums(sizes), self.compiled)
+        return summed(self.groups, functions, targets, self._given, sizes, self.compiled)
 
     @cached_property
     def _second(self) -> Mapping[str, Sum]:
         """The Hessian, apart from the rest, since a start at a KKT point does not need it."""
-        pattern = self.hessian_pattern
-        functions = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
-        targets = [{"hess": p} for p in pattern.places]
-        sums = self._sums({"hess": len(pattern.rows)})
-        every = [{"hess": f} if f else {} for f in functions]
-        return summed(self.groups, every, targets, sums, self.compiled)
+        second = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
+        functions = [{"hess": f} if f else {} for f in second]
+        targets = [{"hess": p} for p in self.hessian_pattern.places]
+        sizes = {"hess": self.nnzh}
+        return summed(self.groups, functions, targets, self._given, sizes, self.compiled)
 
-    def _sums(self, sizes: Mapping[str, int]) -> dict[str, Sum]:
-        given = self.nx, len(self.theta), self.ng
-        return {key: Sum(given, size) for key, size in sizes.items()}
+    @property
+    def _given(self) -> tuple[int, int, int]:
+        """Sizes of x, theta and lam_g."""
+        return self.nx, len(self.theta), self.ng
 
     def evaluated(self) -> NLP:
         """The same, with all its functions made now, so that later timings exclude it."""
@@ -121,12 +121,13 @@ class NLP:
     @cached_property
     def jacobian_pattern(self) -> Pattern:
         """Of g's Jacobian; places for every group with constraints."""
-        return jacobian_pattern(self.groups, self.ng, self.nx)
+        return Pattern((self.ng, self.nx), partial(jacobian_entries, self.groups))
 
     @cached_property
     def hessian_pattern(self) -> Pattern:
         """Of the Hessian's upper triangle; places for every group."""
-        return hessian_pattern(self.groups, self.nx, self.hessian_kind)
+        entries = partial(hessian_entries, self.groups, self.hessian_kind)
+        return Pattern((self.nx, self.nx), entries)
 
     @cached_property
     def graph(self) -> Graph:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import casadi as ca
@@ -76,24 +76,16 @@ class Pattern:
         return sparse.csc_matrix((nonzeros, self.rows, self._union.indptr), self.shape)
 
 
-def jacobian_pattern(groups: Sequence[Group], ng: int, nx: int) -> Pattern:
-    """Pattern of g's Jacobian; one set for every group that has constraints."""
-    return Pattern((ng, nx), partial(_jacobian_entries, groups))
-
-
-def hessian_pattern(groups: Sequence[Group], nx: int, hessian: str) -> Pattern:
-    """Pattern of the upper triangle of the Lagrangian's Hessian; one set for every group."""
-    return Pattern((nx, nx), partial(_hessian_entries, groups, hessian))
-
-
-def _jacobian_entries(groups: Sequence[Group]) -> Iterator[Entries]:
+def jacobian_entries(groups: Sequence[Group]) -> Iterator[Entries]:
+    """Nonzeros of g's Jacobian; one set for every group that has constraints."""
     for group in groups:
         if group.kernel.nc:
             r, c = nonzeros(group.kernel.first_order()["jac"])
             yield Entries(group.table.rows[:, r], group.table.index[:, c])
 
 
-def _hessian_entries(groups: Sequence[Group], hessian: str) -> Iterator[Entries]:
+def hessian_entries(groups: Sequence[Group], hessian: str) -> Iterator[Entries]:
+    """Nonzeros of the upper triangle of the Lagrangian's Hessian; one set for every group."""
     for group in groups:
         # half the bytes sort in half the time
         index = group.table.index.astype(np.int32)

@@ -67,21 +67,24 @@ def summed(
     groups: Sequence[Group],
     functions: Sequence[Mapping[str, ca.Function]],
     targets: Sequence[Mapping[str, NDArray[np.integer]]],
-    sums: Mapping[str, Sum],
+    given: tuple[int, int, int],
+    sizes: Mapping[str, int],
     compiled: bool,
 ) -> Mapping[str, Sum]:
-    """Fill in the terms of sums, by the fastest way there is.
+    """Sums of kernels' functions by key, evaluated by the fastest way there is.
 
     Args:
         groups: Kernels and tables.
         functions: Functions of every kernel, by the key of the sum that they belong to.
         targets: (E, k) where each entry of them is added.
-        sums: Without terms, by key.
+        given: Sizes of x, theta and lam_g.
+        sizes: Of the sums, by key.
         compiled: Use the C compiler where there is one.
 
     Raises:
         ModelError: a kernel has an unknown operation.
     """
+    sums = {key: Sum(given, size) for key, size in sizes.items()}
     for group, own_functions, own_targets in zip(groups, functions, targets):
         for f in own_functions.values():
             unknown = {i.operation for i in instructions(f)} - OPERATIONS.keys() - _OTHERS
@@ -101,7 +104,7 @@ def summed(
                     error,
                 )
         for key, f in own_functions.items():
-            target, size = own_targets[key], sums[key].size
+            target, size = own_targets[key], sizes[key]
             sums[key].terms.append(
                 Summed(library, f, blocks, target, size)
                 if library and blocks

@@ -1,4 +1,4 @@
-"""What `nlpsol` calls: an NLP's functions and the callback of its iterations, as CasADi callbacks.
+"""What `nlpsol` calls, as CasADi callbacks: the functions of an NLP.
 
 CasADi's own graph of an NLP (`model.symbolic`) takes the data of all tables as a parameter,
 which it copies at every call, and takes seconds to build at real sizes. Only theta is one here.
@@ -112,20 +112,3 @@ class Functions:
         self.hess_lag = Buffered(
             "nlp_hess_l", {**at, "lam_f": 1, "lam_g": nlp.ng}, {"triu_hess_gamma_x_x": hessian}
         )
-
-
-def iteration_callback(
-    name: str, nx: int, ng: int, parameters: int, stop: Callable[..., float]
-) -> Buffered:
-    """What nlpsol calls at every iteration.
-
-    Args:
-        name: Its name.
-        nx: Variables.
-        ng: Constraints.
-        parameters: Parameters of the NLP.
-        stop: Function of nlpsol's outputs (x, f, g, lam_x, lam_g, lam_p), which are valid during
-            the call only; 1 to stop, else 0.
-    """
-    sizes = {"x": nx, "f": 1, "g": ng, "lam_x": nx, "lam_g": ng, "lam_p": parameters}
-    return Buffered(name, sizes, {"ret": Output(ca.Sparsity.dense(1, 1), stop)})

@@ -14,7 +14,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.functions import Functions, iteration_callback
+from soup_nlp.solve.functions import Buffered, Functions, Output
 from soup_nlp.storage.progress import Progress, Watch, interruptible, raising
 
 # few bounds are active, so mu starts near its end (docs/solving.md)
@@ -95,11 +95,16 @@ class _Iterations:
         self.x0 = self.best_x = x0
         self.best_lam: tuple[Float, Float] | None = None
         self.reason = ""
-        sizes = nlp.nx, nlp.ng, len(nlp.theta)
-        self.callback = iteration_callback(f"watch_{nlp.name}", *sizes, self.stop)
+        sizes = {"x": nlp.nx, "f": 1, "g": nlp.ng}
+        sizes |= {"lam_x": nlp.nx, "lam_g": nlp.ng, "lam_p": len(nlp.theta)}
+        answer = {"ret": Output(ca.Sparsity.dense(1, 1), self.stop)}
+        self.callback = Buffered(f"watch_{nlp.name}", sizes, answer)
 
     def stop(self, *outputs: Float) -> float:
-        """Whether to stop after this iteration; a callback must not raise."""
+        """Whether to stop after this iteration, 1 or 0; a callback must not raise.
+
+        The outputs of nlpsol are valid during the call only.
+        """
         try:
             self._step(*outputs)
         except Exception as error:
