@@ -179,6 +179,9 @@ def test_slack_variables_on_their_epigraph_are_the_smooth_norms(gauge):
     x[bound] = np.sqrt(x[bound] ** 2 - row)
     np.testing.assert_allclose(value(epigraph, x)[1][rows(epigraph, "epigraph")], 0, atol=1e-9)
     assert value(epigraph, x)[0] == pytest.approx(value(smooth, x[~slack])[0], rel=1e-12)
+    # and they start on it
+    start = value(epigraph, epigraph.x0)[1][rows(epigraph, "epigraph")]
+    np.testing.assert_allclose(start, 0, atol=1e-9)
 
 
 @pytest.mark.parametrize("units", UNITS)

@@ -141,18 +141,6 @@ def test_the_epigraph_at_its_optimum_is_the_untruncated_energy(gauge, units):
         assert nlp.value(y) > f
 
 
-@pytest.mark.parametrize("units", UNITS)
-def test_the_epigraph_at_its_optimum_is_the_smooth_form(units):
-    problem, weights = tiny(units), weights_for(units)
-    one, _ = problem.nlp(weights, form(norm="epigraph", eps=0.2, eps_pixel=0.1))
-    two, _ = problem.nlp(weights, form(eps=0.2, eps_pixel=0.1))
-    smooth = two.value(two.x0)
-    assert one.value(optimal_slacks(one)) == pytest.approx(smooth, rel=1e-12)
-    # the slack variables start there: every row of the epigraph form is then 0
-    assert one.value(one.x0) == pytest.approx(smooth, rel=1e-12)
-    np.testing.assert_allclose(one.x0, optimal_slacks(one), rtol=1e-12)
-
-
 @pytest.mark.parametrize("name", TERMS)
 def test_a_weight_scales_its_term_alone(name):
     nlp, _ = tiny().nlp(PAPER, form())

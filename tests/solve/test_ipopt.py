@@ -17,7 +17,7 @@ from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import optimality
-from soup_nlp.storage.progress import Progress, Watch, interruptible
+from soup_nlp.storage.progress import Progress, Watch
 
 # --- textbook problems as kernels and tables -----------------------------------------------------
 
@@ -240,14 +240,6 @@ def test_a_listener_that_fails_ends_the_solve_with_its_message():
     assert "no more paper" in stage.status
     assert not stage.converged
     assert np.isfinite(stage.x).all()
-
-
-def test_control_c_sets_the_event_and_the_old_handler_returns():
-    before = signal.getsignal(signal.SIGINT)
-    with interruptible() as stop:
-        os.kill(os.getpid(), signal.SIGINT)
-        assert stop.wait(5)
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
