@@ -88,8 +88,8 @@ def write_fused(path: Path, chain: Chain, contents: Mapping[str, Any]) -> None:
     title = f"{contents['name']}: static scene of {len(chain)} frames, one point per voxel"
     note = "sigma_log_depth: of the frame that the point is from; guesses are left out"
     comments = [title, f"frame: {WORLD}", f"unit: {contents['unit']}", note]
-    scalars = {"sigma_log_depth": cloud.sigma, "frame": cloud.label}
-    write_ply(path, cloud.points, cloud.colours, None, scalars, comments)
+    scalars = {"sigma_log_depth": cloud["sigma"], "frame": cloud["label"]}
+    write_ply(path, cloud["points"], cloud["colours"], None, scalars, comments)
 
 
 def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> None:
@@ -97,7 +97,7 @@ def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> No
     cloud = fuse(chain, COLMAP_POINTS)
     frames, seen = range(len(chain)), []
     for k in frames:
-        inside, v, u, z = projected(chain, cloud.points, k)
+        inside, v, u, z = projected(chain, cloud["points"], k)
         with np.errstate(invalid="ignore", divide="ignore"):
             near = np.abs(np.log(z / chain.depth(k)[v, u])) < VISIBLE
         at = np.flatnonzero(inside & near)
@@ -109,7 +109,7 @@ def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> No
         [chain.camera(k) for k in frames],
         [pose.inverse for pose in chain.world_from_camera],
         [chain.labels(k) > 0 for k in frames],
-        (cloud.points, cloud.colours),
+        (cloud["points"], cloud["colours"]),
         seen,
         f"{contents['name']}; unit: {contents['unit']}",
     )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.report.models import thinned
@@ -22,7 +23,7 @@ IN_FRONT = 0.8
 SHOWN = 3
 """Smallest number of frames of a track that is shown; shorter tracks are mostly no objects."""
 
-Cloud: TypeAlias = "np.recarray[Any, Any]"
+Cloud: TypeAlias = NDArray[np.void]
 """(M,) points with the fields of POINT."""
 POINT = np.dtype([("points", float, 3), ("colours", "u1", 3), ("sigma", float), ("label", int)])
 """Position in world coordinates in the unit of the chain, RGB, standard deviation of log depth, and
@@ -45,25 +46,20 @@ def fuse(chain: Chain, most: int = MOST) -> Cloud:
         for other in (k - 2, k - 1, k + 1, k + 2):
             if 0 <= other < len(chain.pairs):
                 fits &= ~_contradicts(chain, cloud, other)
-        clouds.append(kept(cloud, fits))
+        clouds.append(cloud[fits])
     cloud = _joined(clouds)
     if not len(cloud):
         return cloud
-    side = VOXEL * float(np.median(np.linalg.norm(cloud.points, axis=1)))
-    cloud = kept(cloud, np.argsort(cloud.sigma, kind="stable"))
-    voxel = np.floor(cloud.points[:, ::-1] / side).astype(np.int64)
+    side = VOXEL * float(np.median(np.linalg.norm(cloud["points"], axis=1)))
+    cloud = cloud[np.argsort(cloud["sigma"], kind="stable")]
+    voxel = np.floor(cloud["points"][:, ::-1] / side).astype(np.int64)
     _, first = np.unique(voxel, axis=0, return_index=True)
-    return every_kth(kept(cloud, first), most)
+    return every_kth(cloud[first], most)
 
 
 def every_kth(cloud: Cloud, most: int) -> Cloud:
     """At most so many points of a cloud: each k-th one."""
-    return kept(cloud, slice(None, None, max(1, -(-len(cloud) // most))))
-
-
-def kept(cloud: Cloud, keep: Mask | Int | slice) -> Cloud:
-    """The points of a mask, of indices or of a slice."""
-    return cloud[keep].view(np.recarray)
+    return cloud[:: max(1, -(-len(cloud) // most))]
 
 
 def shown_tracks(chain: Chain) -> list[int]:
@@ -84,21 +80,21 @@ def movers(chain: Chain, frame: int) -> Cloud:
         if track in shown and mask.any():
             cloud = _cloud(chain, pair, thinned(mask, OF_MOVER), track)
             if pair != frame:
-                cloud.points = chain.motion(pair, label)(cloud.points)
+                cloud["points"] = chain.motion(pair, label)(cloud["points"])
             clouds.append(cloud)
     return _joined(clouds)
 
 
 def _cloud(chain: Chain, frame: int, mask: Mask, label: int) -> Cloud:
     """The points of a mask."""
-    out = np.recarray(int(mask.sum()), POINT)
-    out.points, out.colours = chain.points(frame)[mask], chain.image(frame)[mask]
-    out.sigma, out.label = chain.pairs[frame].result.sigma[mask], label
+    out = np.empty(int(mask.sum()), POINT)
+    out["points"], out["colours"] = chain.points(frame)[mask], chain.image(frame)[mask]
+    out["sigma"], out["label"] = chain.pairs[frame].result.sigma[mask], label
     return out
 
 
 def _joined(clouds: Sequence[Cloud]) -> Cloud:
-    return np.concatenate([np.empty(0, POINT), *clouds]).view(np.recarray)
+    return np.concatenate([np.empty(0, POINT), *clouds])
 
 
 def projected(chain: Chain, points: Float, frame: int) -> tuple[Mask, Int, Int, Float]:
@@ -119,8 +115,8 @@ def projected(chain: Chain, points: Float, frame: int) -> tuple[Mask, Int, Int, 
 
 def _contradicts(chain: Chain, cloud: Cloud, frame: int) -> Mask:
     """(M,) points in front of the static surface of a frame that is more certain there."""
-    inside, v, u, z = projected(chain, cloud.points, frame)
+    inside, v, u, z = projected(chain, cloud["points"], frame)
     with np.errstate(invalid="ignore"):
         in_front = z < IN_FRONT * chain.depth(frame)[v, u]
-    more_certain = chain.pairs[frame].result.sigma[v, u] <= cloud.sigma
+    more_certain = chain.pairs[frame].result.sigma[v, u] <= cloud["sigma"]
     return np.asarray(chain.pairs[frame].static[v, u] & inside & in_front & more_certain)

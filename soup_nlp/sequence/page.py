@@ -25,7 +25,7 @@ from soup_nlp.report.models import GLTF
 from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
 from soup_nlp.report.pictures import depth_bar
 from soup_nlp.sequence.chain import Chain
-from soup_nlp.sequence.fused import Cloud, every_kth, fuse, kept, movers, shown_tracks
+from soup_nlp.sequence.fused import Cloud, every_kth, fuse, movers, shown_tracks
 from soup_nlp.sequence.score import LINK_HEADS, link_rows, score_text
 from soup_nlp.storage.files import PathLike, write_bytes
 from soup_nlp.storage.store import plain
@@ -86,8 +86,8 @@ def _scene(chain: Chain) -> dict[str, Any]:
     K, (height, width) = chain.camera(0), chain.image(0).shape[:2]
 
     def points(cloud: Cloud) -> dict[str, str]:
-        numbers = packed(cloud.points.astype(np.float32))
-        return {"points": numbers, "colours": packed(cloud.colours)}
+        numbers = packed(cloud["points"].astype(np.float32))
+        return {"points": numbers, "colours": packed(cloud["colours"])}
 
     most = MOVING // len(chain)
     moving = [every_kth(movers(chain, k), most) for k in range(len(chain))]
@@ -101,8 +101,8 @@ def _scene(chain: Chain) -> dict[str, Any]:
         "cameras": [pose.matrix for pose in chain.world_from_camera],
         "K": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
         "size": [width, height],
-        "middle": float(np.median(still.points[:, 2])) if len(still) else 1.0,
-        "far": float(np.abs(still.points).max(initial=1.0)),
+        "middle": float(np.median(still["points"][:, 2])) if len(still) else 1.0,
+        "far": float(np.abs(still["points"]).max(initial=1.0)),
     }
 
 
@@ -157,8 +157,8 @@ def write_animation(path: PathLike, chain: Chain, contents: Mapping[str, Any]) -
             channels.append({"sampler": len(samplers) - 1, "target": target})
 
     def show(cloud: Cloud, name: str) -> None:
-        colours = np.hstack([cloud.colours, np.full((len(cloud), 1), 255, np.uint8)])
-        attributes = {"POSITION": add(cloud.points @ GLTF), "COLOR_0": add(colours)}
+        colours = np.hstack([cloud["colours"], np.full((len(cloud), 1), 255, np.uint8)])
+        attributes = {"POSITION": add(cloud["points"] @ GLTF), "COLOR_0": add(colours)}
         meshes.append({"name": name, "primitives": [{"attributes": attributes, "mode": 0}]})
         nodes.append({"name": name, "mesh": len(meshes) - 1})
 
@@ -168,7 +168,7 @@ def write_animation(path: PathLike, chain: Chain, contents: Mapping[str, Any]) -
     for track in shown_tracks(chain):
         first = min(chain.path(track))
         cloud = movers(chain, first)
-        cloud = kept(cloud, cloud.label == track)
+        cloud = cloud[cloud["label"] == track]
         if len(cloud):
             show(cloud, f"track {track}")
             members = chain.members(track)

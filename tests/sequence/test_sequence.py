@@ -141,10 +141,10 @@ def test_the_static_scene_becomes_one_cloud():
     )
     # both pairs see the same wall: far fewer points than pixels, from either frame
     assert 0 < len(cloud) <= both
-    assert set(cloud.label) <= {0, 1}
+    assert set(cloud["label"]) <= {0, 1}
     # points of the second pair lie on the surface of the first
     wall = chain.points(0)[chain.pairs[0].result.sure]
-    for point in cloud.points[cloud.label == 1][::50]:
+    for point in cloud["points"][cloud["label"] == 1][::50]:
         assert np.linalg.norm(wall - point, axis=1).min() < 0.05 * np.linalg.norm(point)
     # short tracks are not shown
     assert len(movers(chain, 0)) == 0 or len(chain.path(1)) >= 3
