@@ -16,7 +16,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run
 from soup_nlp.pipeline.run import make_run, skipped
 
-# drawn cases are the same in every run
+# drawn cases are the same in every run, without a time limit on a busy machine
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed")
 

@@ -104,10 +104,6 @@ class PlaneFit:
     cost: Float
     parallax: Float
 
-    def columns(self, indices: list[int]) -> PlaneFit:
-        """The candidates in some columns."""
-        return PlaneFit(*(v[:, indices] for v in self.__dict__.values()))
-
     def penalised(self) -> Float:
         """(N, C) cost in pixels, increased where the plane lies behind the camera.
 

@@ -117,11 +117,6 @@ class Soup:
         near = far + self.translation
         return near[:, :2] / near[:, 2:] - far[:, :2] / far[:, 2:]
 
-    def homographies(self, K_ref: Float, K_next: Float) -> Float:
-        """(N, 3, 3) `K_next (R - t n^T / d) K_ref^-1`, paper Eq. 3."""
-        H = self.R - self.t[:, :, None] * self.n[:, None, :] / self.d[:, None, None]
-        return K_next @ H @ np.linalg.inv(K_ref)
-
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 
-import helpers_model  # noqa: F401  (hypothesis profile)
 import numpy as np
 import pytest
 from helpers_truth import assert_partition
@@ -66,7 +65,7 @@ def test_a_count_that_does_not_fit_is_an_error(count):
         segment(noise(48, 64), count)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(hnp.arrays(np.int32, (8, 9), elements=st.integers(0, 3)), st.integers(1, 12))
 def test_split_components_leaves_connected_pieces(labels, min_size):
     out = split_components(labels, min_size)

@@ -8,7 +8,6 @@ from functools import cache
 
 import casadi as ca
 import numpy as np
-from hypothesis import settings
 from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
@@ -18,7 +17,7 @@ from soup_nlp.data.scenes.texture import Texture
 from soup_nlp.data.scenes.things import about, placed
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
-from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.geometry.superpixels import segment, split_components
 from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
@@ -34,10 +33,6 @@ from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit, Views
 
 Float = NDArray[np.float64]
-
-# same examples at every run, and no time limit on a busy machine
-settings.register_profile("repeatable", derandomize=True, deadline=None)
-settings.load_profile("repeatable")
 
 WIDTH, HEIGHT = 64, 48
 K_REF = camera.intrinsics(70.0, 72.0, 31.0, 24.5)
@@ -117,12 +112,7 @@ class Tiny:
         )
         self.soup = random_soup(seed + 1, len(self.seg))
         confidence = rng.choice([0.0, 0.5, 1.0], (HEIGHT, WIDTH), p=[0.1, 0.3, 0.6])
-        H = self.soup.homographies(K_REF, K_NEXT)[labels]
-        uv1 = np.concatenate(
-            [camera.pixel_grid(HEIGHT, WIDTH), np.ones((HEIGHT, WIDTH, 1))], axis=-1
-        )
-        y = np.einsum("hwij,hwj->hwi", H, uv1)
-        exact = y[..., :2] / y[..., 2:] - uv1[..., :2]
+        exact = reconstruct(self.soup, labels, K_REF, K_NEXT).flow
         noisy = exact + rng.normal(0, 1.0, exact.shape)
         self.flow = Flow(noisy.astype(np.float32), confidence.astype(np.float32), "test")
         self.data: EnergyData = build_energy_data(

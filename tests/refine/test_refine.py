@@ -13,7 +13,7 @@ from helpers_model import K_NEXT, K_REF, Tiny, random_soup, weights_for, with_gr
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
-from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
@@ -65,12 +65,8 @@ class Planar:
         R = rotation.exp(np.where(left[:, None], [0.0, 0.02, 0.0], [0.03, -0.02, 0.01]))
         T = np.where(left[:, None], [0.08, 0.0, 0.02], [-0.05, 0.04, 0.0])
         self.truth = Soup(np.ones(n), normal, D, R, T)
-        H = self.truth.homographies(K_REF, K_NEXT)[labels]
-        uv = camera.pixel_grid(60, 80)
-        y = np.einsum("hwij,hwj->hwi", H, np.concatenate([uv, np.ones((60, 80, 1))], axis=-1))
-        flow = Flow(
-            (y[..., :2] / y[..., 2:] - uv).astype(np.float32), np.ones((60, 80), np.float32), "test"
-        )
+        uv = reconstruct(self.truth, labels, K_REF, K_NEXT).flow
+        flow = Flow(uv.astype(np.float32), np.ones((60, 80), np.float32), "test")
         data = build_energy_data(seg, flow, K_REF, K_NEXT, 8, seed)
         self.data = in_pixels(data, self.truth, seg)
         self.bad = rng.choice(n, broken, replace=False)
