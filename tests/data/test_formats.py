@@ -1,4 +1,4 @@
-"""Files of flow, depth, cameras and images: golden bytes, round trips, malformed files."""
+"""Files of flow, depth, cameras and images: golden bytes, real and malformed files."""
 
 from __future__ import annotations
 
@@ -10,25 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import put, raises, write_cam, write_dpt, write_flo, write_kitti_flow, write_pfm
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
+from helpers_files import put, raises, write_cam, write_dpt, write_kitti_flow
 
 from soup_nlp.data.formats import camera_files
 from soup_nlp.data.formats import map_files as fmt
 from soup_nlp.data.formats.images import read_image, read_mask
 
-many = settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-shapes = st.tuples(st.integers(1, 7), st.integers(1, 7))
 K = np.array([[688.0, 0.0, 511.5], [0.0, 688.5, 217.5], [0.0, 0.0, 1.0]])
-
-
-def floats(low: float, high: float, *channels: int) -> st.SearchStrategy[np.ndarray]:
-    number = st.floats(low, high, width=32)
-    return shapes.flatmap(lambda s: hnp.arrays(np.float32, (*s, *channels), elements=number))
 
 
 # --- malformed files ----------------------------------------------------------------------------
@@ -157,7 +145,8 @@ def test_a_scale_of_depth_is_positive(scale: float, tmp_path: Path) -> None:
 def test_flo_golden_bytes(tmp_path: Path) -> None:
     golden = struct.pack("<fii4f", 202021.25, 2, 1, 1.5, -2.0, 1e10, 0.0)
     assert golden[:4] == b"PIEH"
-    flow = fmt.read_flow(put(tmp_path / "a.flo", golden))
+    # capital letters are a suffix, too
+    flow = fmt.read_flow(put(tmp_path / "A.FLO", golden))
     np.testing.assert_array_equal(flow, [[[1.5, -2.0], [np.nan, np.nan]]])
 
 
@@ -189,21 +178,10 @@ def test_unknown_flow(tmp_path: Path, mark: float) -> None:
         np.testing.assert_array_equal(fmt.read_flow(path), [[[np.nan, np.nan], [1, 1]]])
 
 
-@many
-@given(flow=floats(-512, 511.875, 2))
-def test_flow_round_trips(tmp_path: Path, flow: np.ndarray) -> None:
-    flow[0, 0] = np.nan
-    # capital letters are a suffix, too
-    write_flo(tmp_path / "A.FLO", 1e6 * flow)
-    np.testing.assert_array_equal(fmt.read_flow(tmp_path / "A.FLO"), 1e6 * flow)
-    write_kitti_flow(tmp_path / "a.png", flow)
-    np.testing.assert_allclose(fmt.read_flow(tmp_path / "a.png"), flow, atol=1 / 128, rtol=0)
-
-
 def test_kitti_flow_channel_order(tmp_path: Path) -> None:
-    rgb = np.array([[[2**15 + 64, 2**15 - 128, 1], [1, 2, 0]]], np.uint16)
+    rgb = np.array([[[2**15 + 96, 2**15 - 128, 1], [1, 2, 0]]], np.uint16)
     flow = fmt.read_flow(stored(tmp_path / "a.png", rgb[:, :, ::-1]))
-    np.testing.assert_array_equal(flow, [[[1.0, -2.0], [np.nan, np.nan]]])
+    np.testing.assert_array_equal(flow, [[[1.5, -2.0], [np.nan, np.nan]]])
 
 
 def test_vkitti_flow(tmp_path: Path) -> None:
@@ -220,33 +198,11 @@ def test_vkitti_flow(tmp_path: Path) -> None:
 # --- depth --------------------------------------------------------------------------------------
 
 
-@many
-@given(depth=floats(0.0009765625, 1e6))
-def test_dpt_and_pfm_round_trip(tmp_path: Path, depth: np.ndarray) -> None:
-    write_dpt(tmp_path / "a.dpt", depth)
-    np.testing.assert_array_equal(fmt.read_depth(tmp_path / "a.dpt"), depth)
-    for scale in ("-1.0", "1.0"):
-        write_pfm(tmp_path / "a.pfm", depth, scale)
-        np.testing.assert_array_equal(fmt.read_depth(tmp_path / "a.pfm"), depth)
-
-
-@many
-@given(
-    code=shapes.flatmap(lambda s: hnp.arrays(np.uint16, s)),
-    scale=st.sampled_from([100, 256, 1000, 5000.0]),
-)
-def test_png16_values(tmp_path: Path, code: np.ndarray, scale: float) -> None:
-    depth = fmt.read_depth_png16(stored(tmp_path / "a.png", code), scale)
-    np.testing.assert_array_equal(np.isnan(depth), code == 0)
-    np.testing.assert_allclose(depth[code > 0], code[code > 0] / scale)
-    np.testing.assert_array_equal(fmt.read_depth(tmp_path / "a.png", scale), depth)
-
-
 def test_unknown_depth(tmp_path: Path) -> None:
     depth = np.array([[1.0, 0.0, -1.0, np.inf, np.nan]])
     np.save(tmp_path / "a.npy", depth)
     write_dpt(tmp_path / "a.dpt", depth)
-    write_pfm(tmp_path / "a.pfm", depth)
+    put(tmp_path / "a.pfm", b"Pf\n5 1\n-1\n" + depth.astype("<f4").tobytes())
     for name in ("a.npy", "a.dpt", "a.pfm"):
         out = fmt.read_depth(tmp_path / name)
         assert out.dtype == np.float64

@@ -36,13 +36,6 @@ def write_cam(path: Path, K: np.ndarray) -> None:
     path.write_bytes(struct.pack("<f21d", 202021.25, *K.ravel(), *np.eye(3, 4).ravel()))
 
 
-def write_pfm(path: Path, values: np.ndarray, scale: str = "-1.0") -> None:
-    """A grey .pfm map; a negative scale is little endian."""
-    order = "<f4" if scale.startswith("-") else ">f4"
-    header = f"Pf\n{values.shape[1]} {values.shape[0]}\n{scale}\n".encode()
-    path.write_bytes(header + values[::-1].astype(order).tobytes())
-
-
 def write_kitti_flow(path: Path, flow: np.ndarray) -> None:
     """A KITTI flow PNG; pixels that are not finite are marked invalid."""
     valid = np.isfinite(flow).all(axis=2)
