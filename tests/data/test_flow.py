@@ -50,7 +50,7 @@ def pair_of(truth: Truth | None = None, size: tuple[int, int] = (60, 80)) -> Pai
     return Pair(first, second, K, K, truth=truth, name="test")
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     height=st.integers(16, 90),
     width=st.integers(16, 90),
@@ -294,15 +294,13 @@ def test_a_first_flow_that_is_half_wrong_is_completed(monkeypatch):
     np.testing.assert_array_equal(same, forward)
 
 
-@pytest.mark.parametrize("planes", [0, 4])
-def test_flow_with_and_without_homographies(planes, monkeypatch):
+@pytest.mark.parametrize(("planes", "least", "most"), [(0, 0.0, 0.3), (4, 0.7, 1.0)])
+def test_only_homographies_find_large_displacements(planes, least, most, monkeypatch):
     monkeypatch.setattr(dis, "PLANES", planes)
-    first, second = images(ROAD)
-    flow = dis.dis_flow(first, second)
-    assert np.isfinite(flow.uv).all()
-    sure = flow.confidence > 0.5
-    assert sure.mean() > 0.3
-    assert np.median(np.linalg.norm(flow.uv - truth(ROAD), axis=-1)[sure]) < 0.3
+    fast = 2 * ROAD - np.eye(3)
+    flow = dis.dis_flow(*images(fast))
+    right = np.linalg.norm(flow.uv - truth(fast), axis=-1) < 1
+    assert least <= (right & (flow.confidence > 0.5)).mean() <= most
 
 
 @pytest.mark.parametrize(("error", "taken"), [(0.2, False), (0.8, True)])
