@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_model import flow_of
-from helpers_truth import cropped
 
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.pair import Flow
+from soup_nlp.data.pair import Flow, Truth
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup, reconstruct
@@ -290,8 +289,10 @@ def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, mon
     """Rendered pairs whose lower part is cropped: contact alone puts cut-off components too far."""
     what = {"kind": "scene", "scene": scene, "seed": seed, "width": 512, "height": 218}
     problem = make_problem({"input": what, "segmentation": {"superpixels": count}})
-    pair = problem.load_pair()
-    pair = replace(cropped(pair, 0, 0, 0, int(0.3 * pair.image_ref.shape[0])), flow=None)
+    pair, upper = problem.load_pair(), slice(153)
+    truth = Truth(pair.truth.depth_ref[upper], components=pair.truth.components[upper])
+    images = pair.image_ref[upper], pair.image_next[upper]
+    pair = replace(pair, image_ref=images[0], image_next=images[1], truth=truth)
     case = prepare(problem, pair=pair)
     shipped = cut_errors(case, case.soup)
     with monkeypatch.context() as context:
