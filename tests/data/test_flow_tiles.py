@@ -5,18 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from test_flow import texture
 
 from soup_nlp.data.flow import dis, tiles
 from soup_nlp.data.flow.tiles import with_tiles
 
 SIZE = (240, 360)
 START, END, RADIUS = np.array([80, 160]), np.array([170, 70]), 40
-
-
-def texture(seed: int, size: tuple[int, int] = SIZE) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(size=size).astype(np.float32)
-    blurred = cv2.GaussianBlur(noise, (0, 0), 3.0)
-    return cv2.normalize(blurred, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 def disk(centre: np.ndarray) -> np.ndarray:
@@ -26,7 +21,7 @@ def disk(centre: np.ndarray) -> np.ndarray:
 
 def frames(surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A disk of a surface at `START`, then at `END`, on a background that moves by (2, 1)."""
-    back = texture(1, (SIZE[0] + 1, SIZE[1] + 2))
+    back = texture(SIZE[0] + 1, SIZE[1] + 2, 1)
     moved = np.roll(surface, tuple((END - START)[::-1]), axis=(0, 1))
     first = np.where(disk(START), surface, back[1:, 2:])
     return first, np.where(disk(END), moved, back[:-1, :-2])
@@ -52,7 +47,7 @@ def completed(
 def test_a_small_surface_that_moves_far_has_flow_by_its_tiles_only(monkeypatch, searched):
     if not searched:
         monkeypatch.setattr(dis, "with_tiles", lambda *a: a[3:])
-    first, second = (np.dstack([image] * 3) for image in frames(texture(2)))
+    first, second = (np.dstack([image] * 3) for image in frames(texture(*SIZE, 2)))
     flow = dis.dis_flow(first, second)
     right = np.linalg.norm(flow.uv - (END - START), axis=-1) < 1
     share = (right & (flow.confidence > 0.5))[disk(START)].mean()
@@ -64,7 +59,7 @@ def test_a_small_surface_that_moves_far_has_flow_by_its_tiles_only(monkeypatch, 
 
 @pytest.mark.parametrize("claimed", [False, True])
 def test_no_flow_ends_where_another_usable_flow_ends(claimed):
-    ref, nxt = frames(texture(2))
+    ref, nxt = frames(texture(*SIZE, 2))
     lost = disk(START) if claimed else disk(START) | disk(END)
     flow, gap, new = completed(ref, nxt, lost)
     if claimed:
@@ -78,8 +73,8 @@ def test_no_flow_ends_where_another_usable_flow_ends(claimed):
 
 
 def test_a_surface_that_is_hidden_in_the_next_image_has_no_flow():
-    ref, _ = frames(texture(2))
-    nxt = texture(1, (SIZE[0] + 1, SIZE[1] + 2))[:-1, :-2]
+    ref, _ = frames(texture(*SIZE, 2))
+    nxt = texture(SIZE[0] + 1, SIZE[1] + 2, 1)[:-1, :-2]
     _, _, new = completed(ref, nxt, disk(START))
     assert not new.any()
 
@@ -87,7 +82,7 @@ def test_a_surface_that_is_hidden_in_the_next_image_has_no_flow():
 def test_a_repeated_texture_has_no_flow(monkeypatch):
     """Bars that look alike: some displacement fits as well as the right one."""
     u = np.arange(SIZE[1])
-    bars = 127 + 100 * np.sin(u / 4) + 0.05 * texture(2)
+    bars = 127 + 100 * np.sin(u / 4) + 0.05 * texture(*SIZE, 2)
     ref = np.rint(bars).astype(np.uint8)
     nxt, lost = np.roll(ref, 50, axis=1), np.ones(SIZE, bool)
     assert not completed(ref, nxt, lost)[2].any()
@@ -98,15 +93,15 @@ def test_a_repeated_texture_has_no_flow(monkeypatch):
 @pytest.mark.parametrize("share", [tiles.CONFIRMED, 1.01])
 def test_a_flow_that_is_usable_on_little_of_its_tiles_is_refused(monkeypatch, share):
     monkeypatch.setattr(tiles, "CONFIRMED", share)
-    _, _, new = completed(*frames(texture(2)), disk(START) | disk(END))
+    _, _, new = completed(*frames(texture(*SIZE, 2)), disk(START) | disk(END))
     assert new.any() == (share < 1)
 
 
 def test_images_of_other_sizes():
     """Tiles for which the next image has no room match nowhere."""
-    ref = texture(2)
+    ref = texture(*SIZE, 2)
     gap = np.full(SIZE, np.inf, np.float32)
     flow = np.zeros((*SIZE, 2), np.float32)
-    for nxt in (texture(3, (60, 90)), texture(3, (20, 30))):
+    for nxt in (texture(60, 90, 3), texture(20, 30, 3)):
         same, _ = with_tiles(ref, nxt, match, flow, gap)
         np.testing.assert_array_equal(same, flow)
