@@ -30,11 +30,6 @@ def png16(path: Path, values: np.ndarray) -> None:
     picture(path, values.astype(np.uint16))
 
 
-def kitti_flow(path: Path, flow: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_kitti_flow(path, flow)
-
-
 def load(kind: str, where: Path, **options: object):
     """The pair of an input at a folder."""
     key = "path" if kind in ("folder", "tum") else "root"
@@ -83,13 +78,9 @@ def test_folder_with_everything(folder: Path) -> None:
     millimetres = load("folder", folder, depth_scale=1.0, unit="mm").truth
     assert millimetres.unit == "mm"
     np.testing.assert_allclose(millimetres.points, [[3.5, 2.5, 550.0]])
-
-
-def test_folder_array_depth_wins_over_png(folder: Path) -> None:
-    png16(folder / "depth.png", np.full((H, W), 1))
+    # an array goes before a picture
     np.save(folder / "depth.npy", np.full((H, W), 7.0))
-    truth = load("folder", folder).truth
-    assert truth.depth_ref[0, 0] == 7.0
+    assert load("folder", folder).truth.depth_ref[0, 0] == 7.0
 
 
 @pytest.mark.parametrize("name", ["frame_0.png", "frame_1.png", "K.txt"])
@@ -139,7 +130,7 @@ def kitti2012(root: Path) -> Path:
     flow = np.ones((H, W, 2))
     flow[0, 0] = np.nan
     png16(base / "disp_occ" / "000007_10.png", disparity)
-    kitti_flow(base / "flow_occ" / "000007_10.png", flow)
+    write_kitti_flow(base / "flow_occ" / "000007_10.png", flow)
     return root
 
 
@@ -186,7 +177,7 @@ def test_kitti2015(tmp_path: Path) -> None:
         "P_rect_02: 100 0 4 5 0 100 3 0 0 0 1 0\nP_rect_03: 100 0 4 -49 0 100 3 0 0 0 1 0\n"
     )
     png16(base / "disp_occ_0" / "000001_10.png", np.full((H, W), 10 * 256))
-    kitti_flow(base / "flow_occ" / "000001_10.png", np.full((H, W, 2), 2.0))
+    write_kitti_flow(base / "flow_occ" / "000001_10.png", np.full((H, W, 2), 2.0))
     picture(base / "obj_map" / "000001_10.png", np.eye(H, W, dtype=np.uint8))
     truth = load("kitti2015", tmp_path, index="1").truth
     assert truth.depth_next is None
@@ -259,8 +250,6 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         DataWarning, match=r"camdata_left.*assumed: the focal length of alley_1, 688 pixels$"
     ):
         assert load("sintel", tmp_path, scene="alley_1", frame=1, render="final").K_ref[0, 0] == 688
-    for kind in ("camdata_left", "depth", "flow"):
-        (base / kind / "cave_2").mkdir(parents=True)
     for number, focal in ((1, 100.0), (2, 120.0)):
         name = f"cave_2/frame_{number:04d}"
         camera = np.array([[focal, 0, 4.0], [0, focal, 3.0], [0, 0, 1]])

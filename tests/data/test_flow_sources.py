@@ -168,7 +168,6 @@ def test_frames_of_other_focal_lengths_have_a_flow(factor: float) -> None:
     zoomed = Pair(pair.image_ref, image, pair.K_ref, K, depth_prior=np.ones((108, 256)))
     flow = FlowOptions().load(zoomed, Path)
     equal = FlowOptions().load(pair, Path)
-    assert pair.truth is not None
     at = np.stack(np.meshgrid(np.arange(256), np.arange(108)), axis=-1)
     # pixel centres are at whole numbers
     true = (at + pair.truth.flow + 0.5) * np.divide(size, (256, 108)) - 0.5 - at
@@ -207,7 +206,6 @@ def test_focal_lengths_that_contradict_the_images_give_a_warning() -> None:
 
 def test_flows_that_do_not_fit_name_their_cause(tmp_path: Path) -> None:
     pair = render_scene("orbit", 0, 256, 108)
-    assert pair.truth is not None
     true, path = pair.truth.flow, tmp_path / "f.flo"
     write_flo(path, true)
     np.testing.assert_allclose(resolve_flow(pair, str(path)).uv, true, rtol=1e-6)
@@ -238,7 +236,7 @@ def test_flows_that_do_not_fit_name_their_cause(tmp_path: Path) -> None:
 def test_a_backward_flow_is_compared_with_the_images_too(change: float, tmp_path: Path) -> None:
     pair = render_scene("orbit", 0, 256, 108)
     back = dis_flow(pair.image_next, pair.image_ref).uv
-    write_flo(tmp_path / "f.flo", pair.truth.flow)  # type: ignore[union-attr]
+    write_flo(tmp_path / "f.flo", pair.truth.flow)
     options = FlowOptions(source="f.flo", backward="b.flo")
     write_flo(tmp_path / "b.flo", back)
     assert (options.load(pair, lambda name: tmp_path / name).confidence > 0).mean() > 0.7

@@ -18,12 +18,12 @@ from soup_nlp.errors import DataError
 def write_flo(path: Path, flow: np.ndarray) -> None:
     """A Middlebury .flo file; unknown flow (not finite) becomes 1e10."""
     values = np.where(np.isfinite(flow).all(axis=2, keepdims=True), flow, 1e10)
-    path.write_bytes(pieh(values.astype("<f4")))
+    put(path, pieh(values.astype("<f4")))
 
 
 def write_dpt(path: Path, depth: np.ndarray) -> None:
     """A Sintel .dpt file."""
-    path.write_bytes(pieh(depth.astype("<f4")))
+    put(path, pieh(depth.astype("<f4")))
 
 
 def pieh(values: np.ndarray) -> bytes:
@@ -33,7 +33,7 @@ def pieh(values: np.ndarray) -> bytes:
 
 def write_cam(path: Path, K: np.ndarray) -> None:
     """A Sintel .cam file of a camera at the origin."""
-    path.write_bytes(struct.pack("<f21d", 202021.25, *K.ravel(), *np.eye(3, 4).ravel()))
+    put(path, struct.pack("<f21d", 202021.25, *K.ravel(), *np.eye(3, 4).ravel()))
 
 
 def write_kitti_flow(path: Path, flow: np.ndarray) -> None:
@@ -41,7 +41,7 @@ def write_kitti_flow(path: Path, flow: np.ndarray) -> None:
     valid = np.isfinite(flow).all(axis=2)
     code = np.rint(np.where(valid[..., None], flow, 0.0) * 64.0 + 2.0**15) * valid[..., None]
     bgr = np.dstack([valid, code[..., 1], code[..., 0]]).astype(np.uint16)
-    cv2.imwrite(str(path), bgr)
+    put(path, cv2.imencode(".png", bgr)[1].tobytes())
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -74,7 +74,8 @@ def write_pair(folder: Path, pair: Pair, names: Sequence[str] = ("a", "b")) -> N
 
 
 def put(path: Path, content: bytes) -> Path:
-    """A file of these bytes."""
+    """A file of these bytes, below folders that it makes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content)
     return path
 

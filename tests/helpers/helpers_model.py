@@ -217,8 +217,6 @@ def plane_world(
 def with_true_flow(pair: Pair) -> Pair:
     """The pair with its exact flow, full confidence wherever it is finite."""
     truth = pair.truth
-    assert truth is not None
-    assert truth.flow is not None
     valid = np.isfinite(truth.flow).all(-1)
     uv = np.where(valid[..., None], truth.flow, 0.0)
     # float64 on purpose: float32 rounding (1e-6 px) would hide an inexact formula

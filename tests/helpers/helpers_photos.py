@@ -41,7 +41,7 @@ def said(*args: object, **keys: object) -> tuple[Pair, str]:
     """A loaded pair and its warnings, all of which are about data."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        pair = load(*args, **keys)  # type: ignore[arg-type]
+        pair = load(*args, **keys)
     assert {w.category for w in caught} <= {DataWarning}
     return pair, "\n".join(str(w.message) for w in caught)
 

@@ -41,8 +41,6 @@ from soup_nlp.sequence.solve import one_camera
 
 pytestmark = pytest.mark.slow
 
-IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
-
 
 def test_the_link_of_two_maps_is_their_median_ratio():
     rng = np.random.default_rng(0)
