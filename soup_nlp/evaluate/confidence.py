@@ -35,11 +35,11 @@ from soup_nlp.start.propose import Start
 
 log = logging.getLogger(__name__)
 
-SIGMA_PRIOR = 1.0
-"""Standard deviation of log depth without any evidence; true scenes have 0.3 (rooms) to 1.2
-(outdoors)."""
+SIGMA_PRIOR = 1.5
+"""Standard deviation of log depth without any evidence, about the median, to which depths refer;
+true scenes have 0.3 (rooms) to 1.4 (roads below a sky)."""
 GUESSED = 2.0
-"""Added in squares, of log depth, where no flow determines depth: 0.89 with the information of the
+"""Added in squares, of log depth, where no flow determines depth: 1.2 with the information of the
 prior, which keeps the order given by the other terms."""
 PRIOR_SHARE = 0.001
 """Factor of E_prior in the information: it is no evidence, but keeps variances finite where there
@@ -59,7 +59,7 @@ FACTOR, POWER = 7.0, 1.25
 """sigma = FACTOR (noise spread)^POWER, with the flow's noise in pixels: docs/confidence.md."""
 BENDING_FACTOR = 0.5
 """sigma = BENDING_FACTOR misfit sqrt(spread) where surfaces bend."""
-BENDING_SIGMA = 0.24
+BENDING_SIGMA = 0.235
 """Least standard deviation of log depth where surfaces bend: without a rigid motion, relief follows
 from the surface's own stretching and not from parallax."""
 LEAST_SPREAD = 0.1

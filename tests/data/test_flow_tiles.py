@@ -97,6 +97,20 @@ def test_a_flow_that_is_usable_on_little_of_its_tiles_is_refused(monkeypatch, sh
     assert new.any() == (share < 1)
 
 
+def test_two_surfaces_do_not_move_to_one_place(monkeypatch):
+    """Two disks look like the one of the next image; each alone would get a flow."""
+    monkeypatch.setattr(tiles, "MUTUAL", np.inf)
+    twin = START + (170, 0)
+    ref, nxt = frames(texture(2))
+    moved = np.roll(ref, tuple((twin - START)[::-1]), axis=(0, 1))
+    both = np.where(disk(twin), moved, ref)
+    places = disk(START), disk(twin)
+    for alone in places:
+        assert completed(both, nxt, alone | disk(END))[2][alone].mean() > 0.5
+    _, _, new = completed(both, nxt, places[0] | places[1] | disk(END))
+    assert sorted(new[place].mean() > 0.5 for place in places) == [False, True]
+
+
 def test_images_of_other_sizes():
     """Tiles for which the next image has no room match nowhere."""
     ref = texture(*SIZE, 2)

@@ -91,6 +91,9 @@ def with_tiles(
             continue
         flow[here][found], gap[here][found] = new[found], new_gap[found]
         confidence[here][found] = new_confidence[found]
+        # the next surface is compared with this one
+        lost = confidence <= _USABLE
+        taken = _ends(flow, ~lost, nxt.shape)
     return flow, gap
 
 
