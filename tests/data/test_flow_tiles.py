@@ -100,7 +100,7 @@ def test_a_flow_that_is_usable_on_little_of_its_tiles_is_refused(monkeypatch, sh
 def test_two_surfaces_do_not_move_to_one_place(monkeypatch):
     """Two disks look like the one of the next image; each alone would get a flow."""
     monkeypatch.setattr(tiles, "MUTUAL", np.inf)
-    twin = START + (170, 0)
+    twin = START + np.array([170, 0])
     ref, nxt = frames(texture(2))
     moved = np.roll(ref, tuple((twin - START)[::-1]), axis=(0, 1))
     both = np.where(disk(twin), moved, ref)
