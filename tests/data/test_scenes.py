@@ -13,10 +13,10 @@ from soup_nlp.data.inputs import SceneInput
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import SCENES, render_scene
 from soup_nlp.data.scenes.everyday import LAYOUTS
-from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, render
 from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Plane, Sheet
 from soup_nlp.data.scenes.texture import Texture, fractal_noise, pulse_coverage, value_noise
-from soup_nlp.data.scenes.things import SceneBuilder, about, placed
+from soup_nlp.data.scenes.things import SceneBuilder, placed
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera
 
@@ -270,11 +270,6 @@ def test_hits_by_hand():
     at = np.array([[0.0, 0.0, -3.0], [1.0, 0.0, 0.0], [0.0, np.sqrt(2), 1.5 * np.sqrt(2)]])
     normal = [[0, 0, -1], [1, 0, 0], np.array([0, 3, 2]) / np.sqrt(13)]
     np.testing.assert_allclose(shape.normals(at), normal, atol=1e-12)
-
-
-def test_a_pose_and_its_inverse():
-    pose = about(turn=[10, -30, 20], shift=[1, 2, 3])
-    np.testing.assert_allclose(inverse(pose) @ pose, np.eye(4), atol=1e-15)
 
 
 def test_points_that_pass_the_camera_have_no_flow():
