@@ -29,6 +29,16 @@ def exp(w: ArrayLike) -> Float:
     return np.eye(3) + a * W + b * (W @ W)
 
 
+def right_jacobian(w: ArrayLike) -> Float:
+    """J (3, 3) with `exp(w + d) = exp(w) exp(J d)` to first order in d, for w (3,)."""
+    w = np.asarray(w, float)
+    angle2, W = w @ w, hat(w)
+    angle = np.sqrt(angle2)
+    a = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    b = (1 - np.sinc(angle / np.pi)) / max(angle2, 1e-30)
+    return np.eye(3) - a * W + b * (W @ W)
+
+
 def log(R: ArrayLike) -> Float:
     """Rotation vectors (..., 3) of rotations (..., 3, 3); angles in [0, pi]."""
     from scipy.spatial.transform import Rotation

@@ -65,12 +65,23 @@ class Matches(NamedTuple):
         """(M,) Sampson distance to a motion, pixels."""
         return sampson(motion.essential(), self.ray, self.target, self.focal)
 
+    def slope(self, motion: Motion) -> Float:
+        """(9, M) derivative of `distance` by the essential matrix, row by row."""
+        r, q, E = self.ray.T, self.target.T, motion.essential()
+        by_q, by_r = E @ r, E.T @ q
+        squared = np.maximum(np.sum(by_q[:2] ** 2 + by_r[:2] ** 2, axis=0), 1e-24)
+        share = np.sum(q * by_q, axis=0) / squared
+        by_q[2] = by_r[2] = 0.0
+        # the numerator is q^T E r, and the root of `squared` is the denominator
+        by_E = (q - share * by_q)[:, None] * r - (share * q)[:, None] * by_r
+        return self.focal / np.sqrt(squared) * by_E.reshape(9, -1)
+
 
 def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
-    """Sampson distance (...) of rays r, q (..., 3) under E (3, 3), times focal: pixels."""
-    by_q, by_r = r @ E.T, q @ E
-    squared = np.sum(by_q[..., :2] ** 2 + by_r[..., :2] ** 2, axis=-1)
-    return focal * np.sum(q * by_q, axis=-1) / np.sqrt(np.maximum(squared, 1e-24))
+    """(M,) Sampson distance of rays r, q (M, 3) under E (3, 3), times focal: pixels."""
+    by_q, by_r = E @ r.T, E.T @ q.T
+    squared = np.sum(by_q[:2] ** 2 + by_r[:2] ** 2, axis=0)
+    return focal * np.sum(q.T * by_q, axis=0) / np.sqrt(np.maximum(squared, 1e-24))
 
 
 def estimate(matches: Matches, threshold: float = 1.0, seed: int = 0) -> Motion | None:
@@ -151,8 +162,12 @@ def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
     def residual(x: Float) -> Float:
         return root * matches.distance(moved(x))
 
+    def jacobian(x: Float) -> Float:
+        return (root * (essential_slope(motion, x) @ matches.slope(moved(x)))).T
+
     for _ in range(REFINEMENTS):
-        x = least_squares(residual, x, loss="cauchy", f_scale=scale, max_nfev=STEPS).x
+        fit = least_squares(residual, x, jacobian, loss="cauchy", f_scale=scale, max_nfev=STEPS)
+        x = fit.x
         error = np.abs(residual(x))
         near = error[error < max(3 * scale, LEAST_NOISE)]
         noise = 1.5 * float(np.median(near)) if len(near) else scale
@@ -216,6 +231,16 @@ def around(motion: Motion) -> Callable[[Float], Motion]:
         return Motion(motion.R @ rotation.exp(x[:3]), t / np.linalg.norm(t))
 
     return moved
+
+
+def essential_slope(motion: Motion, x: Float) -> Float:
+    """(5, 9) derivative of the essential matrix of `around(motion)(x)`, row by row, by x."""
+    basis, moved = tangent(motion.t), around(motion)(x)
+    by_turn = moved.essential() @ rotation.hat(rotation.right_jacobian(x[:3]).T)
+    # the translation is scaled to unit length
+    along = basis - np.outer(basis @ moved.t, moved.t)
+    by_shift = rotation.hat(along / np.linalg.norm(motion.t + x[3:] @ basis)) @ moved.R
+    return np.concatenate([by_turn, by_shift]).reshape(5, 9)
 
 
 def fit_translation(R: Float, matches: Matches, noise: float, rounds: int = 6) -> Motion:

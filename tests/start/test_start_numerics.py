@@ -118,6 +118,19 @@ def test_flow_without_confidence_does_not_change_a_motion():
     assert tilt < 1e-5
 
 
+@pytest.mark.parametrize("size", [0.0, 0.3])
+def test_the_derivative_of_the_distance_is_that_of_differences(size):
+    m, r, q = rigid(50)
+    rng = np.random.default_rng(2)
+    noisy = q + np.column_stack([rng.normal(0, 0.05, (50, 2)), np.zeros(50)])
+    matches, moved = Matches(r, noisy, np.ones(50), FOCAL), epipolar.around(m)
+    x, step = size * rng.normal(size=5), 1e-5
+    by_x = epipolar.essential_slope(m, x) @ matches.slope(moved(x))
+    for k, way in enumerate(step * np.eye(5)):
+        change = matches.distance(moved(x + way)) - matches.distance(moved(x - way))
+        np.testing.assert_allclose(by_x[k], change / (2 * step), atol=1e-6 * np.abs(by_x).max())
+
+
 @pytest.mark.parametrize("position", [0, 1, 2])
 def test_the_essential_matrix_that_explains_most_is_taken(monkeypatch, position):
     m, r, q = rigid(100)
