@@ -56,14 +56,10 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
     curved_rows, row_constant = np.zeros(ng, bool), np.zeros(ng)
     curved_objective, objective_constant = False, 0.0
     stamped = []
-    linear: list[tuple[Float, Int, Int]] = [(np.zeros(0), np.zeros(0, int), np.zeros(0, int))]
+    linear: list[tuple[Float, Int, Int]] = []
     for group in groups:
         name, table = group.kernel.name, group.table
-        if not group.size:
-            continue
         parts = split(group, theta)
-        if not parts.nonlinear.numel():
-            continue
         template = make_template(name, parts.nonlinear, group, theta)
         for values in (*template.numbers.values(), parts.coefficient):
             if not np.isfinite(values).all():
@@ -156,7 +152,7 @@ def split(group: Group, theta: Float) -> Split:
     """
     kernel, table = group.kernel, group.table
     given = [part for part in (kernel.objective, kernel.constraints) if part is not None]
-    out = ca.densify(ca.vertcat(ca.SX(0, 1), *given))
+    out = ca.densify(ca.vertcat(*given))
     # before the split, since a piecewise constant part such as sign(a) has a zero derivative and
     # would look linear
     trace(kernel.name, out, group, theta)
@@ -177,5 +173,5 @@ def split(group: Group, theta: Float) -> Split:
             removed = ca.vertcat(*[kernel.x[int(j)] for j in gone])
             part = ca.substitute(part, removed, ca.SX.zeros(len(gone)))
         parts.append(part)
-    nonlinear = ca.densify(ca.cse(ca.vertcat(*parts))) if parts else ca.SX(0, 1)
+    nonlinear = ca.densify(ca.cse(ca.vertcat(*parts)))
     return Split(nonlinear, row, column, linear, coefficient, kernel.objective is not None)

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import casadi as ca
 import numpy as np
 import pytest
 from helpers_model import PAPER, Tiny
@@ -17,11 +16,9 @@ from scipy import sparse
 from soup_nlp.errors import ExportError
 from soup_nlp.export import verify
 from soup_nlp.export.nl import write_nl
-from soup_nlp.export.program import make_program
 from soup_nlp.export.sol import Sol, read_sol, write_sol
 from soup_nlp.export.verify import bound_multipliers, kind, least_squares_multipliers
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.solve.kkt import optimality
 
 ORDER = np.array([2, 0, 1])
@@ -189,22 +186,6 @@ def test_residuals_are_within_a_few_times_the_tolerance(place):
         found = np.zeros(3)
         found[place] = factor * verify.SLACK * bounds[place]
         assert verify.Residuals(*found.tolist(), "", found, found).within(limits) is good
-
-
-def test_groups_without_elements_are_passed_over():
-    x, none = ca.SX.sym("x"), ca.SX.sym("none", 0)
-    groups = []
-    for name, index in (("first", [0]), ("empty", []), ("last", [1])):
-        kernel = Kernel(name, x, none, ca.SX.sym("theta", 0), objective=ca.sqrt(x))
-        table = Table(
-            np.array(index, int).reshape(-1, 1),
-            np.zeros((len(index), 0)),
-            np.zeros((len(index), 0), int),
-        )
-        groups.append(Group(kernel, table))
-    program = make_program(groups, 2, 0, np.zeros(0))
-    assert program.in_objective.tolist() == [True, True]
-    assert len(program.stamped) == 2
 
 
 def test_a_row_of_residuals_says_whether_it_holds():
