@@ -18,7 +18,7 @@ from soup_nlp.export.nl import NLFile, suffixes_of, write_nl
 from soup_nlp.export.verify import examine
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Coordinates, Formulation
-from soup_nlp.model.layout import GAUGES, MatrixLayout, TangentLayout
+from soup_nlp.model.layout import GAUGES, Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import NormForm
 from soup_nlp.pipeline.record import Case
@@ -186,7 +186,7 @@ def export_case(
 
 
 def _description(
-    case: Case, form: Formulation, nlp: NLP, layout: MatrixLayout | TangentLayout, file: NLFile
+    case: Case, form: Formulation, nlp: NLP, layout: Layout, file: NLFile
 ) -> dict[str, Any]:
     """Entries of the manifest that follow from the problem and its .nl file."""
     return {
@@ -209,7 +209,7 @@ def _description(
     }
 
 
-def fingerprint(case: Case, nlp: NLP, layout: MatrixLayout | TangentLayout) -> dict[str, float]:
+def fingerprint(case: Case, nlp: NLP, layout: Layout) -> dict[str, float]:
     """f and |g| at the proposal with all slack variables and switches at 1/2."""
     x = np.full(nlp.nx, 0.5)
     x[: layout.size] = layout.pack(case.start.soup)

@@ -19,7 +19,7 @@ from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import ENERGY_SLACK, FEASIBLE, Kind, examine, kind, violations
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.layout import Layout, MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run
@@ -116,7 +116,7 @@ def foreign_run(
     case: Case,
     form: Formulation,
     nlp: NLP,
-    layout: MatrixLayout | TangentLayout,
+    layout: Layout,
     answer: Sol,
     source: str,
 ) -> Run:

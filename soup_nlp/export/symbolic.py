@@ -14,7 +14,7 @@ from soup_nlp.config.problem import Problem, load_problem
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.formulation import Coordinates
 from soup_nlp.model.kernel import Hessian
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import prepare
@@ -39,7 +39,7 @@ class SymbolicNLP:
 
     case: Case
     record: NLP
-    layout: MatrixLayout | TangentLayout
+    layout: Layout
     x: ca.MX
     p: ca.MX
     f: ca.MX

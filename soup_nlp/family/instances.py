@@ -24,7 +24,7 @@ from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.pipeline.case import build_energy, solver_options
@@ -189,7 +189,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
 
 def build_instance(
     case: Case, record: Frozen, formulation: str, start: str
-) -> tuple[NLP, MatrixLayout | TangentLayout, Formulation]:
+) -> tuple[NLP, Layout, Formulation]:
     """The NLP of a formulation at a start, its layout and its formulation.
 
     Args:
@@ -208,9 +208,7 @@ def build_instance(
     return nlp, layout, form
 
 
-def _program(
-    case: Case, record: Frozen, soup: Soup, form: Formulation
-) -> tuple[NLP, MatrixLayout | TangentLayout]:
+def _program(case: Case, record: Frozen, soup: Soup, form: Formulation) -> tuple[NLP, Layout]:
     """The NLP at a soup. The base of tangent coordinates is the record's start, rounded where it
     may be: its rotations stay orthogonal, as they are decoded."""
     if form.coordinates == "matrix":

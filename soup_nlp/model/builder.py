@@ -12,9 +12,10 @@ import casadi as ca
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
-from soup_nlp.model.elements import Element, Layout, Norms
+from soup_nlp.model.elements import Element, Norms
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
+from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import NormForm, solver_form
 from soup_nlp.model.superpixel import View

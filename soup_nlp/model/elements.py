@@ -13,11 +13,9 @@ from soup_nlp.arrays import Float, Int
 from soup_nlp.model import terms
 from soup_nlp.model.energy_data import PAPER_TERMS, EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.layout import Layout
 from soup_nlp.model.norms import Norm
 from soup_nlp.model.superpixel import View
-
-Layout = TangentLayout | MatrixLayout
 
 
 class Norms(NamedTuple):

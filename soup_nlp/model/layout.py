@@ -200,6 +200,9 @@ class TangentLayout:
         return [f"{s}[{i}]" for i in range(self.count) for s in labels]
 
 
+Layout = MatrixLayout | TangentLayout
+
+
 def _turned(a: Float) -> Float:
     """(N, 9) variables of the other chart; the map is its own inverse."""
     return np.column_stack([1 / a[:, 0], a[:, 1:3] / a[:, :1], a[:, 3:]])

@@ -23,7 +23,7 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.layout import Layout, MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
@@ -74,7 +74,7 @@ class Case:
         options, eps = dict(self.problem.formulation), self.options.eps
         return Formulation.make({**options, "eps": eps, "eps_pixel": eps, **changes})
 
-    def nlp(self, form: Formulation) -> tuple[NLP, MatrixLayout | TangentLayout]:
+    def nlp(self, form: Formulation) -> tuple[NLP, Layout]:
         """The NLP of a formulation at the case's soup; tangent coordinates are about the start."""
         energy = self.data, self.weights, form
         if form.coordinates == "matrix":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from helpers_files import sets
 from helpers_nl import ReadBack, close
 from scipy import sparse
 
+from soup_nlp.bench.solvers.plugins import find_program
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError, ExportError
@@ -304,7 +304,7 @@ def test_suffixes_say_kind_and_superpixel(tmp_path):
 
 
 def test_pounce_takes_the_multipliers(tmp_path):
-    command = shutil.which("pounce") or shutil.which(str(Path(sys.executable).parent / "pounce"))
+    command = find_program("pounce")
     if command is None:
         pytest.skip("pounce is not installed")
     words = ["-o", str(tmp_path), *TINY, "--superpixels", "16", "--suffixes"]

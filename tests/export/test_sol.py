@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +10,7 @@ import pytest
 from helpers_model import PAPER, Tiny
 from scipy import sparse
 
+from soup_nlp.bench.solvers.plugins import find_program
 from soup_nlp.errors import ExportError
 from soup_nlp.export import verify
 from soup_nlp.export.nl import write_nl
@@ -112,7 +110,7 @@ def test_wrong_files_are_refused(tmp_path, old, new, said):
 
 @pytest.mark.slow
 def test_multipliers_of_a_foreign_optimum(tmp_path):
-    pounce = shutil.which("pounce") or shutil.which(str(Path(sys.executable).parent / "pounce"))
+    pounce = find_program("pounce")
     if pounce is None:
         pytest.skip("pounce (pounce-solver) is not installed")
     tiny = Tiny(neighbours=2, samples=1, boundary_samples=1)

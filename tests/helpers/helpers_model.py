@@ -24,7 +24,7 @@ from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import GAUGES as GAUGES
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.layout import Layout, MatrixLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.reweighting import in_pixels
@@ -166,9 +166,7 @@ def wiggle(nlp: NLP, layout_size: int, seed: int, size: float) -> Float:
     return np.clip(x, nlp.lbx + 1e-3, nlp.ubx - 1e-3)
 
 
-def exact_terms(
-    x: Float, data: EnergyData, weights: Weights, layout: MatrixLayout | TangentLayout
-) -> dict[str, float]:
+def exact_terms(x: Float, data: EnergyData, weights: Weights, layout: Layout) -> dict[str, float]:
     """Exact energy by term of a solver's vector, from the norms of the symbolic terms."""
     matrix = isinstance(layout, MatrixLayout)
     view, option = (matrix_view, layout.gauge) if matrix else (tangent_view, layout.chart)

@@ -24,7 +24,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
@@ -46,7 +46,7 @@ class Task:
     """
 
     nlp: NLP
-    layout: MatrixLayout | TangentLayout
+    layout: Layout
     soup: Soup
     data: EnergyData
     weights: Weights

@@ -42,7 +42,7 @@ from soup_nlp.family.instances import build_instance, case_of, parse_name, probl
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import MatrixLayout, TangentLayout
+from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
@@ -52,7 +52,7 @@ from soup_nlp.storage.rows import Job, Row, failure, measure_all, one_thread, re
 from soup_nlp.storage.versions import versions
 
 Label = Mapping[str, Any]
-Build = Callable[[], tuple[NLP, MatrixLayout | TangentLayout, Formulation]]
+Build = Callable[[], tuple[NLP, Layout, Formulation]]
 Labelled = tuple[Label, Callable[[], Task]]
 """Entries of the rows of a task, and what makes the task."""
 
