@@ -21,6 +21,7 @@ from soup_nlp.model.formulation import Coordinates, Formulation
 from soup_nlp.model.layout import GAUGES, Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import NormForm
+from soup_nlp.model.symbolic import Graph
 from soup_nlp.pipeline.record import Case
 from soup_nlp.storage.files import read_json, write_text
 from soup_nlp.storage.folders import claim, staged
@@ -162,10 +163,11 @@ def export_case(
         lam_g = None if duals is None else duals.lam_g
         file = write_nl(new / f"{STUB}.nl", nlp, lam_g, segments if suffixes else ())
         if "casadi" in formats:
+            graph = Graph(nlp)
             for function in FUNCTIONS:
                 # the file writer of CasADi ignores a full disk
                 text = ca.StringSerializer()
-                text.pack(getattr(nlp.graph, function))
+                text.pack(getattr(graph, function))
                 write_text(new / f"{function}.casadi", text.encode())
         write_text(new / "problem.yaml", dump_problem(case.problem))
         manifest = {
@@ -236,7 +238,7 @@ def _write_start_h5(path: Path, nlp: NLP, attrs: dict[str, object], info: Inform
     vectors = {key: getattr(nlp, key) for key in ("x0", "lbx", "ubx", "lbg", "ubg")}
     tree = {
         **{key: np.asarray(value, float).ravel() for key, value in vectors.items()},
-        "p": nlp.graph.p,
+        "p": Graph(nlp).p,
         "x_names": nlp.x_names(),
         "g_names": nlp.g_names(),
         "at_start": {

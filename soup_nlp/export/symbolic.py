@@ -16,6 +16,7 @@ from soup_nlp.model.formulation import Coordinates
 from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.symbolic import Graph
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
@@ -109,6 +110,6 @@ def nlp(
         made = build_tangent_nlp(case.soup, case.data, case.weights, form)
     record, layout = made
     x, p = ca.MX.sym("x", record.nx), ca.MX.sym("p", len(record.theta))
-    graph = record.graph
+    graph = Graph(record)
     f, g = graph.oracle(x, ca.vertcat(p, graph.p[len(record.theta) :]))
     return SymbolicNLP(case, record, layout, x, p, f, g, Functions(record))

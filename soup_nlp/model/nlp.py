@@ -14,7 +14,6 @@ from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group, Hessian
 from soup_nlp.model.pattern import Pattern, hessian_entries, jacobian_entries
 from soup_nlp.model.sums import Sum, summed
-from soup_nlp.model.symbolic import Graph
 
 
 @dataclass(frozen=True)
@@ -128,13 +127,6 @@ class NLP:
         """Of the Hessian's upper triangle; places for every group."""
         entries = partial(hessian_entries, self.groups, self.hessian_kind)
         return Pattern((self.nx, self.nx), entries)
-
-    @cached_property
-    def graph(self) -> Graph:
-        """The same functions as CasADi's graph: what the exports write and `nlpsol` may
-        differentiate."""
-        patterns = self.jacobian_pattern, self.hessian_pattern
-        return Graph(self.groups, self.thetas(), *patterns, self.hessian_kind)
 
     @property
     def nx(self) -> int:

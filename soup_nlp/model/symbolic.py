@@ -13,8 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float
-from soup_nlp.model.kernel import Group
+from soup_nlp.model.nlp import NLP
 from soup_nlp.model.pattern import Pattern
 
 
@@ -25,34 +24,11 @@ class Graph:
         p: (np,) values of the parameters: theta, then the data of every group, by elements.
     """
 
-    def __init__(
-        self,
-        groups: Sequence[Group],
-        theta: Float,
-        jacobian: Pattern,
-        hessian: Pattern,
-        hessian_kind: str,
-    ) -> None:
-        """For groups that are not empty, and the patterns of their derivatives.
-
-        Args:
-            groups: Kernels and tables.
-            theta: Values of the shared parameters.
-            jacobian: Of g's Jacobian (ng x nx).
-            hessian: Of the upper triangle of the Lagrangian's Hessian.
-            hessian_kind: One of kernel.HESSIANS.
-        """
-        self._groups, self._first = groups, [g.kernel.first_order() for g in groups]
-        self._jacobian, self._hessian, self._kind = jacobian, hessian, hessian_kind
-        self._thetas = len(theta)
-        self.p = np.concatenate([theta, *(g.table.data.ravel() for g in groups)])
-        ng, nx = jacobian.shape
-        sizes = {"x": nx, "p": len(self.p), "lam_g": ng, "lam_f": 1}
+    def __init__(self, nlp: NLP) -> None:
+        self._nlp, self._first = nlp, [g.kernel.first_order() for g in nlp.groups]
+        self.p = np.concatenate([nlp.thetas(), *(g.table.data.ravel() for g in nlp.groups)])
+        sizes = {"x": nlp.nx, "p": len(self.p), "lam_g": nlp.ng, "lam_f": 1}
         self._x, self._p, self._lam_g, self._lam_f = (ca.MX.sym(*size) for size in sizes.items())
-
-    def parameters(self, theta: Float) -> Float:
-        """p with other values of theta."""
-        return np.concatenate([theta, self.p[self._thetas :]])
 
     @cached_property
     def oracle(self) -> ca.Function:
@@ -63,7 +39,7 @@ class Graph:
     def grad_f(self) -> ca.Function:
         """(x, p) -> f, gradient."""
         local = self._local("grad", self._first)
-        places = [g.table.index for g, v in zip(self._groups, self._first) if "grad" in v]
+        places = [g.table.index for g, v in zip(self._nlp.groups, self._first) if "grad" in v]
         return self._function(
             "nlp_grad_f", {"f": self._f, "grad_f_x": _sum(self._x.numel(), places, local)}
         )
@@ -71,17 +47,18 @@ class Graph:
     @cached_property
     def jac_g(self) -> ca.Function:
         """(x, p) -> g, Jacobian (ng x nx sparse)."""
-        jac = _matrix(self._jacobian, self._local("jac", self._first))
+        jac = _matrix(self._nlp.jacobian_pattern, self._local("jac", self._first))
         return self._function("nlp_jac_g", {"g": self._g, "jac_g_x": jac})
 
     @cached_property
     def hess_lag(self) -> ca.Function:
         """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
-        second = [g.kernel.second_order(self._kind) for g in self._groups]
+        nlp = self._nlp
+        second = [g.kernel.second_order(nlp.hessian_kind) for g in nlp.groups]
         local = self._local("hess", [{"hess": h} if h else {} for h in second])
         symbols = [self._x, self._p, self._lam_f, self._lam_g]
         names = ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
-        return ca.Function("nlp_hess_l", symbols, [_matrix(self._hessian, local)], *names)
+        return ca.Function("nlp_hess_l", symbols, [_matrix(nlp.hessian_pattern, local)], *names)
 
     @cached_property
     def _f(self) -> ca.MX:
@@ -89,7 +66,7 @@ class Graph:
 
     @cached_property
     def _g(self) -> ca.MX:
-        places = [g.table.rows for g, v in zip(self._groups, self._first) if "con" in v]
+        places = [g.table.rows for g, v in zip(self._nlp.groups, self._first) if "con" in v]
         return _sum(self._lam_g.numel(), places, self._local("con", self._first))
 
     def _function(self, name: str, outputs: Mapping[str, ca.MX]) -> ca.Function:
@@ -99,15 +76,16 @@ class Graph:
 
     def _local(self, key: str, functions: Sequence[Mapping[str, ca.Function]]) -> list[ca.MX]:
         """A function of every group that has it over its table, element by element."""
-        at, out = self._thetas, []
-        for group, own_functions in zip(self._groups, functions):
+        at, out = len(self._nlp.theta), []
+        theta = self._p[:at]
+        for group, own_functions in zip(self._nlp.groups, functions):
             size, width = group.table.data.shape
             data = ca.reshape(self._p[at : at + size * width], width, size)
             at += size * width
             if key not in own_functions:
                 continue
             x = ca.reshape(self._x[_list(group.table.index)], group.kernel.nx, size)
-            given = [x, data, ca.repmat(self._p[: self._thetas], 1, size)]
+            given = [x, data, ca.repmat(theta, 1, size)]
             if key == "hess":
                 rows = _list(group.table.rows)
                 lam_c = ca.reshape(self._lam_g[rows], -1, size) if rows else ca.MX(0, size)

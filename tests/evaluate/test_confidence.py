@@ -35,6 +35,7 @@ from soup_nlp.evaluate.information import information, learned, marginals, sprea
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.symbolic import Graph
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.selected_inverse import BlockCholesky, layers
@@ -217,14 +218,15 @@ def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room, mon
             break
     newton = inverse(x, "exact")
     assert np.abs(newton @ nlp.gradient(x, theta)).max() < 1e-9
-    parameters, targets = _with_targets(nlp, wide)
+    graph = Graph(nlp)
+    targets = _targets(nlp)
     rng = np.random.default_rng(0)
     spread = np.empty((draws, n))
     for k in range(draws):
-        p = parameters.copy()
+        p = np.concatenate([theta, graph.p[len(theta) :]])
         p[targets] += rng.normal(0, noise, targets.shape)
-        y = x - newton @ np.asarray(nlp.graph.grad_f(x, p)[1]).ravel()
-        y -= newton @ np.asarray(nlp.graph.grad_f(y, p)[1]).ravel()
+        y = x - newton @ np.asarray(graph.grad_f(x, p)[1]).ravel()
+        y -= newton @ np.asarray(graph.grad_f(y, p)[1]).ravel()
         spread[k] = -np.log(y[::9] / x[::9])
     at = layout.unpack(x)
     S = fixed_mean(information(at, data, weights, FORM).matrix.toarray())
@@ -238,16 +240,15 @@ def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room, mon
     assert np.mean(np.abs(ratio - 1) < 0.2) > 0.9
 
 
-def _with_targets(nlp: NLP, smoothing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters of the NLP, and positions (E, 2) of the flow's targets among them."""
-    p = nlp.graph.parameters(nlp.thetas(eps=smoothing, eps_pixel=smoothing))
+def _targets(nlp: NLP) -> np.ndarray:
+    """Positions (E, 2) of the flow's targets among the parameters of the NLP's graph."""
     offset = len(nlp.theta)
     for group in nlp.groups:
         rows, width = group.table.data.shape
         if group.kernel.name == "t_proj":
             names = [group.kernel.row[k].name() for k in range(width)]
             columns = [k for k, name in enumerate(names) if name.startswith("target")]
-            return p, offset + width * np.arange(rows)[:, None] + columns
+            return offset + width * np.arange(rows)[:, None] + columns
         offset += rows * width
     raise AssertionError("no re-projection")
 

@@ -27,6 +27,7 @@ from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, kind, table_text, violations
 from soup_nlp.model import oracle
+from soup_nlp.model.symbolic import Graph
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.kkt import WARM
 from soup_nlp.solve.stages import solve_soup
@@ -97,7 +98,7 @@ def test_casadi_and_hdf5_agree_with_the_nlp(exported):
         close(oracle(x0, p)[1], file["at_start/g"][:])
         stored = file["at_start/hess_lag/value"][:]
         assert file["x_names"].asstr()[0] == "lam[0]"
-        assert np.array_equal(p, nlp.graph.p)
+        assert np.array_equal(p, Graph(nlp).p)
         for name in ("x0", "lbx", "ubx", "lbg", "ubg"):
             assert np.array_equal(file[name][:], getattr(nlp, name))
         row, column, value, shape = (

@@ -28,6 +28,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.symbolic import Graph
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
 # --- layouts -------------------------------------------------------------------------------------
@@ -133,7 +134,7 @@ def test_sizes_are_those_of_the_formulation():
     # orientation has no epigraph (a square is smooth)
     assert slack.sizes()["variables"] == 16 * n + norms
     assert slack.sizes()["inequalities"] == 9 * n + norms
-    assert sizes["jacobian_nonzeros"] == nlp.nnzj == nlp.graph.jac_g.nnz_out(1)
+    assert sizes["jacobian_nonzeros"] == nlp.nnzj == Graph(nlp).jac_g.nnz_out(1)
 
 
 def test_the_print_shows_sizes_and_sparsity():

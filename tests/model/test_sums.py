@@ -18,6 +18,7 @@ from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.lanes import LANES, Summed, compile_lanes
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.symbolic import Graph
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
@@ -109,8 +110,8 @@ def test_the_functions_that_ipopt_takes_are_those_of_the_graph(case, compiled, g
     form = Formulation(compiled=compiled, gauge=gauge, norm=norm)
     nlp, _ = build_matrix_nlp(case.soup, case.data, case.weights, form)
     x, lam_f, lam_g = nlp.x0, 0.7, np.random.default_rng(3).normal(size=nlp.ng)
-    fast, graph, theta = Functions(nlp), nlp.graph, nlp.thetas(eps=0.05)
-    p = graph.parameters(theta)
+    fast, graph, theta = Functions(nlp), Graph(nlp), nlp.thetas(eps=0.05)
+    p = np.concatenate([theta, graph.p[len(theta) :]])
     one, two = [fast.hess_lag(x, theta, lam_f, lam_g)], [graph.hess_lag(x, p, lam_f, lam_g)]
     for name in ("oracle", "grad_f", "jac_g"):
         one += getattr(fast, name)(x, theta)

@@ -27,6 +27,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.symbolic import Graph
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.ipopt import DEFAULTS
@@ -201,8 +202,8 @@ def plugin(name: str, task: Task) -> Answer:
     x, functions = ca.MX.sym("x", nlp.nx), Functions(nlp)
     # these libraries differentiate f and g at set-up, in spite of cached derivatives
     symbolic = library in ("bonmin", "uno")
-    program = (nlp.graph.oracle, nlp.graph.p) if symbolic else (functions.oracle, nlp.thetas())
-    f, g = program[0](x, program[1])
+    graph = Graph(nlp) if symbolic else None
+    f, g = graph.oracle(x, graph.p) if graph else functions.oracle(x, nlp.thetas())
     common: dict[str, Any] = {
         "print_time": False,
         "show_eval_warnings": False,
