@@ -31,8 +31,10 @@ SYSTEMATIC, LEAST_PX, MOST_PX = 4.0, 0.01, 0.07
 REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
 with the diameter of the superpixel."""
-LEAST_GAP = 3.0
-"""Least gain of depth over a turn alone in explaining the flow, in units of the flow's noise."""
+LEAST_GAP, TURNS = 3.0, 9e-5
+"""Least gains of depth over a turn alone in explaining the flow: in units of the flow's noise, and
+relative to the longer side of the image. Scenes before a camera that turns or is at rest gain up to
+7.4e-5 of it, and those with parallax at least 1.1e-4 (alley_1)."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
 """Pixels of a fit of a rotation or of the least median error, and the least scale of the latter's
 refinement, pixels."""
@@ -51,10 +53,11 @@ def systematic_error(noise: float) -> float:
 def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
     """The camera's (3, 3) rotation, if a turn explains the flow of the main motion without depth.
 
-    It does if the main rigid motion, with depths, lowers the error by no more than the systematic
-    error of the flow, or `LEAST_GAP` noises, in the median, which movers assigned to that motion do
-    not change. A zoom and a shift of the next image are free there, because they leave a residual
-    that depths explain; the rotation itself, which a shift can replace, is that of the plain turn.
+    It does if the main rigid motion, with depths, lowers the error by no more than `TURNS` longer
+    sides of the image, or `LEAST_GAP` noises, in the median, which movers assigned to that motion
+    do not change. A zoom and a shift of the next image are free there, because they leave a
+    residual that depths explain; the rotation itself, which a shift can replace, is that of the
+    plain turn.
     """
     at = np.flatnonzero(flow.views.usable & (choice.label == 0))
     if not len(at):
@@ -62,7 +65,7 @@ def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
     views = flow.views.subset(at)
     gain = np.median(fit_turn(views, ANY_TURN)[1] - choice.fit.cost[at, 0])
     noise = reference_noise(flow.residual)
-    if gain > max(systematic_error(noise), LEAST_GAP * noise):
+    if gain > max(TURNS * max(flow.seg.labels.shape), LEAST_GAP * noise):
         return None
     return fit_turn(views)[0]
 
