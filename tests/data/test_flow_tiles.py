@@ -101,7 +101,7 @@ def test_two_surfaces_do_not_move_to_one_place(monkeypatch):
     """Two disks look like the one of the next image; each alone would get a flow."""
     monkeypatch.setattr(tiles, "MUTUAL", np.inf)
     twin = START + np.array([170, 0])
-    ref, nxt = frames(texture(2))
+    ref, nxt = frames(texture(*SIZE, 2))
     moved = np.roll(ref, tuple((twin - START)[::-1]), axis=(0, 1))
     both = np.where(disk(twin), moved, ref)
     places = disk(START), disk(twin)
