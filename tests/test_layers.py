@@ -70,37 +70,29 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
-def for_types(tree: ast.AST) -> set[ast.AST]:
-    """Nodes under `if TYPE_CHECKING:`."""
-    return {
-        inner
-        for node in ast.walk(tree)
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-        for line in node.body
-        for inner in ast.walk(line)
-    }
-
-
-def imports(tree: ast.AST, module: str, is_package: bool, types: bool = True) -> Iterator[str]:
+def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[str, bool]]:
     """Absolute names that a module imports, also inside functions and by `import_module`.
 
-    Imports for types alone are left out unless `types`.
+    With each name comes whether it is imported for types alone, under `if TYPE_CHECKING:`.
     """
-    left_out = set() if types else for_types(tree)
-    for node in ast.walk(tree):
-        if node in left_out:
+    left = [(tree, False)]
+    while left:
+        node, typed = left.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            left += [(line, True) for line in node.body] + [(line, typed) for line in node.orelse]
             continue
+        left += [(inner, typed) for inner in ast.iter_child_nodes(node)]
         if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
-            yield from (a.value for a in node.args if isinstance(a, ast.Constant))
+            yield from ((a.value, typed) for a in node.args if isinstance(a, ast.Constant))
         elif isinstance(node, ast.Import):
-            yield from (a.name for a in node.names)
+            yield from ((a.name, typed) for a in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
                 home = f"soup_nlp.{module}".rstrip(".").split(".")
                 keep = len(home) - node.level + is_package
                 base = ".".join([*home[:keep], *([base] if base else [])])
-            yield from (f"{base}.{a.name}" for a in node.names)
+            yield from ((f"{base}.{a.name}", typed) for a in node.names)
 
 
 def own(name: str) -> str | None:
@@ -113,24 +105,23 @@ def own(name: str) -> str | None:
     return inner
 
 
-def graph(types: bool) -> tuple[dict[str, set[str]], dict[str, set[str]]]:
-    """(own modules, foreign libraries) that every module imports; `types` as in `imports`."""
-    inside: dict[str, set[str]] = {}
-    outside: dict[str, set[str]] = {}
-    for module, path in MODULES.items():
-        inside[module], outside[module] = set(), set()
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for name in imports(tree, module, path.name == "__init__.py", types):
-            target = own(name)
-            if target is None:
-                outside[module].add(name.partition(".")[0])
-            elif target != module:
-                inside[module].add(target)
-    return inside, outside
-
-
-INSIDE, OUTSIDE = graph(types=False)
-WITH_TYPES, _ = graph(types=True)
+INSIDE: dict[str, set[str]] = {module: set() for module in MODULES}
+"""Own modules that every module imports, those for types alone left out."""
+WITH_TYPES: dict[str, set[str]] = {module: set() for module in MODULES}
+"""The same with those for types alone."""
+OUTSIDE: dict[str, set[str]] = {module: set() for module in MODULES}
+"""Foreign libraries that every module imports, those for types alone left out."""
+for importer, file in MODULES.items():
+    parsed = ast.parse(file.read_text(encoding="utf-8"))
+    for name, for_types in imports(parsed, importer, file.name == "__init__.py"):
+        target = own(name)
+        if target is None:
+            if not for_types:
+                OUTSIDE[importer].add(name.partition(".")[0])
+        elif target != importer:
+            WITH_TYPES[importer].add(target)
+            if not for_types:
+                INSIDE[importer].add(target)
 
 
 def room(module: str) -> str:
@@ -144,10 +135,9 @@ def test_the_parser_sees_the_imports():
     assert "casadi" in OUTSIDE["model.kernel"]
     tree = ast.parse("def f():\n    from ..model import nlp\n    from . import costs")
     found = set(imports(tree, "refine.mppbp", False))
-    assert found == {"soup_nlp.model.nlp", "soup_nlp.refine.costs"}
+    assert found == {("soup_nlp.model.nlp", False), ("soup_nlp.refine.costs", False)}
     tree = ast.parse("if TYPE_CHECKING:\n    import a\nelse:\n    import_module('soup_nlp.b')")
-    assert set(imports(tree, "errors", False)) == {"a", "soup_nlp.b"}
-    assert set(imports(tree, "errors", False, types=False)) == {"soup_nlp.b"}
+    assert set(imports(tree, "errors", False)) == {("a", True), ("soup_nlp.b", False)}
     assert own("soup_nlp.model.nlp.NLP") == "model.nlp"
     assert own("soup_nlp.__version__") == ""
     assert own("soup_nlpx") is None
