@@ -43,14 +43,13 @@ class Seen:
         self.pair = pair.with_flow(flow_from_truth(pair))
         self.seg = build_segmentation(segment(pair.image_ref, 150), pair.image_ref)
         flow_data = self.pair.flow, pair.K_ref, pair.K_next
-        self.start: Start = propose(FlowFit.of(self.seg, *flow_data, SeededStart()))
+        self.fitted = FlowFit.of(self.seg, *flow_data, SeededStart())
+        self.start: Start = propose(self.fitted)
         self.depth = pair.truth.depth_ref
         self.anchor = rays(pair.K_ref, self.seg.anchors)
 
     def by(self, prior: np.ndarray, kind: str | None = None) -> tuple[Start, Given]:
-        pair = replace(self.pair, depth_prior=prior)
-        fitted = FlowFit.of(self.seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
-        start_data = self.start, pair, fitted
+        start_data = self.start, replace(self.pair, depth_prior=prior), self.fitted
         return by_prior(*start_data, judged(*start_data, kind))
 
     def error(self, start: Start) -> np.ndarray:
