@@ -174,7 +174,7 @@ def moving(pair: Pair, depth: Float) -> Row | None:
         return None
     z = depth * depth_metrics(depth, gt).scale
     masks = {"mre": moves, "rest": static}
-    return {k: depth_metrics(z, gt, UNSCALED, m).mre for k, m in masks.items()}
+    return {k: depth_metrics(z, np.where(m, gt, np.nan), UNSCALED).mre for k, m in masks.items()}
 
 
 def _scene_flow(result: Run, scale: float) -> dict[str, float | int] | None:

@@ -63,11 +63,6 @@ class Convention:
                 expected="a depth in the unit of the truth, such as 70",
             )
 
-    def __str__(self) -> str:
-        rule = "no scale" if self.scale == "none" else f"one {self.scale} scale"
-        cap = "no cap" if self.cap is None else f"z <= {self.cap:g}"
-        return f"{rule} per image, {cap}"
-
     def mask(self, truth: ArrayLike) -> Mask:
         """Pixels of a truth (H, W) or (M,) that count."""
         gt = np.asarray(truth, np.float64)
@@ -101,7 +96,7 @@ class DepthMetrics:
         scale_rule: How s was chosen: "median", "mre", "lsq" or "none".
         scale: The factor s on the estimate.
         cap: Truth beyond this depth was left out, in the unit of the truth; None for no cap.
-        coverage: Share of the true pixels (after cap and mask) that have an estimate.
+        coverage: Share of the true pixels (within the cap) that have an estimate.
         n_pixels: Number of pixels that the errors are over.
     """
 
@@ -129,10 +124,7 @@ class DepthMetrics:
 
 
 def depth_metrics(
-    estimate: ArrayLike,
-    truth: ArrayLike,
-    convention: Convention = MEDIAN,
-    mask: ArrayLike | None = None,
+    estimate: ArrayLike, truth: ArrayLike, convention: Convention = MEDIAN
 ) -> DepthMetrics:
     """Errors of an estimated depth, after one global scale s on the estimate.
 
@@ -143,22 +135,20 @@ def depth_metrics(
         estimate: z in any unit, any shape ((H, W) map or (M,) vector); NaN where unknown.
         truth: True z, same shape; NaN where unknown.
         convention: Which pixels are true, and how s is chosen.
-        mask: Bool, same shape; False leaves a pixel out. None keeps all.
 
     Raises:
         DataError: shapes differ, or no pixel has a truth to compare with.
     """
     z, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
-    keep = np.ones(gt.shape, bool) if mask is None else np.asarray(mask, bool)
-    if not z.shape == gt.shape == keep.shape:
+    if z.shape != gt.shape:
         raise DataError(
-            "estimate, truth and mask of a depth differ in shape",
-            found=f"estimate {z.shape}, truth {gt.shape}, mask {keep.shape}",
+            "estimate and truth of a depth differ in shape",
+            found=f"estimate {z.shape}, truth {gt.shape}",
             hint="sample a dense estimate at sparse points with sample_at_points",
         )
-    true = convention.mask(gt) & keep
+    true = convention.mask(gt)
     if not true.any():
-        raise DataError("no pixel has a true depth to compare with, within cap and mask")
+        raise DataError("no pixel has a true depth to compare with, within the cap")
     compared = true & np.isfinite(z) & (z > 0)
     coverage = np.count_nonzero(compared) / np.count_nonzero(true)
     z, gt = z[compared], gt[compared]

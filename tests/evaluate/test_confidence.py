@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_model import directional
 from scipy import sparse
 
 from soup_nlp.config.problem import make_problem
@@ -32,11 +33,9 @@ from soup_nlp.evaluate.confidence import (
     scale_by_contact,
 )
 from soup_nlp.evaluate.information import information, learned, marginals, spread_in_image
+from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.nlp import NLP
-from soup_nlp.model.symbolic import Graph
-from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.selected_inverse import BlockCholesky, layers
 from soup_nlp.start.choice import LEAST_NOISE
@@ -175,82 +174,37 @@ def test_calibration_is_capped_where_nothing_is_known():
     assert calibrated(np.array([0.5]), 0.1)[0] ** -2 == pytest.approx(alone**-2 + SIGMA_PRIOR**-2)
 
 
-@pytest.mark.slow
-def test_predicted_variances_are_those_of_many_draws_of_the_flow(small_room, monkeypatch):
-    """Gaussian noise on the flow: log depths of 100 answers spread as the information predicts.
-
-    Without truncation and with a smoothing wider than all residuals the energy is nearly quadratic:
-    `w |r|^2 / (2 eps)` a norm. The gradient's covariance under noise of variance s^2 is then
-    s^2 times the information F of E_proj with weights w^2 / eps, and that of the answer
-    `S F S s^2` with the inverse S of the whole information.
-    """
-    draws, wide, noise = 100, 300.0, 0.05
+def test_the_information_is_that_of_measured_pixels(small_room, monkeypatch):
+    """With a smoothing wider than all errors it is w / eps times the squared motion of pixels."""
+    wide = 300.0
     monkeypatch.setattr(information_module, "SMOOTHING", wide)
-    data, n = small_room.data, len(small_room)
+    others = dict.fromkeys(("arap", "cont", "orient", "prior", "depth", "order"), 0.0)
+    weights = small_room.weights.replace(**others, sigma_proj=np.inf)
+    data, info = small_room.data, information(small_room.soup, small_room.data, weights, FORM)
+
+    def pixels(x):
+        soup = info.layout.unpack(x)
+        return project(data.K_next, soup.moved(soup.points(data.pixel_ray)))
+
+    x = info.layout.pack(small_room.soup)
+    x.reshape(-1, 9)[:, :3] = info.plane
+    direction = np.random.default_rng(0).normal(size=len(x))
+    squared = np.sum(directional(pixels, x, direction, 1e-4) ** 2, axis=-1)
+    expected = weights.proj * np.sum(data.pixel_weight * squared) / wide
+    assert direction @ info.matrix @ direction == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("term", ["arap", "proj", "cont", "prior"])
+def test_a_smoothing_wider_than_all_errors_divides_the_information(term, small_room, monkeypatch):
     free = dict.fromkeys(("sigma_proj", "sigma_cont", "sigma_cont_ref", "sigma_arap"), np.inf)
-    weights = small_room.weights.replace(**free, sigma_orient=np.inf)
-    reweighted, layout = build_tangent_nlp(
-        small_room.soup, data, weights, majorant(FORM), "inverse-depth"
-    )
-    programs = {"reweighted": reweighted, "exact": replace(reweighted, hessian_kind="exact")}
-    theta = reweighted.thetas(eps=wide, eps_pixel=wide)
-    nlp, mean = reweighted, np.zeros(9 * n)
-    mean[::9] = -small_room.segmentation.sizes / small_room.segmentation.sizes.sum()
-
-    def fixed_mean(matrix: np.ndarray) -> np.ndarray:
-        """Inverse with the mean log depth fixed."""
-        scale = 1 / np.sqrt(np.abs(matrix.diagonal()))
-        row = mean * scale / np.linalg.norm(mean * scale)
-        inner = matrix * np.outer(scale, scale)
-        kkt = np.block([[inner, row[:, None]], [row[None], np.zeros((1, 1))]])
-        return np.linalg.inv(kkt)[:-1, :-1] * np.outer(scale, scale)
-
-    def inverse(x: np.ndarray, kind: str) -> np.ndarray:
-        return fixed_mean(programs[kind].hessian(x, np.zeros(nlp.ng), theta=theta).toarray())
-
-    x = nlp.x0.copy()
-    for k in range(40):
-        step = inverse(x, "reweighted" if k < 30 else "exact") @ nlp.gradient(x, theta)
-        while nlp.value(x - step, theta) > nlp.value(x, theta) and np.abs(step).max() > 1e-9:
-            step = step / 2
-        x = x - step
-        if k >= 30 and np.abs(step).max() < 1e-12:
-            break
-    newton = inverse(x, "exact")
-    assert np.abs(newton @ nlp.gradient(x, theta)).max() < 1e-9
-    graph = Graph(nlp)
-    targets = _targets(nlp)
-    rng = np.random.default_rng(0)
-    spread = np.empty((draws, n))
-    for k in range(draws):
-        p = np.concatenate([theta, graph.p[len(theta) :]])
-        p[targets] += rng.normal(0, noise, targets.shape)
-        y = x - newton @ np.asarray(graph.grad_f(x, p)[1]).ravel()
-        y -= newton @ np.asarray(graph.grad_f(y, p)[1]).ravel()
-        spread[k] = -np.log(y[::9] / x[::9])
-    at = layout.unpack(x)
-    S = fixed_mean(information(at, data, weights, FORM).matrix.toarray())
-    other = dict.fromkeys(("arap", "cont", "orient", "prior"), 0.0)
-    flow = replace(data, pixel_weight=(weights.proj * data.pixel_weight) ** 2 / wide)
-    F = information(at, flow, weights.replace(**other, proj=1.0), FORM).matrix.toarray()
-    predicted = noise * np.sqrt((S @ F @ S).diagonal()[::9])
-    ratio = spread.std(axis=0) / predicted
-    # the standard deviation of 100 draws has an error of 7 %
-    assert abs(np.median(ratio) - 1) < 0.1
-    assert np.mean(np.abs(ratio - 1) < 0.2) > 0.9
-
-
-def _targets(nlp: NLP) -> np.ndarray:
-    """Positions (E, 2) of the flow's targets among the parameters of the NLP's graph."""
-    offset = len(nlp.theta)
-    for group in nlp.groups:
-        rows, width = group.table.data.shape
-        if group.kernel.name == "t_proj":
-            names = [group.kernel.row[k].name() for k in range(width)]
-            columns = [k for k, name in enumerate(names) if name.startswith("target")]
-            return offset + width * np.arange(rows)[:, None] + columns
-        offset += rows * width
-    raise AssertionError("no re-projection")
+    none = dict.fromkeys(("arap", "proj", "cont", "orient", "prior", "depth", "order"), 0.0)
+    weights = small_room.weights.replace(**free, **none | {term: 1.0}, sigma_orient=np.inf)
+    sizes = []
+    for wide in (300.0, 600.0):
+        monkeypatch.setattr(information_module, "SMOOTHING", wide)
+        info = information(small_room.soup, small_room.data, weights, FORM)
+        sizes.append(np.abs(info.matrix).sum())
+    assert sizes[0] == pytest.approx(2 * sizes[1], rel=1e-3)
 
 
 def sure_of(case, data=None, weights=None):

@@ -55,14 +55,14 @@ def test_scale_rules(rule, scale):
     assert recompute.scores(z, gt, rule, None)["scale"] == pytest.approx(scale, rel=1e-12)
 
 
-def test_coverage_cap_and_mask():
+def test_coverage_and_cap():
     truth = np.array([[1.0, 2.0, np.nan], [4.0, 100.0, 0.0]])
     estimate = np.array([[1.0, np.nan, 5.0], [4.0, 100.0, 1.0]])
     m = depth_metrics(estimate, truth)
     assert (m.n_pixels, m.coverage) == (3, 0.75)
     m = depth_metrics(estimate, truth, Convention(cap=4.0))
     assert (m.n_pixels, m.coverage, m.cap) == (2, pytest.approx(2 / 3), 4.0)
-    m = depth_metrics(estimate, truth, mask=truth == 2.0)
+    m = depth_metrics(estimate, np.where(truth == 2.0, truth, np.nan))
     assert (m.n_pixels, m.coverage) == (0, 0.0)
     assert np.isnan(m.mre)
 
@@ -158,7 +158,6 @@ def test_scene_flow_epe():
     ("score", "words"),
     [
         (lambda: depth_metrics([1.0], [1.0, 2.0]), "differ in shape"),
-        (lambda: depth_metrics([1.0], [1.0], mask=[True, False]), "mask"),
         (lambda: depth_metrics([1.0], [np.nan]), "no pixel"),
         (lambda: depth_metrics([1.0], [1.0], Convention(cap=0.5)), "no pixel"),
         (lambda: Convention(scale="mean"), "unknown scale rule"),

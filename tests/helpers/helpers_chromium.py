@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -153,8 +152,3 @@ class Chromium:
             address = params["request"]["url"]
             if not address.startswith(("data:", "blob:")):
                 self.requests.append(address)
-
-
-def file_address(path: Path) -> str:
-    """Address of a local file."""
-    return path.resolve().as_uri()

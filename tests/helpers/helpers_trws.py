@@ -1,4 +1,4 @@
-"""Plain loops of the original TRW-S, brute force and random problems."""
+"""The original TRW-S node by node, brute force and random problems."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ def textbook(unary, edges, tables, sequence, iterations):
     def gamma(v):
         return 1.0 / max(len(ahead[v]), len(behind[v]))
 
+    def sent(v, e, total):
+        """The message that a node sends along an arc."""
+        table = arcs[e][2] if arcs[e][0] == v else arcs[e][2].T
+        return np.min((gamma(v) * total - message[e])[:, None] + table, axis=0)
+
     bounds, energies, labellings = [], [], []
     for _ in range(iterations):
         for v in sequence:
             total = belief(v)
             for e in ahead[v]:
-                table = arcs[e][2]
-                out = np.empty(table.shape[1])
-                for x in range(table.shape[1]):
-                    out[x] = min(
-                        gamma(v) * total[y] - message[e][y] + table[y, x] for y in range(len(total))
-                    )
+                out = sent(v, e, total)
                 message[e] = out - out.min()
         bound = 0.0
         for v in reversed(sequence):
@@ -52,12 +52,7 @@ def textbook(unary, edges, tables, sequence, iterations):
             bound += total.min()
             total -= total.min()
             for e in behind[v]:
-                table = arcs[e][2]
-                out = np.empty(table.shape[0])
-                for y in range(table.shape[0]):
-                    out[y] = min(
-                        gamma(v) * total[x] - message[e][x] + table[y, x] for x in range(len(total))
-                    )
+                out = sent(v, e, total)
                 bound += out.min()
                 message[e] = out - out.min()
         labels = np.zeros(len(unary), int)

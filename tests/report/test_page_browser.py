@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from helpers_chromium import Chromium, file_address, find_chromium
+from helpers_chromium import Chromium, find_chromium
 
 from soup_nlp.report.page import MODES, page
 from soup_nlp.report.pictures import pictures
@@ -30,7 +30,7 @@ def browser(small_run, tmp_path_factory):
     path.write_text(page(shown, pictures(shown)), encoding="utf-8")
     assert CHROMIUM is not None
     chromium = Chromium(CHROMIUM, 1000, 800)
-    chromium.open(file_address(path))
+    chromium.open(path.resolve().as_uri())
     yield chromium
     chromium.close()
 
