@@ -184,20 +184,23 @@ STORED = {
 """Pairs of the stored tables by the beginning of their row in a document."""
 
 
-def stored_scores():
-    """{(pair, flow): (solution, constant)}; older pages have tables of their own for KITTI."""
+def cells(page: str, head: str) -> list[list[str]]:
+    """Cells of the table of a page whose first row begins so, without the rule below that row."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    lines = text[text.index(f"\n{head}") + 1 :].partition("\n\n")[0].splitlines()
+    return [[c.strip() for c in line.split("|")[1:-1]] for line in (lines[0], *lines[2:])]
+
+
+RESULTS = ("results/accuracy/rendered.md", "results/accuracy/shared.md")
+
+
+def stored_scores() -> dict[tuple[str, ...], list[str]]:
+    """MRE of solution and constant depth by pair and flow."""
     out = {}
-    for name in ("rendered", "shared"):
-        text = (ROOT / "results" / "accuracy" / f"{name}.md").read_text(encoding="utf-8")
-        for part in re.split(r"^## ", text, flags=re.MULTILINE):
-            if part.startswith(("MRE, paper", "MRE, kitti", "MRE, one")):
-                rows = [[c.strip() for c in line.split("|")[1:-1]] for line in part.splitlines()]
-                head = next(row for row in rows if row[:1] == ["pair, flow"])
-                at = [head.index("solution"), head.index("constant")]
-                own = [row for row in rows if len(row) == len(head)]
-                flows = (", truth", ", dis")
-                cells = {r[0]: [r[k] for k in at] for r in own if r[0].endswith(flows)}
-                out |= {tuple(pair.rsplit(", ", 1)): found for pair, found in cells.items()}
+    for page in RESULTS:
+        head, *rows = cells(page, "| pair, flow | solution |")
+        at = [head.index("solution"), head.index("constant")]
+        out |= {tuple(row[0].rsplit(", ", 1)): [row[k] for k in at] for row in rows}
     return out
 
 
@@ -217,36 +220,23 @@ def fits(cell, numbers):
 
 @pytest.mark.parametrize("page", ["README.md", "docs/results.md"])
 def test_scores_are_those_of_the_stored_tables(page):
-    scores, text = stored_scores(), (ROOT / page).read_text(encoding="utf-8")
-    (table,) = re.findall(r"^\| pair \| true flow \|.*\n\|[-|]+\n((?:\|.*\n)+)", text, re.MULTILINE)
-    for line in table.splitlines():
-        cells = [c.strip() for c in line.split("|")[1:-1]]
-        pairs = STORED[max((k for k in STORED if cells[0].startswith(k)), key=len)]
+    scores = stored_scores()
+    for row in cells(page, "| pair | true flow |")[1:]:
+        pairs = STORED[max((k for k in STORED if row[0].startswith(k)), key=len)]
         for cell, flow, column in ((1, "truth", 0), (2, "dis", 0), (3, "dis", 1)):
             numbers = [scores[p, flow][column] for p in pairs if (p, flow) in scores]
-            said = cells[cell].partition(", not")[0]
-            assert fits(said, numbers) or (not said and flow == "truth"), (line, numbers)
+            said = row[cell].partition(", not")[0]
+            assert fits(said, numbers) or (not said and flow == "truth"), (row, numbers)
 
 
 def test_the_table_of_sigma_is_that_of_the_stored_tables():
-    stored = {}
-    for name in ("rendered", "shared"):
-        text = (ROOT / "results" / "accuracy" / f"{name}.md").read_text(encoding="utf-8")
-        text = text[text.index("| sequence | flow | pairs | mre ") :]
-        head, *rows = (
-            [c.strip() for c in line.split("|")[1:-1]]
-            for line in text.partition("\n\n")[0].splitlines()
-        )
+    stored, said = {}, {}
+    for page in RESULTS:
+        head, *rows = cells(page, "| sequence | flow | pairs | mre ")
         at = [head.index(key) for key in ("pairs", "AUSE", "guess", "within 1", "within 2")]
         stored |= {r[0]: [float(r[k]) for k in at] for r in rows if r[1] == "dis"}
-    text = (ROOT / "docs" / "confidence.md").read_text(encoding="utf-8")
-    (table,) = re.findall(
-        r"^\| family \| pairs \| AUSE.*\n\|[-|]+\n((?:\|.*\n)+)", text, re.MULTILINE
-    )
-    said = {}
-    for line in table.splitlines():
-        family, *cells = (c.strip() for c in line.split("|")[1:-1])
-        said[family] = [float(c.rstrip(" %")) / (100 if "%" in c else 1) for c in cells if c]
+    for family, *row in cells("docs/confidence.md", "| family | pairs | AUSE")[1:]:
+        said[family] = [float(c.rstrip(" %")) / (100 if "%" in c else 1) for c in row if c]
     mean = said.pop(f"mean of {len(stored)} families")
     assert said.keys() == stored.keys()
     for family, numbers in said.items():
