@@ -54,33 +54,6 @@ PAIR = "soup_nlp.Pair(image_ref, image_next, K_ref)"
 """How a pair is made, for messages."""
 
 
-class _Clock:
-    """Wall time by stage, and a place to stop between the stages before there is a start."""
-
-    def __init__(
-        self, stop: threading.Event | None, listener: Callable[[str], None] | None = None
-    ) -> None:
-        self.stop, self.listener, self.last = stop, listener, time.perf_counter()
-        self.seconds: dict[str, float] = {}
-
-    def __call__(self, stage: str) -> None:
-        """End a stage.
-
-        Raises:
-            StoppedError: the run is to stop, and there is no start yet.
-        """
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
-        self.last = now
-        if self.listener:
-            self.listener(stage)
-        if self.stop and self.stop.is_set() and stage in ("load", "flow", "segmentation"):
-            raise StoppedError(
-                "interrupted before there was a start: nothing to write",
-                where=f"after stage {stage}",
-            )
-
-
 def run(
     problem: Problem,
     *,
@@ -116,26 +89,36 @@ def run(
             expect(call, (FunctionType, NoneType), name, "a function, such as print, or None")
     expect(stop, (threading.Event, NoneType), "stop", "threading.Event(), or None")
     expect(ipopt_log, (str, NoneType), "ipopt_log", "the name of a file, or None")
-    clock = _Clock(stop, on_stage)
+    seconds, begin = dict[str, float](), time.perf_counter()
+
+    def ended(stage: str) -> None:
+        """Add the wall time of a stage; without a start, a stop ends the run here."""
+        seconds[stage] = time.perf_counter() - begin - sum(seconds.values())
+        if on_stage:
+            on_stage(stage)
+        if stop and stop.is_set() and stage in ("load", "flow", "segmentation"):
+            what = "interrupted before there was a start: nothing to write"
+            raise StoppedError(what, where=f"after stage {stage}")
+
     watch = Watch(listener, stop or threading.Event(), log or (lambda line: None), ipopt_log)
-    case = prepare(problem, pair=pair, log=log, on_stage=clock)
+    case = prepare(problem, pair=pair, log=log, on_stage=ended)
 
     if problem.refine.enabled and problem.refine.from_start:
         solution = skipped(case)
     else:
         energy = case.data, case.weights, case.formulation()
         solution = solve_soup(case.start.soup, *energy, case.options, watch=watch)
-        clock("nlp")
+        ended("nlp")
     refined = None
     if problem.refine.enabled:
         refined = _refined(case, solution.soup, watch)
         if log:
             log(str(refined))
-        clock("refine")
+        ended("refine")
     done = make_run(case, solution, refined)
-    clock("evaluation")
+    ended("evaluation")
     parts = {f"nlp_{k}": v for k, v in solution.seconds.items()}
-    return replace(done, seconds={**clock.seconds, **parts})
+    return replace(done, seconds={**seconds, **parts})
 
 
 def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
