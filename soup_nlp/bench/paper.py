@@ -18,7 +18,6 @@ from soup_nlp.bench.suites import MOTORCYCLE, RENDERED, Options, list_suite, spr
 from soup_nlp.config.presets import overrides_of
 from soup_nlp.errors import DataError, SoupError
 from soup_nlp.pipeline.record import Run
-from soup_nlp.storage.files import atomic_path
 from soup_nlp.storage.rows import Row
 
 METHODS: Mapping[str, Overrides] = {"preset: paper": PAPER, "defaults": ()}
@@ -219,5 +218,4 @@ def write_maps(path: Path, result: Run) -> None:
         maps["truth"] = pair.truth.depth_ref.astype(np.float32)
     small = {name: m[::step, ::step] for name, m in maps.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **small)
+    np.savez_compressed(path, allow_pickle=False, **small)

@@ -22,7 +22,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from soup_nlp.config.problem import Problem, make_problem
-from soup_nlp.storage.files import atomic_path
 from soup_nlp.storage.rows import Job, MeasureRows, Row, attempt, measure_all, reason
 
 if TYPE_CHECKING:
@@ -242,6 +241,5 @@ def panels(
 
 
 def save(out: Figure, path: Path) -> None:
-    """Write a figure as PNG file, whole or not at all."""
-    with atomic_path(path) as temporary:
-        out.savefig(temporary, format="png", metadata={"Software": ""})
+    """Write a figure as PNG file."""
+    out.savefig(path, format="png", metadata={"Software": ""})

@@ -72,7 +72,7 @@ def write_nl(
     """Write an NLP of kernels and tables; names go to `.col` and `.row` beside the file.
 
     Args:
-        path: The .nl file; written whole or not at all.
+        path: The .nl file.
         nlp: The NLP; its Hessian does not matter.
         lam_g: (ng,) multipliers of the start in CasADi's sign, for the segment of initial duals.
         suffixes: Suffixes of variables and rows.

@@ -154,7 +154,7 @@ def write_sol(
     message: str = "",
     code: int = 0,
 ) -> None:
-    """Write an answer as a .sol file, whole or not at all.
+    """Write an answer as a .sol file.
 
     Args:
         path: The file.

@@ -178,7 +178,7 @@ def check_sol(path: Path) -> Verdict:
 
 
 def write_results(path: Path, rows: list[dict[str, Any]], note: dict[str, Any]) -> None:
-    """Write results, whole or not at all.
+    """Write results.
 
     `note` has entries that hold for all rows, such as machine and limits.
     """

@@ -148,7 +148,7 @@ def overview(drawn: Mapping[str, Picture], title: str) -> Image:
 
 
 def write_png(path: PathLike, rgb: Image) -> None:
-    """Write an (H, W, 3) uint8 RGB image as PNG, whole or not at all."""
+    """Write an (H, W, 3) uint8 RGB image as PNG."""
     _encode(path, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 

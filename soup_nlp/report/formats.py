@@ -15,7 +15,7 @@ from soup_nlp.geometry.rotation import log
 from soup_nlp.report.figures import write_clipped_depth_png16
 from soup_nlp.report.models import AXES, write_cloud, write_colmap, write_glb
 from soup_nlp.report.result import FRAMES, Result
-from soup_nlp.storage.files import atomic_path, write_bytes, write_text
+from soup_nlp.storage.files import write_bytes, write_text
 from soup_nlp.storage.store import write_json
 
 CONVENTIONS = {
@@ -100,33 +100,31 @@ def _rrd(folder: Path, result: Result) -> list[str]:
             where=folder,
             hint="pip install 'soup-nlp[rerun]'",
         ) from error
-    path = folder / "scene.rrd"
     poses = np.eye(4), result.components.camera.inverse.matrix
-    with atomic_path(path) as temporary:
-        out = rr.RecordingStream("soup_nlp")
-        out.save(temporary)
-        out.log("world", rr.ViewCoordinates.RDF, static=True)
-        for frame in (0, 1):
-            out.set_time("frame", sequence=frame)
-            pose, image = poses[frame], result.images[frame]
-            camera = rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
-            out.log("world/camera", camera)
-            size = [image.shape[1], image.shape[0]]
-            out.log(
-                "world/camera/image", rr.Pinhole(image_from_camera=result.K[frame], resolution=size)
-            )
-            out.log("world/camera/image/rgb", rr.Image(image).compress(jpeg_quality=92))
-            depth = np.nan_to_num(result.depths[frame]).astype(np.float32)
-            out.log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
-            points = result.points[frame] @ pose[:3, :3].T + pose[:3, 3]
-            of_pixel = result.components.of_pixel
-            for part in result.components:
-                chosen = result.sure & (of_pixel == part.label)
-                name = "background" if part.label == 0 else f"component_{part.label}"
-                cloud = rr.Points3D(points[chosen], colors=result.images[0][chosen])
-                out.log(f"world/{name}", cloud)
-        out.flush()
-        out.disconnect()
+    out = rr.RecordingStream("soup_nlp")
+    out.save(folder / "scene.rrd")
+    out.log("world", rr.ViewCoordinates.RDF, static=True)
+    for frame in (0, 1):
+        out.set_time("frame", sequence=frame)
+        pose, image = poses[frame], result.images[frame]
+        camera = rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
+        out.log("world/camera", camera)
+        size = [image.shape[1], image.shape[0]]
+        out.log(
+            "world/camera/image", rr.Pinhole(image_from_camera=result.K[frame], resolution=size)
+        )
+        out.log("world/camera/image/rgb", rr.Image(image).compress(jpeg_quality=92))
+        depth = np.nan_to_num(result.depths[frame]).astype(np.float32)
+        out.log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
+        points = result.points[frame] @ pose[:3, :3].T + pose[:3, 3]
+        of_pixel = result.components.of_pixel
+        for part in result.components:
+            chosen = result.sure & (of_pixel == part.label)
+            name = "background" if part.label == 0 else f"component_{part.label}"
+            cloud = rr.Points3D(points[chosen], colors=result.images[0][chosen])
+            out.log(f"world/{name}", cloud)
+    out.flush()
+    out.disconnect()
     return ["scene.rrd"]
 
 

@@ -36,7 +36,7 @@ def write_ply(
     scalars: Mapping[str, ArrayLike] | None = None,
     comments: Sequence[str] = (),
 ) -> int:
-    """Write a coloured point cloud (binary little endian, float32 and uchar) atomically.
+    """Write a coloured point cloud (binary little endian, float32 and uchar).
 
     Points with a number that is not a finite float32 are left out.
 

@@ -76,7 +76,7 @@ def write_h5(
     attrs: Mapping[str, object],
     rows: Mapping[str, Row] = MappingProxyType({}),
 ) -> None:
-    """Write a result file, whole or not at all.
+    """Write a result file.
 
     Each array becomes a dataset with the attributes `units`, `description` and `shape_letters`;
     each mapping a group. The root gets `attrs` (None is left out; values without a type of HDF5 are
@@ -212,7 +212,7 @@ def _builtin(obj: object) -> Any:
 
 
 def write_json(path: PathLike, obj: object) -> None:
-    """Write an object as JSON (see `plain`), whole or not at all; two-space indent, UTF-8.
+    """Write an object as JSON (see `plain`); two-space indent, UTF-8.
 
     Raises:
         DataError: the object holds a type that JSON does not have, or the file cannot be written.

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import json
 import os
-import stat
-from contextlib import nullcontext
 from dataclasses import dataclass
 
 import h5py
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import atomic_path, write_text
+from soup_nlp.storage.files import write_text
 from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import parse_table, require, write_h5, write_json
 from soup_nlp.storage.versions import versions
@@ -31,55 +29,6 @@ def tree():
         "none": np.zeros((0, 3)),
         "group": {},
     }
-
-
-# --- atomic ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("error", [None, RuntimeError, KeyboardInterrupt])
-def test_atomic_replaces_a_file_whole_or_not_at_all(error, tmp_path):
-    target = tmp_path / "a.json"
-    target.write_text("old")
-
-    def write():
-        with atomic_path(target) as temporary:
-            assert (temporary.parent, temporary.suffix) == (tmp_path, ".json")
-            temporary.write_text("new")
-            assert target.read_text() == "old"
-            if error:
-                raise error
-
-    with pytest.raises(error) if error else nullcontext():
-        write()
-    assert target.read_text() == ("old" if error else "new")
-    assert os.listdir(tmp_path) == ["a.json"]
-
-
-def test_atomic_permissions(tmp_path):
-    target = tmp_path / "a.txt"
-    umask = os.umask(0o027)
-    try:
-        with atomic_path(target) as temporary:
-            temporary.write_text("x")
-        assert stat.S_IMODE(target.stat().st_mode) == 0o640
-        target.chmod(0o604)
-        with atomic_path(str(target)) as temporary:
-            temporary.write_text("y")
-        assert stat.S_IMODE(target.stat().st_mode) == 0o604
-    finally:
-        os.umask(umask)
-
-
-@pytest.mark.parametrize("name", ["", "no/a", "removed"])
-def test_atomic_bad_targets(name, tmp_path):
-    def write():
-        with atomic_path(tmp_path / name) as temporary:
-            if name == "removed":
-                temporary.unlink()
-
-    with pytest.raises(DataError, match="cannot be written"):
-        write()
-    assert os.listdir(tmp_path) == []
 
 
 # --- HDF5 -----------------------------------------------------------------------------------
@@ -228,3 +177,10 @@ def test_versions():
 def test_text_of_names_that_are_no_utf8_is_written(tmp_path):
     write_text(tmp_path / "log.txt", "folder \udcff")
     assert (tmp_path / "log.txt").read_text() == "folder \\udcff"
+
+
+@pytest.mark.parametrize("name", ["", "no/a"])
+def test_a_file_that_cannot_be_written_is_an_error(name, tmp_path):
+    with pytest.raises(DataError, match="cannot be written"):
+        write_text(tmp_path / name, "x")
+    assert os.listdir(tmp_path) == []
