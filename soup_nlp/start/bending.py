@@ -31,10 +31,11 @@ SYSTEMATIC, LEAST_PX, MOST_PX = 4.0, 0.01, 0.07
 REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
 with the diameter of the superpixel."""
-LEAST_GAP, TURNS = 3.0, 9e-5
-"""Least gains of depth over a turn alone in explaining the flow: in units of the flow's noise, and
-relative to the longer side of the image. Scenes before a camera that turns or is at rest gain up to
-7.4e-5 of it, and those with parallax at least 1.1e-4 (alley_1)."""
+LEAST_GAP, TURN_PX, TURN_SHARE = 3.0, 0.03, 9e-5
+"""Least gain of depth over a turn alone in explaining the flow: in units of the flow's noise, and
+in pixels, or as a share of the longer side of a small image. Scenes before a camera at rest gain up
+to 0.021 px and 7.4e-5 of that side; scenes with parallax and exact flow at least 0.038 px, or
+3.2e-4."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
 """Pixels of a fit of a rotation or of the least median error, and the least scale of the latter's
 refinement, pixels."""
@@ -53,11 +54,10 @@ def systematic_error(noise: float) -> float:
 def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
     """The camera's (3, 3) rotation, if a turn explains the flow of the main motion without depth.
 
-    It does if the main rigid motion, with depths, lowers the error by no more than `TURNS` longer
-    sides of the image, or `LEAST_GAP` noises, in the median, which movers assigned to that motion
-    do not change. A zoom and a shift of the next image are free there, because they leave a
-    residual that depths explain; the rotation itself, which a shift can replace, is that of the
-    plain turn.
+    It does if the main rigid motion, with depths, lowers the error by no more than `LEAST_GAP`
+    noises or `TURN_PX` (`TURN_SHARE`), in the median, which movers assigned to that motion do not
+    change. A zoom and a shift of the next image are free there, because they leave a residual that
+    depths explain; the rotation itself, which a shift can replace, is that of the plain turn.
     """
     at = np.flatnonzero(flow.views.usable & (choice.label == 0))
     if not len(at):
@@ -65,7 +65,8 @@ def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
     views = flow.views.subset(at)
     gain = np.median(fit_turn(views, ANY_TURN)[1] - choice.fit.cost[at, 0])
     noise = reference_noise(flow.residual)
-    if gain > max(TURNS * max(flow.seg.labels.shape), LEAST_GAP * noise):
+    least = min(TURN_PX, TURN_SHARE * max(flow.seg.labels.shape))
+    if gain > max(least, LEAST_GAP * noise):
         return None
     return fit_turn(views)[0]
 
