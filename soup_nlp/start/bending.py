@@ -55,9 +55,10 @@ def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
     """The camera's (3, 3) rotation, if a turn explains the flow of the main motion without depth.
 
     It does if the main rigid motion, with depths, lowers the error by no more than `LEAST_GAP`
-    noises or `TURN_PX` (`TURN_SHARE`), in the median, which movers assigned to that motion do not
-    change. A zoom and a shift of the next image are free there, because they leave a residual that
-    depths explain; the rotation itself, which a shift can replace, is that of the plain turn.
+    noises, or by no more than `TURN_PX` (in a small image `TURN_SHARE` of its longer side). Errors
+    are medians, which movers assigned to that motion do not change. A zoom and a shift of the next
+    image are free, because they leave a residual that depths explain; the rotation itself, which a
+    shift can replace, is that of the plain turn.
     """
     at = np.flatnonzero(flow.views.usable & (choice.label == 0))
     if not len(at):

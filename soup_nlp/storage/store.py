@@ -190,7 +190,7 @@ def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:
 def plain(obj: object) -> Any:
     """An object as JSON types: NumPy becomes Python, NaN and infinities None, paths text.
 
-    Dataclasses become mappings; tuples, sets and arrays become lists.
+    Dataclasses become mappings; tuples and arrays become lists.
 
     Raises:
         DataError: a type that JSON does not have.

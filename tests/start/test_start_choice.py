@@ -110,7 +110,7 @@ def turning(*angles: float) -> list[Motion]:
 
 @pytest.mark.parametrize(("error", "kept"), [(0.0, True), (0.05, False)])
 def test_a_small_motion_counts_where_the_flow_is_exact(error, kept):
-    """A block leaves 0.1 px: more than ten median errors of exact flow, less than 0.15 px."""
+    """A block leaves 0.1 px: more than three median errors of exact flow, less than 0.15 px."""
     seg = cells(6, 10)
     block = seg.anchors[:, 0] > 48
     views = Turns(np.where(block, 0.1 / PER_RADIAN, 0.0))
