@@ -157,18 +157,18 @@ def _error(pixel: Float, data: EnergyData, at: Int | slice = slice(None)) -> Flo
 def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float, float]:
     """Errors of superpixels `at` under the best turn alone and the best motion at equal depths."""
     step = max(1, data.pixel_ray[at].shape[0] * data.pixel_ray.shape[1] // pixels)
-    ray = data.pixel_ray[at].reshape(-1, 3)[::step]
-    target = data.pixel_target[at].reshape(-1, 2)[::step]
-    root = np.sqrt(data.pixel_weight[at].ravel()[::step] * data.pixel_ray.shape[1])[:, None]
+    weight = data.pixel_weight[at].ravel()[::step] * data.pixel_ray.shape[1]
+    target = rays(data.K_next, data.pixel_target[at].reshape(-1, 2)[::step])[:, :2]
+    scale = np.sqrt(weight)[:, None] * np.diag(data.K_next)[:2]
 
-    def error(model: Callable[[Float, Float], Float], size: int) -> float:
-        def miss(x: Float) -> Float:
-            return root * np.nan_to_num(project(data.K_next, model(x, ray)) - target, nan=1e3)
+    def error(matrix: Callable[[Float], Float], size: int, ray: Float) -> float:
+        point = ray.reshape(-1, ray.shape[-1])[::step]
+        x, _ = fit_robustly(matrix, size, point, target, scale)
+        return trimmed_mean(_error(project(data.K_next, ray @ matrix(x).T), data, at))
 
-        moved = model(fit_robustly(miss, size), data.pixel_ray[at])
-        return trimmed_mean(_error(project(data.K_next, moved), data, at))
-
-    return error(turned, PLAIN_TURN), error(displaced, 6)
+    ray = data.pixel_ray[at]
+    at_one = np.insert(ray, 3, 1.0, axis=-1)
+    return error(turned, PLAIN_TURN, ray), error(displaced, 6, at_one)
 
 
 def _open_motion(

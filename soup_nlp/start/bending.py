@@ -36,6 +36,10 @@ LEAST_GAP, TURN_PX, TURN_SHARE = 3.0, 0.03, 9e-5
 in pixels, or as a share of the longer side of a small image. Scenes before a camera at rest gain up
 to 0.021 px and 7.4e-5 of that side; scenes with parallax and exact flow at least 0.038 px, or
 3.2e-4."""
+STEP, NEAREST = 1e-5, 1e-3
+"""Change of parameters by which matrices are differentiated, and least depth of a moved ray."""
+STEP, NEAREST = 1e-5, 1e-3
+"""Step by which matrices of motions are differentiated, and least depth of a moved point."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
 """Pixels of a fit of a rotation or of the least median error, and the least scale of the latter's
 refinement, pixels."""
@@ -76,23 +80,25 @@ PLAIN_TURN, ANY_TURN = 4, 7
 """Parameters of `turned`: rotation and focal length; and with zoom and shift between the images."""
 
 
-def turned(x: Float, ray: Float) -> Float:
-    """Rays (..., 3) turned by the rotation vector x[:3], with the focal length times exp(x[3]).
+def turned(x: Float) -> Float:
+    """Matrices (..., 3, 3) that turn rays, of parameters (..., 7).
 
-    The next image is enlarged by exp(x[4]) and shifted by x[5:7], as by stabilisation or zoom;
-    parameters that are left out are 0.
+    These are a rotation vector, the log of a factor of the focal length, and the zoom (log) and
+    shift of the next image, as by stabilisation.
     """
-    x = np.pad(x, (0, ANY_TURN - len(x)))
-    first, second = (np.array([1.0, 1.0, np.exp(f)]) for f in (x[3], x[3] - x[4]))
-    moved = (ray / first) @ rotation.exp(x[:3]).T * second
-    moved[..., :2] += x[5:7] * moved[..., 2:]
-    return np.asarray(moved)
+    out = rotation.exp(x[..., :3])
+    out[..., 2] *= np.exp(-x[..., 3:4])
+    out[..., 2, :] *= np.exp(x[..., 3:4] - x[..., 4:5])
+    out[..., :2, :] += x[..., 5:, None] * out[..., 2:, :]
+    return out
 
 
-def displaced(x: Float, ray: Float, inverse: Float | float = 1.0) -> Float:
-    """Rays (..., 3) after the rotation vector x[:3] and the translation x[3:6] times an inverse
-    depth (..., 1)."""
-    return np.asarray(ray @ rotation.exp(x[:3]).T + inverse * x[3:6])
+def displaced(x: Float) -> Float:
+    """Matrices (..., 3, 4) that move rays with inverse depths (4 components), of parameters
+    (..., 7): a rotation vector, a translation, and a number added to all inverse depths."""
+    R, T = rotation.exp(x[..., :3]), x[..., 3:6, None]
+    R[..., 2:] += x[..., 6:, None] * T
+    return np.concatenate([R, T], axis=-1)
 
 
 def trimmed_mean(error: Float) -> float:
@@ -100,12 +106,41 @@ def trimmed_mean(error: Float) -> float:
     return float(np.mean(np.sort(error)[: max(1, int(np.ceil(0.9 * len(error))))]))
 
 
-def fit_robustly(miss: Callable[[Float], Float], size: int) -> Float:
-    """(size,) parameters with the least Cauchy loss of `miss`, pixels, by narrowing scales."""
+def fit_robustly(
+    matrix: Callable[[Float], Float], size: int, point: Float, target: Float, scale: Float
+) -> tuple[Float, Float]:
+    """Parameters with the least Cauchy loss of the distances of moved points from targets.
+
+    Args:
+        matrix: Matrices (..., 3, C) of parameters (..., 7) that move points: `turned`, `displaced`.
+        size: Number of parameters that are free; the others are 0.
+        point: (M, C) points.
+        target: (M, 2) rays to which they move, without the third component.
+        scale: (M, 2) weights of the distances, pixels per ray unit.
+
+    Returns:
+        (7,) parameters, by narrowing scales of the loss, and (M, 2) the weighted distances there.
+    """
+    point, target, scale = point.T, target.T, scale.T
+    free = np.eye(ANY_TURN)[:size]
+
+    def moved(x: Float) -> tuple[Float, Float]:
+        out = matrix(x @ free) @ point
+        depth = np.maximum(out[2], NEAREST)
+        return out[:2] / depth, depth
+
+    def miss(x: Float) -> Float:
+        return (scale * (moved(x)[0] - target)).ravel()
+
+    def slope(x: Float) -> Float:
+        (at, depth), step = moved(x), STEP * free
+        change = (matrix(x @ free + step) - matrix(x @ free - step)) @ point / (2 * STEP)
+        return (scale / depth * (change[:, :2] - at * change[:, 2:])).reshape(size, -1).T
+
     x = np.zeros(size)
-    for scale in (10.0, 3.0, 1.0, 0.3):
-        x = least_squares(lambda x: miss(x).ravel(), x, loss="cauchy", f_scale=scale, max_nfev=30).x
-    return x
+    for width in (10.0, 3.0, 1.0, 0.3):
+        x = least_squares(miss, x, slope, loss="cauchy", f_scale=width, max_nfev=30).x
+    return x @ free, miss(x).reshape(2, -1).T
 
 
 def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
@@ -116,14 +151,9 @@ def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
         size: Number of parameters of `turned` that are free.
     """
     ray, target, weight, _ = views.matches(most=FIT_PIXELS)
-
-    def miss(x: Float) -> Float:
-        moved = turned(x, ray)
-        off = moved[..., :2] / moved[..., 2:] - target[..., :2]
-        return np.sqrt(weight)[:, None] * off * np.asarray(views.focal)
-
-    x = fit_robustly(miss, size)
-    return rotation.exp(x[:3]), views.distance(turned(x, views.ray))
+    scale = np.sqrt(weight)[:, None] * views.focal
+    x, _ = fit_robustly(turned, size, ray, target[:, :2], scale)
+    return rotation.exp(x[:3]), views.distance(views.ray @ turned(x).T)
 
 
 ABOVE_NOISE, LEAST_JUMP = 10.0, 0.25

@@ -192,19 +192,21 @@ def refine_near(
         prior: (5,) standard deviations of the change, see `NEAR`.
         rounds: Gauss-Newton steps.
     """
-    r, q, weight, focal = matches
+    # one row per coordinate, the pixels contiguous
+    r, q = (np.ascontiguousarray(v.T) for v in (matches.ray, matches.target))
     R, t, turn, stiff = motion.R, motion.t, np.zeros(3), prior**-2.0
     for _ in range(rounds):
-        y, basis = r @ R.T, tangent(t)
-        cross = np.cross(y, q)
-        sides = np.column_stack([np.cross(t, y)[:, :2], np.cross(q, t) @ R[:, :2]])
-        scale = focal / np.maximum(np.linalg.norm(sides, axis=1), 1e-9)
-        by_turn = (y @ t)[:, None] * q - np.sum(y * q, axis=1)[:, None] * t
-        J = np.column_stack([by_turn, cross @ basis.T]) * scale[:, None]
-        e = scale * (cross @ t)
-        w = weight / (1 + (e / noise) ** 2) / noise**2
-        A = J.T @ (w[:, None] * J) + np.diag(stiff)
-        g = J.T @ (w * e) + stiff * np.append(turn, basis @ (t - motion.t))
+        y, basis = R @ r, tangent(t)
+        cross = np.cross(y, q, axis=0)
+        E = rotation.hat(t) @ R
+        sides = np.concatenate([E[:2] @ r, E.T[:2] @ q])
+        scale = matches.focal / np.maximum(np.linalg.norm(sides, axis=0), 1e-9)
+        by_turn = (t @ y) * q - np.sum(y * q, axis=0) * t[:, None]
+        J = scale * np.concatenate([by_turn, basis @ cross])
+        e = scale * (t @ cross)
+        w = matches.weight / (1 + (e / noise) ** 2) / noise**2
+        A = (w * J) @ J.T + np.diag(stiff)
+        g = J @ (w * e) + stiff * np.append(turn, basis @ (t - motion.t))
         try:
             step = -np.linalg.solve(A, g)
         except np.linalg.LinAlgError:

@@ -130,18 +130,13 @@ class Seen(NamedTuple):
             Error in pixels without the largest tenth, R and T of `X' = R X + T`, and the shift
             added to all inverse depths, 0 unless `shifted`.
         """
-        views, target = self.flow.views, self.flow.centre[at]
-        ray, middle = views.anchor[at], float(np.median(np.abs(inverse)))
-
-        def miss(x: Float) -> Float:
-            near = inverse / middle + (x[6] if shifted else 0.0)
-            moved = displaced(x, ray, near[:, None])
-            gap = moved / np.maximum(moved[:, 2:], 1e-3) - target
-            return gap[:, :2] * views.focal
-
-        x = fit_robustly(miss, 7 if shifted else 6)
-        error = trimmed_mean(np.minimum(np.linalg.norm(miss(x), axis=1), CLIP))
-        return error, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6] if shifted else 0.0
+        views, target = self.flow.views, self.flow.centre[at, :2]
+        middle = float(np.median(np.abs(inverse)))
+        point = np.column_stack([views.anchor[at], inverse / middle])
+        scale = np.tile(views.focal, (len(at), 1))
+        x, miss = fit_robustly(displaced, 7 if shifted else 6, point, target, scale)
+        error = trimmed_mean(np.minimum(np.linalg.norm(miss, axis=1), CLIP))
+        return error, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6]
 
     def relief(self, c: int) -> float:
         """Error of the flow of a component at one depth, above the noise, pixels."""

@@ -9,7 +9,7 @@ import pytest
 
 from soup_nlp.evaluate.evidence import LEAST_GAP_PX, evidence
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.camera import project
+from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import ANY_TURN, PLAIN_TURN, fit_robustly, turned
 
@@ -73,12 +73,12 @@ def test_a_turn_explains_a_stabilised_flow_with_all_parameters_only(small_room):
     _, data = scene(small_room, 0.4, (0.0, 0.0, 0.0), turn=0.1)
     # stabilisation moves the next image back, and crops it
     target = 1.03 * data.pixel_target - 0.08 * data.K_next[0, 0]
+    ray, seen = (v.reshape(-1, 3) for v in (data.pixel_ray, rays(data.K_next, target)))
+    scale = np.tile(np.diag(data.K_next)[:2], (len(ray), 1))
 
     def error(size: int) -> float:
-        def miss(x):
-            return project(data.K_next, turned(x, data.pixel_ray)) - target
-
-        return float(np.mean(np.abs(miss(fit_robustly(miss, size)))))
+        miss = fit_robustly(turned, size, ray, seen[:, :2], scale)[1]
+        return float(np.mean(np.abs(miss)))
 
     assert error(PLAIN_TURN) > 0.3
     assert error(ANY_TURN) < 0.02

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import OptimizeResult
 
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane import PlaneFit
-from soup_nlp.start import epipolar
-from soup_nlp.start.bending import constant_depth
+from soup_nlp.start import bending, epipolar
+from soup_nlp.start.bending import constant_depth, displaced, fit_robustly, turned
 from soup_nlp.start.epipolar import (
     Matches,
     Motion,
@@ -129,6 +130,27 @@ def test_the_derivative_of_the_distance_is_that_of_differences(size):
     for k, way in enumerate(step * np.eye(5)):
         change = matches.distance(moved(x + way)) - matches.distance(moved(x - way))
         np.testing.assert_allclose(by_x[k], change / (2 * step), atol=1e-6 * np.abs(by_x).max())
+
+
+@pytest.mark.parametrize(("matrix", "size"), [(turned, 4), (turned, 7), (displaced, 7)])
+def test_the_derivative_of_a_robust_fit_is_that_of_differences(monkeypatch, matrix, size):
+    rng, seen = np.random.default_rng(3), {}
+
+    def derived(miss, x, slope, **options):
+        seen["by_x"], seen["miss"] = slope(x + way), miss
+        return OptimizeResult(x=x)
+
+    way, step = 0.1 * rng.normal(size=size), 1e-6
+    monkeypatch.setattr(bending, "least_squares", derived)
+    _, r, q = rigid(50)
+    point = r if matrix is turned else np.column_stack([r, rng.uniform(0.2, 1.0, 50)])
+    scale = FOCAL * rng.uniform(0.5, 1.0, (50, 2))
+    x, miss = fit_robustly(matrix, size, point, q[:, :2], scale)
+    moved = point @ matrix(x).T
+    np.testing.assert_allclose(miss, scale * (moved[:, :2] / moved[:, 2:] - q[:, :2]), atol=1e-9)
+    for k, along in enumerate(step * np.eye(size)):
+        change = (seen["miss"](way + along) - seen["miss"](way - along)) / (2 * step)
+        np.testing.assert_allclose(seen["by_x"][:, k], change, atol=1e-6 * np.abs(change).max())
 
 
 @pytest.mark.parametrize("position", [0, 1, 2])
