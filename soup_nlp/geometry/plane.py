@@ -153,9 +153,8 @@ def fit_planes(
     floor = 1e-12
     for step in range(ROUNDS):
         s = w / depth_like**2
-        mu_a = -np.sum(s * ab, axis=2) / np.maximum(np.sum(s * b2, axis=2), floor)
         if step == 0:
-            mu[..., 0] = mu_a
+            mu[..., 0] = -np.sum(s * ab, axis=2) / np.maximum(np.sum(s * b2, axis=2), floor)
         else:
             A = ((s * b2) @ outer).reshape(*mu.shape, 3)
             rhs = -(s * ab) @ basis

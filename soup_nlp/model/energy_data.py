@@ -143,7 +143,7 @@ def sample_pixels(
     flat = labels.ravel()
     usable = np.flatnonzero(flow.confidence.ravel() > 0)
     # a random order within each superpixel, then its first S: a sample without replacement
-    order = usable[np.lexsort((rng.random(len(usable)), flat[usable]))]
+    order = usable[np.argsort(flat[usable] + rng.random(len(usable)))]
     count = np.bincount(flat[order], minlength=n)
     s = int(count.max(initial=1)) if samples is None else samples
     start = np.concatenate([[0], np.cumsum(count)[:-1]])

@@ -67,7 +67,8 @@ class Matches(NamedTuple):
 
     def slope(self, motion: Motion) -> Float:
         """(9, M) derivative of `distance` by the essential matrix, row by row."""
-        r, q, E = self.ray.T, self.target.T, motion.essential()
+        r, q = (np.ascontiguousarray(v.T) for v in (self.ray, self.target))
+        E = motion.essential()
         by_q, by_r = E @ r, E.T @ q
         squared = np.maximum(np.sum(by_q[:2] ** 2 + by_r[:2] ** 2, axis=0), 1e-24)
         share = np.sum(q * by_q, axis=0) / squared
