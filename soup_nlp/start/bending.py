@@ -37,8 +37,6 @@ in pixels, or as a share of the longer side of a small image. Scenes before a ca
 to 0.021 px and 7.4e-5 of that side; scenes with parallax and exact flow at least 0.038 px, or
 3.2e-4."""
 STEP, NEAREST = 1e-5, 1e-3
-"""Change of parameters by which matrices are differentiated, and least depth of a moved ray."""
-STEP, NEAREST = 1e-5, 1e-3
 """Step by which matrices of motions are differentiated, and least depth of a moved point."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
 """Pixels of a fit of a rotation or of the least median error, and the least scale of the latter's
@@ -81,11 +79,8 @@ PLAIN_TURN, ANY_TURN = 4, 7
 
 
 def turned(x: Float) -> Float:
-    """Matrices (..., 3, 3) that turn rays, of parameters (..., 7).
-
-    These are a rotation vector, the log of a factor of the focal length, and the zoom (log) and
-    shift of the next image, as by stabilisation.
-    """
+    """Matrices (..., 3, 3) that turn rays, by parameters (..., 7): a rotation vector, the log of a
+    factor of the focal length, and zoom (log) and shift of the next image, as by stabilisation."""
     out = rotation.exp(x[..., :3])
     out[..., 2] *= np.exp(-x[..., 3:4])
     out[..., 2, :] *= np.exp(x[..., 3:4] - x[..., 4:5])
@@ -94,7 +89,7 @@ def turned(x: Float) -> Float:
 
 
 def displaced(x: Float) -> Float:
-    """Matrices (..., 3, 4) that move rays with inverse depths (4 components), of parameters
+    """Matrices (..., 3, 4) that move rays with inverse depths (4 components), by parameters
     (..., 7): a rotation vector, a translation, and a number added to all inverse depths."""
     R, T = rotation.exp(x[..., :3]), x[..., 3:6, None]
     R[..., 2:] += x[..., 6:, None] * T
@@ -109,17 +104,15 @@ def trimmed_mean(error: Float) -> float:
 def fit_robustly(
     matrix: Callable[[Float], Float], size: int, point: Float, target: Float, scale: Float
 ) -> tuple[Float, Float]:
-    """Parameters with the least Cauchy loss of the distances of moved points from targets.
+    """(7,) parameters with the least Cauchy loss of points off their targets, by narrowing scales,
+    and (M, 2) distances there, pixels.
 
     Args:
-        matrix: Matrices (..., 3, C) of parameters (..., 7) that move points: `turned`, `displaced`.
+        matrix: `turned` or `displaced`, matrices (..., 3, C) by parameters.
         size: Number of parameters that are free; the others are 0.
         point: (M, C) points.
         target: (M, 2) rays to which they move, without the third component.
         scale: (M, 2) weights of the distances, pixels per ray unit.
-
-    Returns:
-        (7,) parameters, by narrowing scales of the loss, and (M, 2) the weighted distances there.
     """
     point, target, scale = point.T, target.T, scale.T
     free = np.eye(ANY_TURN)[:size]
