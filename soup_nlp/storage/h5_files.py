@@ -118,9 +118,10 @@ def contents_digest(file: h5py.File) -> str:
         sha.update(repr(value.tolist()).encode() if value.dtype == object else value.tobytes())
 
     for name, item in sorted([("", file), *items], key=lambda pair: pair[0]):
-        for key in sorted(item.attrs):
+        attrs = item.attrs
+        for key in sorted(attrs):
             if (name, key) != ("", DIGEST):
-                add(f"{name}@{key}", item.attrs[key])
+                add(f"{name}@{key}", attrs[key])
         add(name, item[()] if isinstance(item, h5py.Dataset) else 0)
     return sha.hexdigest()
 

@@ -133,10 +133,10 @@ def _write_group(group: h5py.Group, tree: Tree, rows: Mapping[str, Row]) -> None
         if data.dtype.kind == "U":
             data = np.char.encode(data, "utf-8")
             data = data.astype(h5py.string_dtype(length=max(1, data.dtype.itemsize)))
-        _write_array(group, name, data)
-        row = row_of(rows, group[name].name.removeprefix("/")) or Row()
+        array = _write_array(group, name, data)
+        row = row_of(rows, array.name.removeprefix("/")) or Row()
         described = {"units": row.unit, "description": row.text, "shape_letters": row.axes}
-        group[name].attrs.update(described)
+        array.attrs.update(described)
 
 
 def _write_attribute(file: h5py.File, key: str, value: object) -> None:
@@ -148,14 +148,13 @@ def _write_attribute(file: h5py.File, key: str, value: object) -> None:
     file.attrs.create(key, text, dtype=h5py.string_dtype(length=max(1, len(text))))
 
 
-def _write_array(group: h5py.Group, name: str, data: NDArray[Any]) -> None:
+def _write_array(group: h5py.Group, name: str, data: NDArray[Any]) -> h5py.Dataset:
     """Write an array with a checksum."""
     if data.ndim and data.size:
         options: dict[str, Any] = {"fletcher32": True, "chunks": True}
         if data.nbytes > COMPRESS_ABOVE:
             options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-        group.create_dataset(name, data=data, **options)
-        return
+        return group.create_dataset(name, data=data, **options)
     # scalars and empty arrays are stored in the header, which has a checksum
     kind = h5py.h5t.py_create(data.dtype, logical=True)
     layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
@@ -163,6 +162,7 @@ def _write_array(group: h5py.Group, name: str, data: NDArray[Any]) -> None:
     space = h5py.h5s.create_simple(data.shape) if data.ndim else h5py.h5s.create(h5py.h5s.SCALAR)
     made = h5py.h5d.create(group.id, name.encode(), kind, space, layout)
     made.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(data))
+    return h5py.Dataset(made)
 
 
 def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -35,9 +34,13 @@ def code_version() -> str:
 
 def versions() -> dict[str, str]:
     """Versions of the packages that a result depends on; "unknown" if not available."""
-    out = {"soup_nlp": __version__, "python": platform.python_version()}
-    for name, package in _PACKAGES.items():
-        out[name] = "unknown"
-        with suppress(PackageNotFoundError):
-            out[name] = version(package)
-    return out
+    own = {"soup_nlp": __version__, "python": platform.python_version()}
+    return own | {name: _installed(package) for name, package in _PACKAGES.items()}
+
+
+@cache
+def _installed(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"
