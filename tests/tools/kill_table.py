@@ -24,11 +24,14 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.context import ForkProcess
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import write_sol
@@ -97,17 +100,37 @@ def clip(root: Path) -> Path:
     return folder
 
 
-def start(words: Sequence[str]) -> subprocess.Popen[bytes]:
-    """Run a command in a process and session of its own."""
-    nothing = subprocess.DEVNULL
-    command = [sys.executable, "-m", "soup_nlp", *words]
-    return subprocess.Popen(command, stdout=nothing, stderr=nothing, start_new_session=True)
+def start(words: Sequence[str]) -> ForkProcess:
+    """Run a command in a process and session of its own, which need not import the package."""
+    process = get_context("fork").Process(target=_command, args=(words,))
+    process.start()
+    return process
+
+
+def _command(words: Sequence[str]) -> None:
+    os.setsid()
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nothing, stream)
+    # TMPDIR may have changed
+    tempfile.tempdir, code = None, 1
+    try:
+        code = main([*words])
+    finally:
+        # without the exit handlers of the parent
+        os._exit(code)
 
 
 def run(words: Sequence[str]) -> tuple[int, float]:
     """Exit code and seconds of an undisturbed run."""
     begin = time.perf_counter()
-    return start(words).wait(), time.perf_counter() - begin
+    return exit_code(start(words)), time.perf_counter() - begin
+
+
+def exit_code(process: ForkProcess) -> int:
+    """Exit code of a process, negative after a signal."""
+    process.join()
+    return int(process.exitcode or 0)
 
 
 def busy(folder: Path) -> bool:
@@ -138,12 +161,12 @@ def disturbed(
         stale = stale and now
         if waiting and now and not stale:
             waiting, until = False, time.perf_counter() + delay
-        if process.poll() is not None:
+        if not process.is_alive():
             return "before", time.perf_counter() - begin
     for number in numbers:
-        process.send_signal(number)
+        os.kill(process.pid, number)
         time.sleep(0.02)
-    code = process.wait()
+    code = exit_code(process)
     spent = time.perf_counter() - begin
     return signal.Signals(-code).name if code < 0 else f"exit {code}", spent
 
