@@ -106,7 +106,9 @@ def solve_chain(
     step = _step(stride)
     # frames of a video, or of arrays, are written before their number is known
     claim(folder, SINGLE, overwrite, subject)
-    chosen = _frames(frames, folder, camera, step, most, depth_scale)
+    # every solve gives the warnings of its images
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
+        chosen = _frames(frames, folder, camera, step, most, depth_scale)
     count = len(chosen)
     claim(folder, chain_files(count), overwrite, subject)
     which = [(k, k + 1) for k in range(count - 1)]
@@ -307,13 +309,11 @@ def _frames(
     if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
         camera = {"intrinsics": str(beside), **camera}
     frames = Frames(tuple(map(str, images)), camera, depths, depth_scale)
-    # every solve gives these warnings too
-    with warnings.catch_warnings(action="ignore", category=DataWarning):
-        for image in images:
-            read_image(image, turn="intrinsics" not in camera)
-        if step:
-            return frames
-        first = make_problem({"input": frames.pair(0, 1)}, where="sequence").load_pair()
+    for image in images:
+        read_image(image, turn="intrinsics" not in camera)
+    if step:
+        return frames
+    first = make_problem({"input": frames.pair(0, 1)}, where="sequence").load_pair()
     keep = key_frames(images, first.K_ref, most)
     kept = tuple(frames.names[k] for k in keep)
     return replace(frames, names=kept, depths=[depths[k] for k in keep] if depths else [])
