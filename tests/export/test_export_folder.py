@@ -16,11 +16,8 @@ from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.export.artefact import parse_formulations
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.sol import write_sol
-from soup_nlp.family.frozen import load_frozen
-from soup_nlp.family.instances import build_instance, case_of, parse_name
 from soup_nlp.model import oracle
 from soup_nlp.model.layout import TangentLayout
-from soup_nlp.model.symbolic import Graph
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.folders import MARK
 
@@ -158,24 +155,6 @@ def test_an_answer_in_tangent_coordinates_becomes_a_result(exported, tmp_path, c
     bad[::9] *= 1.5
     write_sol(path, bad, None, *order, "elsewhere", 0)
     assert main(["check", str(path), "--export", str(exported)]) == 1
-
-
-def test_the_start_does_not_change_the_program():
-    record = load_frozen("street", 100)
-    case = case_of(record)
-    built = {}
-    for start in ("easy", "hard", "cold"):
-        name = f"SOUP-street-tangent-smooth-N100-{start}"
-        built[start] = build_instance(case, record, parse_name(name).formulation, start)
-    first, layout, _ = built["hard"]
-    for nlp, other, _ in built.values():
-        assert np.array_equal(Graph(nlp).p, Graph(first).p)
-        assert np.array_equal(other.R0, layout.R0)
-    # and the best known point is that of the matrices
-    tangent, _, _ = build_instance(case, record, "tangent/smooth", "best")
-    matrix, _, _ = build_instance(case, record, "unit-offset/smooth", "best")
-    f, m = (p.value(p.x0) for p in (tangent, matrix))
-    assert f == pytest.approx(m, rel=1e-9)
 
 
 def test_tangent_coordinates_have_no_gauge():

@@ -40,6 +40,7 @@ from soup_nlp.family.instances import (
 from soup_nlp.family.write import published
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.model.symbolic import Graph
 
 pytestmark = pytest.mark.slow
 
@@ -172,6 +173,22 @@ def test_an_instance_has_the_published_bytes(scene, tmp_path):
     nlp = build_instance(case_of(record), record, STANDARD, "hard")[0]
     file = write_nl(tmp_path / "x.nl", nlp)
     assert file.sha256 == published()["sha256"][instance.name]
+
+
+def test_the_start_does_not_change_the_program(record):
+    case = case_of(record)
+    built = {}
+    for start in ("easy", "hard", "cold"):
+        built[start] = build_instance(case, record, "tangent/smooth", start)
+    first, layout, _ = built["hard"]
+    for nlp, other, _ in built.values():
+        assert np.array_equal(Graph(nlp).p, Graph(first).p)
+        assert np.array_equal(other.R0, layout.R0)
+    # and the best known point is that of the matrices
+    tangent, _, _ = build_instance(case, record, "tangent/smooth", "best")
+    matrix, _, _ = build_instance(case, record, "unit-offset/smooth", "best")
+    f, m = (p.value(p.x0) for p in (tangent, matrix))
+    assert f == pytest.approx(m, rel=1e-9)
 
 
 # --- the folder ----------------------------------------------------------------------------------
