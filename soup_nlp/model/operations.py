@@ -131,10 +131,10 @@ LARGE = 20_000
 def _instructions(f: ca.Function) -> tuple[Instruction, ...]:
     return tuple(
         Instruction(
-            f.instruction_id(k),
+            operation := f.instruction_id(k),
             f.instruction_output(k),
             f.instruction_input(k),
-            f.instruction_constant(k) if f.instruction_id(k) == ca.OP_CONST else 0.0,
+            f.instruction_constant(k) if operation == ca.OP_CONST else 0.0,
         )
         for k in range(f.n_instructions())
     )

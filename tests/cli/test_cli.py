@@ -182,6 +182,7 @@ def test_arguments_that_are_no_pair_and_no_result_are_refused(words, part, capsy
     assert part in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("solves_once")
 def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch, capsys):
     """Results of two pairs frame_0, frame_1 do not replace each other, with and without --out."""
     monkeypatch.chdir(tmp_path)

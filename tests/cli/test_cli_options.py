@@ -18,7 +18,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.storage.folders import MARK
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("solves_once")]
 
 SMALL = sets(
     "input.width=112 input.height=84 refine.enabled=false segmentation.superpixels=16"

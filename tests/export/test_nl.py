@@ -245,8 +245,8 @@ def swinging(tmp_path_factory) -> Case:
     raw = {
         "input": scene,
         "flow": {"source": "truth"},
-        "segmentation": {"superpixels": 32, "neighbours": 3},
-        "energy": {"pixel_samples": 2},
+        "segmentation": {"superpixels": 32, "neighbours": 2, "boundary_samples": 1},
+        "energy": {"pixel_samples": 1},
         "depth_prior": {"source": str(folder / "depth.npy")},
     }
     return prepare(make_problem(raw))
