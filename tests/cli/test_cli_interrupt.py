@@ -26,8 +26,8 @@ from soup_nlp.storage.progress import interruptible
 pytestmark = pytest.mark.slow
 
 SMALL = sets(
-    "input.width=128 input.height=96 flow.source=truth segmentation.superpixels=20"
-    " segmentation.neighbours=5 refine.rounds=1"
+    "input.width=96 input.height=72 flow.source=truth segmentation.superpixels=12"
+    " segmentation.neighbours=4 refine.enabled=false"
 )
 
 

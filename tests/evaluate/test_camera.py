@@ -11,7 +11,8 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.camera import KINDS, camera_errors, corrected
 from soup_nlp.geometry import rotation
-from soup_nlp.pipeline.run import run
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.report.findings import hints
 from soup_nlp.report.summary import certainty
 from soup_nlp.start.epipolar import Matches
@@ -67,10 +68,12 @@ def test_too_few_matches_show_no_error():
     assert camera_errors(matches().at(slice(7)))[1] is None
 
 
-def solved(pair: Pair):
+def started(pair: Pair):
+    """The start of a pair as a run, and what is said of it."""
     scene = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
     raw = {"input": scene, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
-    done = run(make_problem(raw), pair=pair)
+    case = prepare(make_problem(raw), pair=pair)
+    done = make_run(case, skipped(case))
     shares, flow = certainty(done), done.pair.flow
     camera = done.confidence.evidence.camera
     return done, "; ".join(hints(flow.uv, flow.confidence, shares, 0.0, camera))
@@ -86,11 +89,11 @@ def orbit():
 def test_a_wrong_principal_point_makes_depth_unsure(orbit):
     K = orbit.K_ref.copy()
     K[0, 2] += 32
-    exact, told = solved(replace(orbit, flow=None))
+    exact, told = started(replace(orbit, flow=None))
     assert exact.good
     assert exact.confidence.evidence.camera is None
     assert "intrinsics" not in told
-    wrong, told = solved(replace(orbit, flow=None, K_ref=K, K_next=K))
+    wrong, told = started(replace(orbit, flow=None, K_ref=K, K_next=K))
     assert "intrinsics" in told
     sigma = np.median(wrong.confidence.sigma), np.median(exact.confidence.sigma)
     assert sigma[0] > 1.3 * sigma[1]
@@ -105,14 +108,14 @@ def test_two_scenes_are_a_guess():
     one, other = (
         make_problem({"input": {**size, "scene": name}}).load_pair() for name in ("room", "street")
     )
-    done, told = solved(replace(one, flow=None, image_next=other.image_next))
+    done, told = started(replace(one, flow=None, image_next=other.image_next))
     assert not done.good
     assert "same scene" in told
 
 
 @pytest.mark.slow
 def test_a_repeated_frame_is_a_guess(orbit):
-    done, told = solved(replace(orbit, flow=None, image_next=orbit.image_ref))
+    done, told = started(replace(orbit, flow=None, image_next=orbit.image_ref))
     assert not done.good
     assert done.confidence.guessed == 1
     assert "nearly the same" in told

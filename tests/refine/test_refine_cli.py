@@ -97,26 +97,34 @@ def test_without_refinement_the_nlps_soup_is_delivered(tmp_path):
     assert check_folder(tmp_path).ok
 
 
-def test_without_the_nlp_the_start_is_refined(tmp_path, capsys):
-    code, summary = solve(tmp_path, "--no-nlp")
+@pytest.fixture(scope="module")
+def without_nlp(tmp_path_factory) -> tuple[Path, dict]:
+    """The folder of a refined start, and its summary."""
+    out = tmp_path_factory.mktemp("start")
+    code, summary = solve(out, "--no-nlp")
     assert code == 0
-    assert "Ipopt" not in capsys.readouterr().out
+    return out, summary
+
+
+def test_without_the_nlp_the_start_is_refined(without_nlp):
+    folder, summary = without_nlp
+    assert "Ipopt" not in (folder / "log.txt").read_text()
     assert summary["status"] == "Skipped"
     assert summary["delivered"] == "start"
     assert summary["iterations"] == {}
     r = summary["refinement"]
     assert r["end"]["total"] < r["begin"]["total"]
     assert "nlp" not in summary["metrics"]
-    assert check_folder(tmp_path).ok
+    assert check_folder(folder).ok
     # the solve can be repeated from the folder alone, see test_cli
-    again = load_problem(tmp_path / "config.yaml")
+    again = load_problem(folder / "config.yaml")
     assert again.digest() == summary["problem_hash"]
     assert again.refine.from_start
 
 
 @pytest.mark.xfail(strict=True, reason="0.995: the start with settled motions is lower")
-def test_the_refinement_lowers_the_start_by_a_hundredth(tmp_path):
-    r = solve(tmp_path, "--no-nlp")[1]["refinement"]
+def test_the_refinement_lowers_the_start_by_a_hundredth(without_nlp):
+    r = without_nlp[1]["refinement"]
     assert r["end"]["total"] < 0.99 * r["begin"]["total"]
 
 
