@@ -133,5 +133,5 @@ def split_components(labels: Labels, min_size: int) -> Labels:
 
 
 def _relabel(labels: NDArray[np.int32]) -> Labels:
-    _, inverse = np.unique(labels, return_inverse=True)
-    return inverse.reshape(labels.shape).astype(np.int32)
+    present = np.bincount(labels.ravel()) > 0
+    return (np.cumsum(present, dtype=np.int32) - 1)[labels]

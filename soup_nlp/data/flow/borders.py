@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.data.pair import Flow
@@ -77,7 +77,7 @@ def follow_flow(
         current[v[moved], u[moved]] = best[moved]
         near[:] = False
         near[v[moved], u[moved]] = True
-        near = ndimage.binary_dilation(near)
+        near = cv2.dilate(near.astype(np.uint8), np.ones((3, 3))) > 0
     return split_components(current.astype(np.int32), int(LEAST_PIECE * current.size / count))
 
 
