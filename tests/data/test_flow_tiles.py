@@ -111,6 +111,36 @@ def test_two_surfaces_do_not_move_to_one_place(monkeypatch):
     assert sorted(new[place].mean() > 0.5 for place in places) == [False, True]
 
 
+@pytest.mark.parametrize(("noise", "match"), [(0.6, True), (1.0, False)])
+def test_a_tile_matches_what_looks_nearly_like_it(noise, match):
+    """With independent texture in it, the next image correlates by 1 / sqrt(1 + noise^2)."""
+    ref, other = (texture(*SIZE, seed).astype(float) for seed in (2, 7))
+    nxt = np.roll(ref, (20, 60), axis=(0, 1)) + noise * (other - 128)
+    ref, nxt = (np.rint(image / 2 + 64).astype(np.uint8) for image in (ref, nxt))
+    matches = tiles._matched(ref, nxt, np.ones(SIZE, bool), 2)
+    # correlations of 0.86 and 0.71: nearly all of 330 tiles, or nearly none
+    assert len(matches) > 320 if match else len(matches) < 10
+    assert (matches[:, 2:] == (30, 10)).all() or not match
+
+
+def test_of_tiles_that_match_one_place_only_one_is_mutual():
+    ref, nxt = frames(texture(*SIZE, 2))
+    # a multiple of the distance of tiles, so that tiles of both disks match the same places
+    twin = START + np.array([14 * tiles.STEP * 2, 0])
+    both = np.where(disk(twin), np.roll(ref, tuple((twin - START)[::-1]), axis=(0, 1)), ref)
+    matches = tiles._matched(both, nxt, disk(START) | disk(twin), 2)
+    ends = np.unique(matches[:, :2] + matches[:, 2:], axis=0)
+    assert 10 < len(matches) == len(ends)
+
+
+@pytest.mark.parametrize(("change", "count"), [(2, 1), (4, 2)])
+def test_tiles_of_one_surface_have_similar_displacements(change, count):
+    u = tiles.STEP * np.arange(2 * tiles.GROUP)
+    shift = np.where(np.arange(len(u)) < tiles.GROUP, 30, 30 + change)
+    matches = np.column_stack([u, 0 * u, shift, 0 * u])
+    assert [len(group) for group in tiles._surfaces(matches)] == [len(u) // count] * count
+
+
 def test_images_of_other_sizes():
     """Tiles for which the next image has no room match nowhere."""
     ref = texture(*SIZE, 2)
