@@ -65,6 +65,11 @@ class Segmentation:
 
     __repr__ = __str__
 
+    def across(self, label: Int | Mask) -> Mask:
+        """(P,) True where two neighbours have different labels (N,)."""
+        first, second = label[self.pairs].T
+        return np.asarray(first != second)
+
     def nearest(self, mask: Mask) -> Int:
         """(N,) the nearest superpixel of a mask (N,), which is not empty; in the mask itself."""
         members = np.flatnonzero(mask)

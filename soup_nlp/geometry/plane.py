@@ -121,7 +121,7 @@ def fit_planes(
     weight: Float,
     anchor: Float,
     radius: Float,
-    focal: tuple[float, float],
+    focal: Float,
 ) -> PlaneFit:
     """Fit `mu(r) = mu_a + g . (r - r_a) / h` with `q ~ R r + mu t` to the flow.
 
@@ -133,7 +133,7 @@ def fit_planes(
         weight: (N, S) confidence.
         anchor: (N, 3) anchor rays.
         radius: (N,) reach in ray units (h).
-        focal: (fx, fy) of the next camera: errors are in pixels.
+        focal: (2,) focal lengths of the next camera: errors are in pixels.
     """
     # one array (N, C, S) per coordinate, the pixels contiguous
     y = R @ np.ascontiguousarray(ray.transpose(0, 2, 1))[:, None]

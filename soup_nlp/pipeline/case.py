@@ -118,9 +118,7 @@ def prepare(
         if log:
             log(str(evidence))
     if flow.options.upright and flow.options.ground and flow.options.method != "homography":
-        contact = off_ground(
-            start.soup, seg, pair.K_ref, start.component, ~start.borrowed, problem.seed
-        )
+        contact = off_ground(flow, start.soup, start.component, ~start.borrowed)
         start = replace(start, off_ground=contact)
     done("start", start)
     data, weights = build_energy(problem, pair, seg, start, given_depth)

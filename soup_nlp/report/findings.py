@@ -10,7 +10,6 @@ from soup_nlp.arrays import AnyFloat, Float
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.result import Result
-from soup_nlp.start.components import largest
 
 SHARES = {
     "flow": "by flow and parallax",
@@ -154,7 +153,7 @@ def _shift(run: Run, shift: Float) -> str:
 
 def flow_words(run: Run) -> list[str]:
     """Usable flow, and how well simpler explanations than depth fit it."""
-    sure, main = run.confidence.evidence, largest(run.start.component)
+    sure, main = run.confidence.evidence, np.argmax(np.bincount(run.start.component))
     assert run.pair.flow is not None
     lines = [f"usable at {run.pair.flow.usable:.0%} of the pixels, noise {sure.noise:.2f} px"]
     if np.isfinite(sure.turn[main]):

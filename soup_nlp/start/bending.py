@@ -143,7 +143,7 @@ def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
         views: The flow.
         size: Number of parameters of `turned` that are free.
     """
-    ray, target, weight, _ = views.matches(most=FIT_PIXELS)
+    ray, target, weight, _ = views.matches(FIT_PIXELS)
     scale = np.sqrt(weight)[:, None] * views.focal
     x, _ = fit_robustly(turned, size, ray, target[:, :2], scale)
     return rotation.exp(x[:3]), views.distance(views.ray @ turned(x).T)
@@ -263,7 +263,7 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     most = systematic_error(noise) + NOISES * noise
     motions = dominant(flow)
     label = np.argmin(views.fit(motions).penalised(), axis=1)
-    whole = surface[seg.pairs[:, 0]] == surface[seg.pairs[:, 1]]
+    whole = ~seg.across(surface)
     surface = joined(flow, surface)
     bends = np.zeros(len(seg), bool)
     left = [np.flatnonzero(surface == c) for c in np.unique(surface[usable])]
@@ -274,7 +274,7 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
         tried = candidates(flow, at, motions[0], present, noise)
         # RANSAC has an inlier distance, within which a compromise with the bending part has more
         # inliers than the motion of the least median error
-        matches, median = views.matches(at, FIT_PIXELS), []
+        matches, median = views.subset(at).matches(FIT_PIXELS), []
         if (motion := essential_motion(matches, None, flow.options.seed)) is not None:
             median = [refine_near(motion, matches, max(noise, LEAST_SCALE))]
         excess = views.subset(at).fit(tried + median).cost - flow.residual[at, None]

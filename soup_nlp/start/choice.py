@@ -10,7 +10,7 @@ from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.components import connected_pieces
-from soup_nlp.start.epipolar import Motion, estimate, fit_translation, repeated
+from soup_nlp.start.epipolar import SIDEWAYS, Motion, estimate, fit_translation, repeated
 from soup_nlp.start.views import FlowFit, Views
 
 CLIP = 3.0
@@ -39,8 +39,7 @@ def dominant(flow: FlowFit) -> list[Motion]:
     rng = np.random.default_rng(seed)
     pick = good if len(good) <= 6000 else rng.choice(good, 6000, replace=False)
     motions = repeated(matches.at(pick), DOMINANT, flow.options.threshold_px, seed)
-    # nothing determines a motion (no flow at all): a sideways camera keeps depth defined
-    return motions or [Motion(np.eye(3), np.array([1.0, 0.0, 0.0]))]
+    return motions or [SIDEWAYS]
 
 
 LEAST_NOISE, MOST_NOISE = 0.05, 0.6
@@ -72,7 +71,7 @@ def of_pieces(flow: FlowFit, motions: list[Motion], cost: Float, noise: float) -
     for c in np.argsort(-sizes)[:PIECES]:
         if sizes[c] < PIECE_SIZE:
             break
-        matches = flow.views.matches(np.flatnonzero(piece == c))
+        matches = flow.views.subset(piece == c).matches()
         motion = estimate(matches, max(3 * noise, 0.3), flow.options.seed)
         out += [] if motion is None else [motion]
         out.append(fit_translation(motions[0].R, matches, max(noise, 0.1)))
@@ -167,10 +166,14 @@ class Choice:
         """(N,) pixels that each translation moves the anchor."""
         return self.fit.parallax[:, 0] * np.abs(self.fit.inverse_depth[:, 0])
 
+    def main_error(self, views: Views) -> Float:
+        """(N,) penalised re-projection error under the first motion, pixels."""
+        return views.fit(self.motions[:1]).penalised()[:, 0]
+
     def gain(self, views: Views) -> Float:
         """(N,) error, pixels, that the motions save over the first one, times the confidence."""
-        alone = views.fit(self.motions[:1]).penalised()[:, 0]
-        return np.clip(alone - self.error, 0.0, CLIP) * views.weight.mean(axis=1)
+        saved = np.clip(self.main_error(views) - self.error, 0.0, CLIP)
+        return saved * views.weight.mean(axis=1)
 
 
 def rigid_choice(flow: FlowFit, motions: list[Motion]) -> Choice:

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation, connected
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.views import FlowFit
@@ -37,11 +36,6 @@ SCENE = 0
 """Index of the component that is the static scene: depths and motions refer to it."""
 
 
-def largest(label: Int) -> int:
-    """The most frequent index of (N,) labels."""
-    return int(np.argmax(np.bincount(label)))
-
-
 def borrow(
     mu: Float, slope: Float, label: Int, weak: Mask, seg: Segmentation
 ) -> tuple[Float, Float]:
@@ -63,9 +57,8 @@ def borrow(
     for c in np.unique(label[weak]):
         borrowers, strong = weak & (label == c), ~weak & (label == c)
         lenders = np.flatnonzero(strong if strong.any() else ~weak)
-        near = cKDTree(seg.anchors[lenders]).query(seg.anchors[borrowers], k=min(5, len(lenders)))[
-            1
-        ]
+        count = min(5, len(lenders))
+        _, near = cKDTree(seg.anchors[lenders]).query(seg.anchors[borrowers], k=count)
         mu[borrowers] = np.median(mu[lenders][near.reshape(borrowers.sum(), -1)], axis=1)
         slope[borrowers] = 0.0
     return mu, slope
@@ -171,7 +164,7 @@ def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[
     tie[SCENE] = TIES.index("reference")
     if count == 1 or not len(seg.pairs):
         return np.ones(len(soup)), tie[label]
-    zi, zk = depth_from_inside(soup, label, seg, flow.K_ref)
+    zi, zk = depth_from_inside(flow, soup, label)
     ratio = np.log(np.concatenate([zk / zi, zi / zk]))
     at_camera = np.zeros(count, bool)
     at_camera[label[fixed]] = True
@@ -210,7 +203,7 @@ def contact_scales(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> tuple[
     return np.exp(log_scale)[label], tie[label]
 
 
-def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -> Float:
+def depth_from_inside(flow: FlowFit, soup: Soup, label: Int) -> Float:
     """(2, B) depths of both components at the B pairs across outlines, from planes further inside.
 
     The flow is blurred across an outline, which falsifies the planes of the superpixels along it.
@@ -218,27 +211,21 @@ def depth_from_inside(soup: Soup, label: Int, seg: Segmentation, K_ref: Float) -
     boundary; without inner neighbours the superpixel's own plane is used.
 
     Args:
+        flow: The flow of every superpixel.
         soup: Planes.
         label: (N,) index of the component.
-        seg: Superpixels and graphs.
-        K_ref: (3, 3) intrinsics of the reference frame.
     """
-    i, k = seg.pairs.T
-    across = label[i] != label[k]
-    pairs, ray = seg.pairs[across], rays(K_ref, seg.boundary[across].mean(axis=1))
+    seg, across = flow.seg, flow.seg.across(label)
+    pairs, ray = seg.pairs[across], flow.middle[across]
     outline = np.zeros(len(soup), bool)
     outline[pairs] = True
-    behind: list[list[int]] = [[] for _ in range(len(soup))]
-    for a, b in seg.pairs[~across]:
-        if not outline[b]:
-            behind[a].append(b)
-        if not outline[a]:
-            behind[b].append(a)
+    links = np.concatenate([seg.pairs[~across], seg.pairs[~across, ::-1]])
+    first, second = links[~outline[links[:, 1]]].T
     depth = soup.depth_across(pairs, ray)
     for side, p in np.ndindex(depth.shape):
-        inner = behind[pairs[p, side]]
-        if inner:
-            inner_depth = soup.depth_across(np.array([inner]), ray[p : p + 1])
+        inner = second[first == pairs[p, side]]
+        if len(inner):
+            inner_depth = soup.depth_across(inner[None], ray[p : p + 1])
             depth[side, p] = 1 / np.median(1 / inner_depth)
     return depth
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -42,6 +42,15 @@ class Motion:
         return rotation.hat(self.t) @ self.R
 
 
+SIDEWAYS = Motion(np.eye(3), np.array([1.0, 0.0, 0.0]))
+"""The motion where nothing determines one: it keeps depth defined."""
+
+
+def stacked(motions: Sequence[Motion]) -> tuple[Float, Float]:
+    """Rotations (M, 3, 3) and translations (M, 3) of motions."""
+    return np.stack([m.R for m in motions]), np.stack([m.t for m in motions])
+
+
 class Matches(NamedTuple):
     """Correspondences of two frames.
 
@@ -60,6 +69,11 @@ class Matches(NamedTuple):
     def at(self, which: Int | Mask | slice) -> Matches:
         """Some of the correspondences."""
         return Matches(self.ray[which], self.target[which], self.weight[which], self.focal)
+
+    def confident(self, most: int) -> Matches:
+        """Those with weight; evenly about `most` of them if there are more."""
+        use = np.flatnonzero(self.weight > 0)
+        return self.at(use[:: max(1, len(use) // most)])
 
     def distance(self, motion: Motion) -> Float:
         """(M,) Sampson distance to a motion, pixels."""
@@ -119,23 +133,17 @@ def essential_motion(matches: Matches, threshold: float | None, seed: int = 0) -
     if E is None or E.shape[0] < 3 or not np.isfinite(E).all():
         return None
     # several solutions come stacked: keep the one with the smallest robust distance
-    stack = np.ascontiguousarray(E[: 3 * (len(E) // 3)]).reshape(-1, 3, 3)
-    cost = [np.mean(np.minimum(np.abs(sampson(e, r, q, focal)), 3.0)) for e in stack]
-    return _decompose(np.ascontiguousarray(stack[int(np.argmin(cost))]), r, q)
+    stack = E[: 3 * (len(E) // 3)].reshape(-1, 3, 3)
+    best = min(stack, key=lambda e: np.mean(np.minimum(np.abs(sampson(e, r, q, focal)), 3.0)))
+    R1, R2, t = cv2.decomposeEssentialMat(best)
 
+    def in_front(motion: Motion) -> int:
+        z, z_next = triangulate(motion, r, q)
+        return int(np.sum((z > 0) & (z_next > 0)))
 
-def _decompose(E: Float, r: Float, q: Float) -> Motion | None:
-    """Decomposition (R, t) of E with the most points in front of both cameras."""
-    R1, R2, t = cv2.decomposeEssentialMat(E)
-    t = t.ravel()
-    best, most = None, -1
-    for R in (R1, R2):
-        for s in (1.0, -1.0):
-            z, z_next = triangulate(Motion(R, s * t), r, q)
-            front = int(np.sum((z > 0) & (z_next > 0)))
-            if front > most:
-                best, most = Motion(R, s * t), front
-    return best
+    # of the four decompositions the one with the most points in front of both cameras
+    motions = [Motion(R, s * t.ravel()) for R in (R1, R2) for s in (1.0, -1.0)]
+    return max(motions, key=in_front)
 
 
 def triangulate(motion: Motion, r: Float, q: Float) -> tuple[Float, Float]:
@@ -246,7 +254,11 @@ def essential_slope(motion: Motion, x: Float) -> Float:
     return np.concatenate([by_turn, by_shift]).reshape(5, 9)
 
 
-def fit_translation(R: Float, matches: Matches, noise: float, rounds: int = 6) -> Motion:
+ROUNDS = 6
+"""Re-weighted fits of a translation."""
+
+
+def fit_translation(R: Float, matches: Matches, noise: float) -> Motion:
     """Motion with a given rotation whose translation explains correspondences best.
 
     The epipolar constraint `t . (R r x q) = 0` is linear in t, which is the eigenvector of the
@@ -256,11 +268,10 @@ def fit_translation(R: Float, matches: Matches, noise: float, rounds: int = 6) -
         R: (3, 3) rotation.
         matches: Correspondences.
         noise: Flow noise, pixels: errors beyond it are down-weighted.
-        rounds: Reweighting rounds.
     """
     r, q, weight, focal = matches
     normal, w, t = np.cross(r @ R.T, q), weight, np.zeros(3)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         t = np.linalg.eigh((normal * w[:, None]).T @ normal)[1][:, 0]
         spread = np.maximum(np.linalg.norm(np.cross(t, q)[:, :2], axis=1), 1e-6)
         # Sampson's weight: error in pixels, not the algebraic one
@@ -325,8 +336,7 @@ def focal_length(matches: Matches, sigma: float, seed: int = 0) -> tuple[float, 
         sigma: Standard deviation of its logarithm.
         seed: Of the fits.
     """
-    use = np.flatnonzero(matches.weight > 0)
-    r, q, weight, focal = matches.at(use[:: max(1, len(use) // FOCAL_PIXELS)])
+    r, q, weight, focal = matches.confident(FOCAL_PIXELS)
     error = np.full(len(FOCAL_FACTORS), np.inf)
     for k, factor in enumerate(FOCAL_FACTORS):
         longer = [factor, factor, 1.0]

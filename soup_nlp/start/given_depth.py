@@ -79,16 +79,14 @@ def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tup
     # components that are fixed in the image keep their depth relative to the scene
     fixed = start.tie == FIXED
     off, strong = np.zeros(n), fixed.copy()
-    rigid = np.unique(start.component[~start.bends & ~fixed])
-    for c in sorted(rigid, key=lambda c: bool(c != SCENE)):
-        mask = start.component == c
+    for c in np.unique(start.component[~start.bends & ~fixed]):
         determined = evidence.determined if c == SCENE else seen.relief(c) > seen.tells
-        soup, strong[mask] = _shaped(seen, soup, c, prior, evidence.sigma, determined)
-        firm = mask & strong
+        soup, firm = _shaped(seen, soup, c, prior, evidence.sigma, determined)
+        strong |= firm
         if not firm.any():
             continue
         gap = np.log(soup.depth_at(anchor)) - prior
-        off[mask] = np.median(gap[firm])
+        off[start.component == c] = np.median(gap[firm])
         if c == SCENE:
             shift, sigma = _local(seg, firm & with_value, gap - off, evidence.sigma)
             prior = np.where(main, prior + shift, prior)
@@ -128,20 +126,19 @@ def _shaped(
         determined: Whether the flow determines the depth of the component.
 
     Returns:
-        The soup, and for every member of the component whether the flow determines its depth.
+        The soup, and (N,) True for members of the component whose depth the flow determines.
     """
-    mask, use, views = seen.start.component == c, seen.members(c), seen.flow.views
-    every = np.ones(mask.sum(), bool)
+    start, use, views = seen.start, seen.members(c), seen.flow.views
+    mask = start.component == c
     rigid = np.ptp(soup.R[mask], axis=0).max() < 1e-9 and np.any(soup.translation[mask][0])
     if len(use) < FEWEST or not rigid:
-        borrowed = seen.start.borrowed[mask]
-        return soup, every if borrowed.all() else ~borrowed
+        firm = mask & ~start.borrowed
+        return soup, firm if firm.any() else mask
     if not determined:
         _, R, T, _ = seen.motion(use, np.exp(-prior[use]))
         by_prior = views.soup(np.exp(-prior), np.zeros((len(prior), 2)), R, T)
-        return soup.taking(by_prior, mask), ~every
-    settled, strong = seen.settled(soup, c, prior, sigma)
-    return settled, strong[mask]
+        return soup.taking(by_prior, mask), np.zeros(len(mask), bool)
+    return seen.settled(soup, c, prior, sigma)
 
 
 def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:

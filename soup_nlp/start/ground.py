@@ -18,8 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.geometry.camera import rays
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import (
     FIXED,
@@ -66,25 +64,25 @@ TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
 
-def ground(mu: Float, ray: Float, weight: Float, reliable: Mask, seed: int) -> Float:
-    """(N,) inverse depth of the ground on every ray; 0 above the horizon and where there is none.
+def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
+    """(N,) inverse depth of the ground at the anchors; 0 above the horizon and without a ground.
+
+    None is sought unless the options `upright` and `ground` are set.
 
     Args:
+        flow: The flow of every superpixel.
         mu: (N,) inverse depth at the anchors.
-        ray: (N, 3) their rays.
-        weight: (N,) area of every superpixel.
         reliable: (N,) True where the depth is reliable.
-        seed: Seed of the random planes.
     """
-    none = np.zeros(len(mu))
-    at = np.flatnonzero(reliable)
-    if len(at) < 20:
+    none, at = np.zeros(len(mu)), np.flatnonzero(reliable)
+    ray, weight, o = flow.views.anchor, flow.seg.sizes.astype(float), flow.options
+    if len(at) < 20 or not (o.upright and o.ground):
         return none
     # inverse depth of a plane is linear in the ray; (x, y, 1) . p with p along the normal
     low = at[ray[at, 1] > np.quantile(ray[at, 1], 0.4)]
     if len(low) < 3:
         return none
-    three = np.random.default_rng(seed).choice(low, (TRIALS, 3))
+    three = np.random.default_rng(o.seed).choice(low, (TRIALS, 3))
     three = three[np.abs(np.linalg.det(ray[three])) > 1e-6]
     planes = np.linalg.solve(ray[three], mu[three][..., None])[..., 0]
     planes = planes[planes[:, 1] > LEVEL * np.linalg.norm(planes, axis=1)]
@@ -103,16 +101,14 @@ def ground(mu: Float, ray: Float, weight: Float, reliable: Mask, seed: int) -> F
         best = np.linalg.lstsq(ray[inliers] * root[:, None], mu[inliers] * root)[0]
     plane_mu = ray @ best
     below = (plane_mu > 0) & (mu < (1 - BELOW) * plane_mu)
-    total = weight[at].sum()
-    if weight[at][on(best)].sum() < LEAST_ON * total:
-        return none
-    if weight[reliable & below].sum() > MOST_BELOW * total:
+    total, area_on = weight[at].sum(), weight[at][on(best)].sum()
+    if area_on < LEAST_ON * total or weight[reliable & below].sum() > MOST_BELOW * total:
         return none
     return np.maximum(plane_mu, 0.0)
 
 
 def above_ground(
-    soup: Soup, ray: Float, weight: Float, reliable: Mask, component: Int, floor: Float
+    flow: FlowFit, soup: Soup, reliable: Mask, component: Int, floor: Float
 ) -> tuple[Soup, Mask]:
     """The soup with unreliable or independently moving parts lifted to the ground.
 
@@ -120,9 +116,8 @@ def above_ground(
     becomes shorter. Single superpixels of the scene keep the translation they share.
 
     Args:
+        flow: The flow of every superpixel.
         soup: Start, its components scaled.
-        ray: (N, 3) rays of the anchors.
-        weight: (N,) area of every superpixel.
         reliable: (N,) True where the depth is reliable and belongs to the scene.
         component: (N,) group that moves as one.
         floor: (N,) inverse depth of the ground (`ground`).
@@ -130,7 +125,7 @@ def above_ground(
     Returns:
         The soup, and (N,) True in components that were lifted as a whole.
     """
-    mu = 1 / soup.depth_at(ray)
+    mu, weight = 1 / soup.depth_at(flow.views.anchor), flow.seg.sizes
     scene = component == SCENE
     lam, t = soup.lam.copy(), soup.t.copy()
     lifted = np.zeros(len(mu), bool)
@@ -172,43 +167,36 @@ class Region(NamedTuple):
 
 
 def regions(
-    soup: Soup,
-    seg: Segmentation,
-    K_ref: Float,
-    floor: Float,
-    component: Int,
-    ratios: tuple[float, float],
+    flow: FlowFit, soup: Soup, floor: Float, component: Int, ratios: tuple[float, float]
 ) -> list[Region]:
     """Regions off the ground, with the ground visible along most of their lower borders.
 
-    Regions of fewer than `FEWEST` superpixels are left out.
+    Regions of fewer than `FEWEST` superpixels are left out, and those of the scene with more than
+    `MOST_AREA` of the image.
 
     Args:
+        flow: The flow of every superpixel.
         soup: Start, its components scaled.
-        seg: Superpixels and graphs.
-        K_ref: (3, 3) intrinsics of the reference frame.
         floor: (N,) inverse depth of the ground (`ground`).
         component: (N,) group that moves as one.
         ratios: Between these ratios to its inverse depth a superpixel lies on the ground.
     """
     if not floor.any():
         return []
-    ray = rays(K_ref, seg.anchors)
+    seg, ray, middle = flow.seg, flow.views.anchor, flow.middle
     mu = 1 / soup.depth_at(ray)
     on_ground = (floor > 0) & (mu > ratios[0] * floor) & (mu <= ratios[1] * floor)
-    middle = rays(K_ref, seg.boundary.mean(axis=1))
     depth = soup.depth_across(seg.pairs, middle)
     step = np.log(depth[1] / depth[0])
-    i, k = seg.pairs.T
-    whole = (np.abs(step) < STEP) & (component[i] == component[k])
+    whole = (np.abs(step) < STEP) & ~seg.across(component)
     region = 1 + connected_pieces(~on_ground, seg, whole)
-    around, across = outlines(region, seg), region[i] != region[k]
+    around, across = outlines(region, seg), seg.across(region)
     plane = np.linalg.lstsq(ray[floor > 0], floor[floor > 0])[0]
     # by entry of the outlines: log ratios of the other side's and the ground's depth to its own
     gap = np.concatenate([step[across], -step[across]])
     level = np.tile(-np.log(np.maximum(middle @ plane, 1e-9))[across], 2)
     rise = level - np.log(depth[:, across]).ravel()
-    scene = int(np.argmax(component == SCENE))
+    scene, first = component == SCENE, int(np.argmax(component == SCENE))
     down = soup.n[:, 1] > FACES_DOWN
     fills = down[seg.pairs[across].T.ravel()]
     out = []
@@ -219,6 +207,8 @@ def regions(
         visible = on.any() and around.weight[on].sum() >= VISIBLE * around.weight[low].sum()
         if mine.sum() < FEWEST or not visible:
             continue
+        if seg.sizes[mine].sum() > MOST_AREA * seg.sizes.sum() and scene[mine].any():
+            continue
         body = mine & ~down
         # what fills a gap has the depth of the rest
         own = level + np.log(np.median(mu[body])) if body.any() else rise
@@ -226,42 +216,27 @@ def regions(
         above, off = (quantile(v[on], around.weight[on], GROUND) for v in values)
         behind = around.contact[edge & (gap > STEP)].sum() / around.contact[edge].sum()
         point, t = (np.exp(above) * v[mine] for v in (soup.points(ray), soup.translation))
-        moved = np.einsum("nij,nj->ni", soup.R[mine], point) + t - soup.translation[scene]
-        way = np.median(moved @ soup.R[scene] - point, axis=0)
+        moved = np.einsum("nij,nj->ni", soup.R[mine], point) + t - soup.translation[first]
+        way = np.median(moved @ soup.R[first] - point, axis=0)
         climb = abs(way @ plane) / max(np.linalg.norm(way) * np.linalg.norm(plane), 1e-12)
         out.append(Region(mine, above, off, float(behind), float(climb)))
     return out
 
 
-def small_or_moves(region: Mask, seg: Segmentation, component: Int) -> bool:
-    """Whether a region (N,) has at most `MOST_AREA` of the image or is no part of the scene."""
-    share = seg.sizes[region].sum() / seg.sizes.sum()
-    return bool(share <= MOST_AREA or (component[region] != SCENE).all())
-
-
-def floating(
-    soup: Soup, seg: Segmentation, K_ref: Float, floor: Float, component: Int
-) -> list[tuple[Mask, float]]:
-    """Masks (N,) of the regions that float above the ground, and their depth ratios to it.
+def floating(flow: FlowFit, soup: Soup, floor: Float, component: Int) -> list[Region]:
+    """The regions that float above the ground; the arguments are those of `regions`.
 
     A region floats if it is in front of most of its surroundings, the ground along its lower border
-    is clearly farther, and it moves along the ground there: what hangs in the air does not. The
-    arguments are those of `regions`.
+    is clearly farther, and it moves along the ground there: what hangs in the air does not.
     """
     return [
-        (r.members, float(np.exp(r.ground)))
-        for r in regions(soup, seg, K_ref, floor, component, (1 - BELOW, RISES))
-        if small_or_moves(r.members, seg, component)
-        and r.climb < MOST_CLIMB
-        and r.behind > IN_FRONT
-        and r.ground > FLOATS
-        and r.step > STEP
+        r
+        for r in regions(flow, soup, floor, component, (1 - BELOW, RISES))
+        if r.climb < MOST_CLIMB and r.behind > IN_FRONT and r.ground > FLOATS and r.step > STEP
     ]
 
 
-def off_ground(
-    soup: Soup, seg: Segmentation, K_ref: Float, component: Int, reliable: Mask, seed: int
-) -> Float:
+def off_ground(flow: FlowFit, soup: Soup, component: Int, reliable: Mask) -> Float:
     """(N,) log ratio of the depth of the ground below a region to its own, 0 where none is known.
 
     The camera's motion explains what moves along the epipolar lines at a wrong depth. Where the
@@ -269,26 +244,22 @@ def off_ground(
     that of the component with the largest area on a level plane.
 
     Args:
+        flow: The flow of every superpixel.
         soup: Start.
-        seg: Superpixels and graphs.
-        K_ref: (3, 3) intrinsics of the reference frame.
         component: (N,) group that moves as one.
         reliable: (N,) True where the depth is reliable.
-        seed: Seed of the random planes.
     """
-    ray, area = rays(K_ref, seg.anchors), seg.sizes.astype(float)
-    mu = 1 / soup.depth_at(ray)
-    floor, most = np.zeros(len(mu)), 0.0
+    mu, area = 1 / soup.depth_at(flow.views.anchor), flow.seg.sizes
+    floor, most = np.zeros(len(mu)), 0
     for c in range(int(component.max()) + 1):
         own = component == c
-        level = ground(mu, ray, area, reliable & own, seed)
+        level = ground(flow, mu, reliable & own)
         on = area[own & (np.abs(mu - level) < ON * level)].sum()
         if on > most:
             floor, most = level, on
     out = np.zeros(len(mu))
-    for r in regions(soup, seg, K_ref, floor, component, (np.exp(-STANDS), np.exp(STANDS))):
-        if small_or_moves(r.members, seg, component):
-            out[r.members] = r.ground
+    for r in regions(flow, soup, floor, component, (np.exp(-STANDS), np.exp(STANDS))):
+        out[r.members] = r.ground
     return out
 
 
@@ -307,15 +278,14 @@ def on_ground(
     Returns:
         Soup, components, ties and (N,) inverse depth of the ground, see `ground`.
     """
-    anchor, area = flow.views.anchor, flow.seg.sizes.astype(float)
     reliable = reliable & (component == SCENE)
-    floor = ground(1 / soup.depth_at(anchor), anchor, area, reliable, flow.options.seed)
-    soup, lifted = above_ground(soup, anchor, area, reliable, component, floor)
+    floor = ground(flow, 1 / soup.depth_at(flow.views.anchor), reliable)
+    soup, lifted = above_ground(flow, soup, reliable, component, floor)
     tie = np.where(lifted & (tie != FIXED), TIES.index("ground"), tie)
     lam, component = soup.lam.copy(), component.copy()
-    for region, farther in floating(soup, flow.seg, flow.K_ref, floor, component):
+    for region in floating(flow, soup, floor, component):
         # at the depth of the ground its flow shows a motion of its own
-        lam[region] *= farther
-        component[region] = component.max() + 1
-        tie[region] = TIES.index("contact below")
+        lam[region.members] *= np.exp(region.ground)
+        component[region.members] = component.max() + 1
+        tie[region.members] = TIES.index("contact below")
     return replace(soup, lam=lam), numbered(component), tie, floor

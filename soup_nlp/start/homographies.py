@@ -11,25 +11,16 @@ The result is the unorganised soup.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.geometry.plane import about_anchor, at_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.epipolar import Matches, Motion, essential_motion
-from soup_nlp.start.views import LEAST_PIXELS, FlowFit, Views
+from soup_nlp.start.epipolar import SIDEWAYS, Matches, Motion, essential_motion, stacked
+from soup_nlp.start.views import LEAST_PIXELS, FlowFit
 
 MOST_PIXELS = 400
 """Largest number of correspondences to which a motion is fitted."""
-
-
-class Patch(NamedTuple):
-    """Motion of a superpixel, and m = -n / d with |t| = 1 as the length unit."""
-
-    motion: Motion
-    m: Float
 
 
 def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
@@ -42,34 +33,30 @@ def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
     patches = [_patch(flow, i) for i in range(len(seg))]
     fails = np.array([p is None for p in patches])
     source = np.arange(len(seg)) if fails.all() else seg.nearest(~fails)
-    sideways = Patch(Motion(np.eye(3), np.array([1.0, 0.0, 0.0])), np.array([0.0, 0.0, 1.0]))
-    sources = [patches[s] or sideways for s in source]
-    R, t = (np.stack([getattr(p.motion, name) for p in sources]) for name in ("R", "t"))
+    sideways = SIDEWAYS, np.array([0.0, 0.0, 1.0])
+    motions, planes = zip(*(patches[s] or sideways for s in source))
+    R, t = stacked(motions)
     # a borrowed plane keeps depth and slopes, since at this anchor it may be behind the camera
-    depth, slope = at_anchor(np.stack([p.m for p in sources]), anchor[source])
+    depth, slope = at_anchor(np.stack(planes), anchor[source])
     n, D = normal_and_distance(about_anchor(np.ones(len(seg)), slope, anchor))
     return Soup(np.ones(len(seg)), n, D, R, t / depth[:, None]), fails
 
 
-def _patch(flow: FlowFit, i: int) -> Patch | None:
-    """Motion and plane of a superpixel; None if its flow does not determine them."""
+def _patch(flow: FlowFit, i: int) -> tuple[Motion, Float] | None:
+    """Motion of a superpixel, and m = -n / d with |t| = 1 as the length unit.
+
+    None if its flow does not determine them.
+    """
     views, o = flow.views, flow.options
-    inside = confident(views, np.array([i]))
+    inside = views.subset(np.array([i])).matches().confident(MOST_PIXELS)
     if len(inside.ray) < LEAST_PIXELS:
         return None
-    around = confident(views, np.append(i, flow.seg.knn[i]))
-    motion = essential_motion(around, o.threshold_px, o.seed)
+    around = views.subset(np.append(i, flow.seg.knn[i])).matches()
+    motion = essential_motion(around.confident(MOST_PIXELS), o.threshold_px, o.seed)
     if motion is None:
         return None
     m, seen = plane_of(motion, inside), np.vstack([inside.ray, views.anchor[i]])
-    return Patch(motion, m) if (seen @ m > 0).all() else None
-
-
-def confident(views: Views, members: Int) -> Matches:
-    """Correspondences of superpixels (M,) with weight, evenly subsampled if there are many."""
-    matches = views.matches(members)
-    use = np.flatnonzero(matches.weight > 0)
-    return matches.at(use[:: max(1, len(use) // MOST_PIXELS)])
+    return (motion, m) if (seen @ m > 0).all() else None
 
 
 def plane_of(motion: Motion, matched: Matches) -> Float:

@@ -52,7 +52,7 @@ def gather(flow: FlowFit, choice: Choice) -> Choice:
         piece = connected_pieces(mover, flow.seg, flow.jump < share * flow.options.discontinuity_px)
         for c in np.unique(piece[mover]):
             at = np.flatnonzero(piece == c)
-            present = [choice.motions[c] for c in np.unique(label[at])]
+            present = [choice.motions[m] for m in np.unique(label[at])]
             # it has one motion already, and a change of it by a few pixels is not reliable
             if len(at) < PIECE_SIZE or len(present) == 1:
                 continue
@@ -75,7 +75,7 @@ def candidates(
     These are a translation with the rotation of `main`, before and after refinement, the `present`
     motions of the superpixels, refined, and the motion of their own essential matrix.
     """
-    matches = flow.views.matches(at, PIXELS)
+    matches = flow.views.subset(at).matches(PIXELS)
     start = [fit_translation(main.R, matches, max(noise, 0.1)), *present]
     motion = estimate(matches, max(3 * noise, 0.3), flow.options.seed)
     refined = [refine_near(m, matches, max(noise, 0.1)) for m in start]
@@ -135,10 +135,10 @@ def unmoved(flow: FlowFit, choice: Choice, component: Int) -> Mask:
     the adjacent flows is enough.
     """
     noise = limited_noise(choice.error)
-    error = flow.views.fit(choice.motions[:1]).penalised()[:, 0]
-    gain, shift, usable = choice.gain(flow.views), flow.displacement, flow.views.usable
+    error, gain = choice.main_error(flow.views), choice.gain(flow.views)
+    shift, usable = flow.displacement, flow.views.usable
     i, k = flow.seg.pairs.T
-    piece = connected_labels(component[i] == component[k], flow.seg)
+    piece = connected_labels(~flow.seg.across(component), flow.seg)
     moving, mixed = choice.label > 0, np.zeros(len(piece), bool)
     for p in np.unique(piece[(component != SCENE) & usable]):
         at = piece == p

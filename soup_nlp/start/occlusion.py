@@ -180,7 +180,7 @@ def in_order(start: Start, pair: Pair, flow: FlowFit) -> Start:
     if not whole.any():
         return start
     order = np.where(np.abs(contrast) > CONTRAST, whole, 0.0)
-    factor = placed(start.soup, region, order, start.tie, seg, pair.K_ref)
+    factor = placed(flow, start.soup, region, order, start.tie)
     moved = factor != 1
     # the scale of a placed region is held along its whole outline
     beside_moved = moved[seg.pairs].any(axis=1) & (flow.jump >= CLOSING_PX)
@@ -205,14 +205,11 @@ def regions(start: Start, flow: FlowFit) -> Int:
     if not start.at_rest:
         return np.where(start.bends, len(seg) + start.surface, start.component)
     still = fit_turn(flow.views)[1] < jump
-    i, k = seg.pairs.T
-    continuous = (still[i] == still[k]) & (flow.jump < jump)
+    continuous = ~seg.across(still) & (flow.jump < jump)
     return np.where(still, 0, 1 + connected_labels(continuous, seg))
 
 
-def placed(
-    soup: Soup, region: Int, order: Float, tie: Int, seg: Segmentation, K_ref: Float
-) -> Float:
+def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Float:
     """(N,) factor by which the scale of every superpixel is multiplied to bring regions in order.
 
     The largest region of the scene and those fixed in the image stay. The others are placed one
@@ -222,23 +219,22 @@ def placed(
     upper outline is `STANDING`. A region without an order moves with the one that it touches most.
 
     Args:
+        flow: The flow of every superpixel.
         soup: Planes.
         region: (N,) region of every superpixel.
         order: (P,) see `vote`.
         tie: (N,) origin of every superpixel's scale, see `components.TIES`.
-        seg: Superpixels and graphs.
-        K_ref: (3, 3) intrinsics of the reference frame.
     """
-    region = numbered(region)
+    seg, region = flow.seg, numbered(region)
     count = int(region.max()) + 1
     shift, done = np.zeros(count), np.zeros(count, bool)
     scene = np.argmax(np.bincount(region, tie == TIES.index("reference")))
     done[[scene, *region[tie == FIXED]]] = True
-    across = region[seg.pairs[:, 0]] != region[seg.pairs[:, 1]]
+    across = seg.across(region)
     around = outlines(region, seg)
     a, b, length = around.component, around.other, around.contact
     behind = np.concatenate([order[across], -order[across]])
-    step = np.log(depth_from_inside(soup, region, seg, K_ref))
+    step = np.log(depth_from_inside(flow, soup, region))
     step = np.concatenate([step[0] - step[1], step[1] - step[0]])
     middle = np.array([np.median(seg.anchors[region == c, 1]) for c in range(count)])
     upper = np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) < middle[a]

@@ -63,7 +63,7 @@ def _error_under(flow: FlowFit, camera: Motion, reliable: Mask) -> Float:
         return error
     reliable = reliable & (error < CONTRADICTED_PX) & (mu > 0)
     reliable &= fit.parallax[:, 0] * np.abs(mu) > LEAST_PARALLAX_PX
-    floor = ground(mu, views.anchor, flow.seg.sizes.astype(float), reliable, o.seed)
+    floor = ground(flow, mu, reliable)
     least = (1 - BELOW) * floor
     moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t
     return np.where(mu < least, np.maximum(error, views.distance(moved)), error)

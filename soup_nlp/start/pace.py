@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import FIXED, SCENE, TIES, TOO_FAST, outlines
@@ -78,10 +77,10 @@ def order_in_front(flow: FlowFit, soup: Soup, label: Int, tie: Int) -> Float | N
     pairs, near = flow.seg.pairs, (tie == TOO_FAST)[flow.seg.pairs]
     if not near.any():
         return None
-    z = soup.depth_across(pairs, rays(flow.K_ref, flow.seg.boundary.mean(axis=1)))
+    z = soup.depth_across(pairs, flow.middle)
     second = np.where(z[1] < z[0], near[:, 1], 0.0)
     first = np.where(z[0] < z[1], near[:, 0], 0.0)
-    return np.where(label[pairs[:, 0]] != label[pairs[:, 1]], second - first, 0.0)
+    return np.where(flow.seg.across(label), second - first, 0.0)
 
 
 def without_support(flow: FlowFit, label: Int, fixed: Mask) -> tuple[Int, Mask]:

@@ -18,7 +18,7 @@ from soup_nlp.start.components import (
     contact_scales,
     numbered,
 )
-from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.epipolar import Motion, stacked
 from soup_nlp.start.ground import on_ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import earned, gather, unmoved
@@ -26,10 +26,7 @@ from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
 from soup_nlp.start.pace import nearer_where_fast, order_in_front
 from soup_nlp.start.scene import scene_first
 from soup_nlp.start.settle import settle
-from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import LEAST_PARALLAX_PX, USABLE, FlowFit, Views
-
-__all__ = ["FlowFit", "SeededStart", "Start", "propose"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,16 +161,12 @@ def propose(flow: FlowFit) -> Start:
             # each connected region of the mask is a component
             regions = component.max() + 1 + connected_pieces(mask, seg)
             component = numbered(np.where(mask, regions, component))
-    component = scene_first(flow, soup, ~weak & rigid.views.usable, component, fixed)
+    reliable = ~weak & rigid.views.usable
+    component = scene_first(flow, soup, reliable, component, fixed)
     scale, tie = contact_scales(flow, soup, component, fixed)
     soup = replace(soup, lam=soup.lam * scale)
     soup, tie = nearer_where_fast(flow, soup, component, tie)
-    grounded = np.zeros(len(seg), bool)
-    if o.upright and o.ground:
-        soup, component, tie, floor = on_ground(
-            flow, soup, ~weak & rigid.views.usable, component, tie
-        )
-        grounded = weak & (floor > 0)
+    soup, component, tie, floor = on_ground(flow, soup, reliable, component, tie)
     mixed = unmoved(flow, choice, component) & ~(fixed | bends)
     return Start(
         soup=soup.normalised(),
@@ -186,7 +179,7 @@ def propose(flow: FlowFit) -> Start:
         motions=choice.motions,
         surface=surface,
         tie=tie,
-        grounded=grounded,
+        grounded=weak & (floor > 0),
         bends=bends,
         wrong=(wrong | fixed & (shift > STILL_PX)) & ~bends,
         noise=limited_noise(error[~bends]),
@@ -216,8 +209,8 @@ def _with_depth(flow: FlowFit, choice: Choice, wrong: Mask) -> tuple[Soup, Mask]
     else:
         length = np.ones(len(mu))
         mu, slope = borrow(mu, slope, choice.label, weak, flow.seg)
-    R, t = (np.stack([getattr(m, v) for m in choice.motions])[choice.label] for v in ("R", "t"))
-    return views.soup(mu, slope, R, t * length[:, None]), weak
+    R, t = stacked(choice.motions)
+    return views.soup(mu, slope, R[choice.label], t[choice.label] * length[:, None]), weak
 
 
 def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
@@ -232,12 +225,10 @@ def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
         component: (N,) rigid component of every superpixel.
         kept: (N,) True in components that stay.
     """
-    i, k = flow.seg.pairs.T
-    same = component[i] == component[k]
-    piece = connected_labels(same, flow.seg)
+    across = flow.seg.across(component)
+    piece = connected_labels(~across, flow.seg)
     weight = np.bincount(piece, flow.views.weight.mean(axis=1)) / np.bincount(piece)
     moves = kept | ((component != SCENE) & (weight >= USABLE)[piece])
-    beside = np.zeros(len(weight), bool)
-    for first, second in ((i, k), (k, i)):
-        beside[piece[first[~same & moves[second]]]] = True
-    return np.where(moves | beside[piece], component, SCENE)
+    ends = flow.seg.pairs[across]
+    beside = np.isin(piece, piece[ends[moves[ends[:, ::-1]]]])
+    return np.where(moves | beside, component, SCENE)

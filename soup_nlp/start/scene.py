@@ -28,15 +28,12 @@ def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Ma
         label: (N,) index of the component.
         fixed: (N,) True in components that are fixed in the image.
     """
-    seg, o, scene = flow.seg, flow.options, int(np.argmax(np.bincount(label, ~fixed)))
-    if o.upright and o.ground:
-        image = label[seg.labels]
-        below = stands_on(image, scene)
-        own = reliable & ~fixed & (label == below)
-        mu, area = 1 / soup.depth_at(flow.views.anchor), seg.sizes.astype(float)
-        if own.any() and stands_on(image, below) < 0:
-            level = ground(mu, flow.views.anchor, area, own, o.seed)
-            scene = below if level.any() else scene
+    scene, image = int(np.argmax(np.bincount(label, ~fixed))), label[flow.seg.labels]
+    below = stands_on(image, scene)
+    own = reliable & ~fixed & (label == below)
+    mu = 1 / soup.depth_at(flow.views.anchor)
+    if own.any() and stands_on(image, below) < 0 and ground(flow, mu, own).any():
+        scene = below
     return numbered(np.where(label == scene, -1, label))
 
 

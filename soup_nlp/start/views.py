@@ -15,7 +15,7 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import PlaneFit, about_anchor, fit_planes, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
-from soup_nlp.start.epipolar import Matches, Motion
+from soup_nlp.start.epipolar import Matches, Motion, stacked
 from soup_nlp.start.start_options import SeededStart
 
 USABLE = 0.5
@@ -36,7 +36,7 @@ class Views:
         weight: (N, S) confidence.
         anchor: (N, 3) anchor rays.
         radius: (N,) reach in ray units.
-        focal: (fx, fy) of the next camera, pixels.
+        focal: (2,) focal lengths of the next camera, pixels.
     """
 
     ray: Float
@@ -44,7 +44,7 @@ class Views:
     weight: Float
     anchor: Float
     radius: Float
-    focal: tuple[float, float]
+    focal: Float
 
     @property
     def usable(self) -> Mask:
@@ -55,14 +55,13 @@ class Views:
         """Planes (N, M) under each of M motions, or (N, 1) under that of index `label` (N,)."""
         each = np.arange(len(motions))[None] if label is None else label[:, None]
         each = np.broadcast_to(each, (len(self.ray), each.shape[1]))
-        R, t = np.stack([m.R for m in motions])[each], np.stack([m.t for m in motions])[each]
-        return fit_planes(
-            R, t, self.ray, self.target, self.weight, self.anchor, self.radius, self.focal
-        )
+        R, t = stacked(motions)
+        samples = self.ray, self.target, self.weight
+        return fit_planes(R[each], t[each], *samples, self.anchor, self.radius, self.focal)
 
     def distance(self, moved: Float) -> Float:
         """(N,) mean distance of points (N, S, 3) of the next camera from the targets, pixels."""
-        off = (moved[..., :2] / moved[..., 2:] - self.target[..., :2]) * np.asarray(self.focal)
+        off = (moved[..., :2] / moved[..., 2:] - self.target[..., :2]) * self.focal
         return self.mean(np.linalg.norm(off, axis=2))
 
     def mean(self, value: Float) -> Float:
@@ -85,18 +84,15 @@ class Views:
 
     def parallax(self, soup: Soup) -> Float:
         """(N,) distance in pixels between the moved and the merely rotated anchor."""
-        return np.linalg.norm(soup.parallax(self.anchor) * np.asarray(self.focal), axis=1)
+        return np.linalg.norm(soup.parallax(self.anchor) * self.focal, axis=1)
 
-    def matches(self, at: Int | None = None, most: int | None = None) -> Matches:
-        """Pixels of superpixels `at`, or of all; evenly about `most` of them if there are more."""
-        ray, target, weight = (
-            v if at is None else v[at] for v in (self.ray, self.target, self.weight)
-        )
-        step = max(1, weight.size // most) if most else 1
-        r, q = (v.reshape(-1, 3)[::step] for v in (ray, target))
-        return Matches(r, q, weight.ravel()[::step], self.focal[0])
+    def matches(self, most: int | None = None) -> Matches:
+        """The sampled pixels; evenly about `most` of them if there are more."""
+        step = max(1, self.weight.size // most) if most else 1
+        r, q = (v.reshape(-1, 3)[::step] for v in (self.ray, self.target))
+        return Matches(r, q, self.weight.ravel()[::step], self.focal[0])
 
-    def subset(self, at: Int) -> Views:
+    def subset(self, at: Int | Mask) -> Views:
         """The views of superpixels `at`."""
         ray, target, weight = self.ray[at], self.target[at], self.weight[at]
         return Views(ray, target, weight, self.anchor[at], self.radius[at], self.focal)
@@ -161,8 +157,8 @@ class FlowFit(NamedTuple):
         anchor = rays(K_ref, seg.anchors)
         reach = (rays(K_ref, seg.rim) - anchor[:, None])[..., :2]
         radius = np.maximum(np.linalg.norm(reach, axis=-1).max(axis=1), 1.0 / K_ref[0, 0])
-        focal = (float(K_next[0, 0]), float(K_next[1, 1]))
-        views = Views(rays(K_ref, uv), rays(K_next, uv + shift), weight, anchor, radius, focal)
+        targets, focal = rays(K_next, uv + shift), np.diag(K_next)[:2]
+        views = Views(rays(K_ref, uv), targets, weight, anchor, radius, focal)
         fitted = cls(seg, K_ref, K_next, o, views, poor, *affine_flow(views), np.zeros(0))
         edge = rays(K_ref, seg.boundary)
         first, second = (fitted.followed(which, edge) for which in seg.pairs.T)
@@ -184,6 +180,11 @@ class FlowFit(NamedTuple):
         return np.asarray(moved)
 
     @property
+    def middle(self) -> Float:
+        """(P, 3) rays of the middles of the boundaries between neighbours."""
+        return rays(self.K_ref, self.seg.boundary.mean(axis=1))
+
+    @property
     def centre(self) -> Float:
         """(N, 3) rays of the next frame to which the anchors move."""
         moved = self.fit[:, 0] / self.views.focal
@@ -201,13 +202,12 @@ class FlowFit(NamedTuple):
         return self.fit[:, 0] - self.views.anchor[:, :2] * self.views.focal
 
 
-def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Float, Float]:
-    """Affine flow of every superpixel, fitted robustly.
+QUADRATIC_PX, ROUNDS = 0.1, 8
+"""Error of an affine flow below which its loss is quadratic, pixels, and re-weighted fits."""
 
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        noise: Residual, pixels, below which errors are squared.
-        rounds: Number of re-weighted fits.
+
+def affine_flow(views: Views) -> tuple[Float, Float]:
+    """Affine flow of every superpixel, fitted robustly.
 
     Returns:
         (N, 3, 2) maps from offsets in radii to targets in pixels, and (N,) their mean error in
@@ -215,13 +215,13 @@ def affine_flow(views: Views, noise: float = 0.1, rounds: int = 8) -> tuple[Floa
     """
     off = (views.ray - views.anchor[:, None])[..., :2] / views.radius[:, None, None]
     basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
-    target = views.target[..., :2] * np.asarray(views.focal)
+    target = views.target[..., :2] * views.focal
     # without confident pixels any affine map will do; the ridge keeps the system regular
-    w = views.weight + 1e-6
+    w = confidence = views.weight + 1e-6
     fit = np.zeros((len(basis), 3, 2))
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         right = (basis * w[..., None]).transpose(0, 2, 1)
         fit = np.linalg.solve(right @ basis + 1e-9 * np.eye(3), right @ target)
         error = np.linalg.norm(basis @ fit - target, axis=2)
-        w = (views.weight + 1e-6) / np.sqrt(error**2 + noise**2)
+        w = confidence / np.sqrt(error**2 + QUADRATIC_PX**2)
     return fit, views.mean(error)

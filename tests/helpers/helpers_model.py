@@ -29,8 +29,6 @@ from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.model.superpixel import matrix_view, tangent_view
-from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import FlowFit, Views
 
 Float = NDArray[np.float64]
 
@@ -334,21 +332,3 @@ def world(name: str, units: str, at_anchors: bool) -> tuple[Soup, EnergyData]:
     )
     soup = plane_soup(pose, move, len(seg))
     return soup, in_pixels(data, soup, seg) if units == "pixels" else data
-
-
-def flow_of(
-    seg: Segmentation,
-    jump: np.ndarray | float = 0.0,
-    usable: np.ndarray | None = None,
-    K: np.ndarray | None = None,
-    **options: bool,
-) -> FlowFit:
-    """A flow that jumps by (P,) pixels, known in the superpixels `usable` (N,); all without it."""
-    n = len(seg)
-    K = np.eye(3) if K is None else K
-    weight = np.ones((n, 1)) if usable is None else usable[:, None].astype(float)
-    anchor, none = camera.rays(K, seg.anchors), np.zeros(n)
-    views = Views(anchor[:, None], anchor[:, None], weight, anchor, np.ones(n), (1.0, 1.0))
-    jump = np.broadcast_to(jump, len(seg.pairs))
-    affine = np.zeros((n, 3, 2))
-    return FlowFit(seg, K, K, SeededStart(**options), views, none > 0, affine, none, jump)

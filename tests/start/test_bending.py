@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_model import flow_of
+from helpers_start import fitted, flow_of, squares
 from helpers_truth import majority
 
 from soup_nlp.cli.main import main
@@ -16,7 +16,7 @@ from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluate.metrics import UNSCALED, depth_metrics
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import build_energy, prepare, solver_options
@@ -70,9 +70,9 @@ def case(scene: str, *overrides: str) -> Case:
     return replace(c, problem=chosen, data=data, weights=weights, options=options)
 
 
-def fitted(c: Case) -> FlowFit:
+def fit(c: Case) -> FlowFit:
     """The flow of a case's superpixels."""
-    return FlowFit.of(c.segmentation, c.pair.flow, c.pair.K_ref, c.pair.K_next)
+    return fitted(c.pair, c.segmentation)
 
 
 @pytest.mark.parametrize("scene", ["street", "room", "orbit"])
@@ -121,7 +121,7 @@ def test_a_rigid_room_does_not_bend_with_its_banner(seed, least):
 
 
 def test_small_surfaces_join_the_neighbour_with_the_longest_outline():
-    seg = strip(30)
+    seg = squares(2, 30)
     column = (seg.anchors[:, 0] // 8).astype(int)
     surface = np.where(column < 10, 0, np.where(column == 10, 1, 2))
     usable = np.ones(len(seg), bool)
@@ -196,7 +196,7 @@ def test_depth_starts_constant_where_the_camera_is_at_rest():
 @pytest.mark.parametrize("longer", [1.0, 1.4])
 def test_a_turn_is_found_despite_wrong_focal_length_and_movers(turn, longer):
     c = case("street")
-    views = fitted(c).views
+    views = fit(c).views
     R = rotation.exp(np.array(turn))
     scale = np.array([longer, longer, 1.0])
     target = (views.ray * scale) @ R.T / scale
@@ -224,7 +224,7 @@ def test_depth_that_explains_the_flow_is_no_turn():
     c = case("orbit")
     # without jumps, with a noise of 0.02 px
     residual = np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c)))
-    flow = fitted(c)._replace(jump=np.zeros(len(c.segmentation.pairs)), residual=residual)
+    flow = fit(c)._replace(jump=np.zeros(len(c.segmentation.pairs)), residual=residual)
     choice = gather(flow, rigid_choice(flow, dominant(flow)))
     assert flow.views.usable.all()
     assert turn_alone(flow, choice) is None
@@ -236,7 +236,7 @@ def test_depth_that_explains_the_flow_is_no_turn():
 
 def test_depth_within_three_noises_of_the_flow_is_not_seen():
     c = case("orbit")
-    flow = fitted(c)
+    flow = fit(c)
     choice = gather(flow, rigid_choice(flow, dominant(flow)))
     at = choice.label == 0
     turn = fit_turn(flow.views.subset(np.flatnonzero(at)), ANY_TURN)[1]
@@ -250,7 +250,7 @@ def test_depth_within_three_noises_of_the_flow_is_not_seen():
 def test_a_stabilised_turn_is_a_turn():
     """The next image is moved back by stabilisation; the rotation is that of the plain turn."""
     c = case("orbit")
-    flow = fitted(c)._replace(residual=np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c))))
+    flow = fit(c)._replace(residual=np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c))))
     choice = rigid_choice(flow, dominant(flow))
     target = flow.views.ray @ rotation.exp(np.array([0.02, -0.2, 0.05])).T
     target = 1.03 * target / target[..., 2:] + np.array([0.2, 0.02, 0.0])
@@ -371,13 +371,6 @@ def test_every_claim_of_a_bending_result_holds(tmp_path, capsys, scene, words):
     assert main(["check", str(out)]) == 0, capsys.readouterr().out
 
 
-def strip(count: int) -> Segmentation:
-    """Tiles of 8 pixels in two rows."""
-    v, u = np.mgrid[0:16, 0 : 8 * count]
-    labels = (v // 8 * count + u // 8).astype(np.int32)
-    return build_segmentation(labels, np.zeros((*labels.shape, 3), np.uint8), neighbours=2)
-
-
 def jumps(seg: Segmentation, column: float, size: np.ndarray, noise: float) -> np.ndarray:
     """(P,) jump of `size` (rows,) between columns before and after `column`, else noise."""
     i, k = seg.pairs.T
@@ -386,7 +379,7 @@ def jumps(seg: Segmentation, column: float, size: np.ndarray, noise: float) -> n
 
 
 def test_a_gap_in_a_discontinuity_does_not_join_two_surfaces():
-    seg = strip(10)
+    seg = squares(2, 10)
     left = seg.anchors[:, 0] < 40
     surface = surfaces(flow_of(seg, jumps(seg, 40, np.array([2.0, 0.6]), 0.01)))
     # one of two rows jumps by more than 1 px: half of the outline is a discontinuity
@@ -396,7 +389,7 @@ def test_a_gap_in_a_discontinuity_does_not_join_two_surfaces():
 
 
 def test_noise_does_not_cut_a_surface():
-    seg = strip(10)
+    seg = squares(2, 10)
     rng = np.random.default_rng(0)
     jump = np.where(rng.random(len(seg.pairs)) < 0.3, 0.9, 0.4)
     whole = surfaces(flow_of(seg, jump))

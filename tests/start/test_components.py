@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_model import flow_of
+from helpers_start import facing, fitted, flow_of, squares
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow, Truth
 from soup_nlp.geometry import camera
-from soup_nlp.geometry.graph import build_segmentation
-from soup_nlp.geometry.soup import Soup, reconstruct
+from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
@@ -26,8 +25,7 @@ from soup_nlp.pipeline.run import run
 from soup_nlp.start import pace as pace_module
 from soup_nlp.start.components import TOO_FAST, contact_scales, depth_from_inside
 from soup_nlp.start.pace import nearer_where_fast, order_in_front
-from soup_nlp.start.propose import SeededStart, propose
-from soup_nlp.start.views import FlowFit
+from soup_nlp.start.propose import propose
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 
@@ -35,21 +33,11 @@ K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 @pytest.fixture(scope="module")
 def world():
     """Eight fronto-parallel planes in two rows, the right half with another translation."""
-    v, u = np.mgrid[0:16, 0:32]
-    labels = (v // 8 * 4 + u // 8).astype(np.int32)
-    seg = build_segmentation(labels, np.zeros((16, 32, 3), np.uint8), neighbours=4)
+    seg = squares(2, 4)
     flow = Flow(np.zeros((16, 32, 2), np.float32), np.ones((16, 32), np.float32), "zero")
     component = (seg.anchors[:, 0] > 16).astype(np.int64)
     T = np.where(component[:, None] == 1, [[0.3, 0, 0]], [[0.1, 0, 0]])
-    lam = np.full(8, 1 / 8)
-    soup = Soup(
-        lam,
-        np.tile([0, 0, -1.0], (8, 1)),
-        np.full(8, 16.0),
-        np.tile(np.eye(3), (8, 1, 1)),
-        T / lam[:, None],
-    )
-    return seg, soup, component, build_energy_data(seg, flow, K, K, 4)
+    return seg, facing(np.full(8, 2.0), T), component, build_energy_data(seg, flow, K, K, 4)
 
 
 def test_the_prior_holds_the_relief_over_the_ground(world):
@@ -99,7 +87,7 @@ def test_pairs_across_an_occlusion_weigh_less(world):
     z = np.where((component == 1) & upper, 0.7, 1.0)
     soup = replace(soup, d=soup.d * z)
     i, k = seg.pairs.T
-    across = component[i] != component[k]
+    across = seg.across(component)
     hidden = across & (upper[i] | upper[k])
     assert hidden.sum() == 1
     assert across.sum() == 2
@@ -121,20 +109,13 @@ def placed(z, component, far=0.01, **options):
     In its own unit of length the component moves by `far` where the scene moves by 1; everything
     else is at its true depth.
     """
-    rows, columns = np.shape(z)
-    v, u = np.mgrid[0 : 8 * rows, 0 : 8 * columns]
-    image = np.zeros((*v.shape, 3), np.uint8)
-    labels = (v // 8 * columns + u // 8).astype(np.int32)
-    seg = build_segmentation(labels, image, neighbours=4)
-    n = rows * columns
-    facing, still = np.tile([0, 0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
-    moved = np.where(np.ravel(component), far, 1.0)[:, None] * [n, 0.0, 0.0]
-    soup = Soup(np.full(n, 1 / n), facing, n * np.ravel(z), still, moved)
-    flow = flow_of(seg, K=K, **options)
+    flow = flow_of(squares(*np.shape(z)), K=K, **options)
     label = np.ravel(component).astype(np.int64)
-    scale, tie = contact_scales(flow, soup, label, np.zeros(n, bool))
+    moved = np.where(np.ravel(component), far, 1.0)[:, None] * [1.0, 0.0, 0.0]
+    soup = facing(np.ravel(z), moved)
+    scale, tie = contact_scales(flow, soup, label, np.zeros(len(soup), bool))
     found, tie = nearer_where_fast(flow, replace(soup, lam=soup.lam * scale), label, tie)
-    return flow, found, tie, (found.lam / soup.lam).reshape(rows, columns)
+    return flow, found, tie, (found.lam / soup.lam).reshape(np.shape(z))
 
 
 def scales(*args, **options):
@@ -298,9 +279,7 @@ def test_components_cut_off_by_the_image_are_placed_well(scene, seed, count, mon
     with monkeypatch.context() as context:
         seen = np.zeros(len(case.segmentation), bool)
         context.setattr(pace_module, "without_support", lambda _, label, __: (label, seen))
-        options = SeededStart(**dict(problem.start), seed=problem.seed)
-        data = case.segmentation, case.pair.flow, pair.K_ref, pair.K_next
-        contact = cut_errors(case, propose(FlowFit.of(*data, options)).soup)
+        contact = cut_errors(case, propose(fitted(case.pair, case.segmentation)).soup)
     moved = contact != shipped
     assert shipped[moved].mean() < 0.7 * contact[moved].mean()
 
@@ -350,16 +329,15 @@ def test_depths_from_inside_follow_slanted_planes(world):
     seg, soup, component, _ = world
     n = np.tile(np.array([0.1, 0.2, -1.0]) / np.linalg.norm([0.1, 0.2, -1.0]), (len(soup), 1))
     one = replace(soup, n=n)
-    i, k = seg.pairs.T
-    across = component[i] != component[k]
+    across = seg.across(component)
     ray = camera.rays(K, seg.boundary[across].mean(axis=1))
     exact = one.depth_across(seg.pairs[across], ray)
     assert np.ptp(exact) > 0
-    np.testing.assert_allclose(depth_from_inside(one, component, seg, K), exact, rtol=1e-12)
+    flow = flow_of(seg, K=K)
+    np.testing.assert_allclose(depth_from_inside(flow, one, component), exact, rtol=1e-12)
     # one wrong superpixel on an outline changes nothing: its inner neighbours decide
     off = one.lam.copy()
     off[np.flatnonzero(component == 1)[0]] *= 3
     assert np.isin(np.flatnonzero(component == 1)[0], seg.pairs[across])
-    np.testing.assert_allclose(
-        depth_from_inside(replace(one, lam=off), component, seg, K), exact, rtol=1e-12
-    )
+    wrong = depth_from_inside(flow, replace(one, lam=off), component)
+    np.testing.assert_allclose(wrong, exact, rtol=1e-12)

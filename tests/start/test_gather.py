@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers_model import corner_scene, cut_by_part, motion, with_true_flow
+from helpers_start import fitted
 
 from soup_nlp.data.scenes.raycast import render
 from soup_nlp.geometry import camera, rotation
@@ -15,14 +16,11 @@ from soup_nlp.start.components import borrow
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import gather
 from soup_nlp.start.propose import propose
-from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import FlowFit
 
 WIDTH, HEIGHT = 192, 144
 K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 CAMERA = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
 WEDGE = motion((0, 3, 0), (-0.15, 0.02, 0.1))
-OPTIONS = SeededStart()
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +30,11 @@ def world():
     pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
     labels, _ = cut_by_part(scene, pair, 100)
     seg = build_segmentation(labels, pair.image_ref, neighbours=10)
-    fitted = FlowFit.of(seg, pair.flow, K, K, OPTIONS)
+    flow = fitted(pair, seg)
     component = np.array(
         [np.bincount(pair.truth.components[labels == i]).argmax() for i in range(len(seg))]
     )
-    return fitted, component, unit(pair.truth.motions)
+    return flow, component, unit(pair.truth.motions)
 
 
 def unit(M: np.ndarray) -> list[Motion]:
@@ -124,7 +122,7 @@ def test_neighbours_agree_unless_the_flow_jumps(world):
     cost = np.where(np.arange(2) == np.where(wrong, 1 - component, component)[:, None], 0.0, 0.3)
     near = flow_affinity(flow)
     assert near.max() <= 1
-    assert near[flow.jump > 3 * OPTIONS.discontinuity_px].max() < 0.01
+    assert near[flow.jump > 3 * flow.options.discontinuity_px].max() < 0.01
     label = smooth_choice(flow, cost, 0.5)
     assert (label == component).mean() > 0.95
     # without a price each takes its own; a high price leaves one
@@ -164,7 +162,7 @@ def test_a_camera_at_rest_starts_near_its_flow():
     labels, _ = cut_by_part(scene, pair, 100)
     seg = build_segmentation(labels, pair.image_ref, neighbours=10)
 
-    start = propose(FlowFit.of(seg, pair.flow, K, K))
+    start = propose(fitted(pair, seg))
     anchor = camera.rays(K, seg.anchors)
     X = start.soup.depth_at(anchor)[:, None] * anchor
     X = np.einsum("nij,nj->ni", start.soup.R, X) + start.soup.translation

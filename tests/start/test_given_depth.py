@@ -7,18 +7,15 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from helpers_start import fitted, rendered
 
 import soup_nlp
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.inputs import PriorOptions, resized_prior
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
-from soup_nlp.geometry.camera import rays
-from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.reweighting import with_prior
 from soup_nlp.pipeline import case as pipeline_case
@@ -28,8 +25,6 @@ from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
 from soup_nlp.start.prior_evidence import CONFIRMED, follows_edges, judged
 from soup_nlp.start.propose import Start, propose
-from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import FlowFit
 
 WAVE = np.sin(np.mgrid[0:240, 0:320] / 40.0).prod(axis=0)
 """A smooth map that is independent of the scene."""
@@ -39,14 +34,11 @@ class Seen:
     """A small scene with true flow, its start, and starts by priors."""
 
     def __init__(self, scene: str, seed: int = 0) -> None:
-        pair = render_scene(scene, seed, 320, 240)
-        self.pair = pair.with_flow(flow_from_truth(pair))
-        self.seg = build_segmentation(segment(pair.image_ref, 150), pair.image_ref)
-        flow_data = self.pair.flow, pair.K_ref, pair.K_next
-        self.fitted = FlowFit.of(self.seg, *flow_data, SeededStart())
+        self.pair, self.seg = rendered(scene, seed, 320, 240, 150)
+        self.fitted = fitted(self.pair, self.seg)
         self.start: Start = propose(self.fitted)
-        self.depth = pair.truth.depth_ref
-        self.anchor = rays(pair.K_ref, self.seg.anchors)
+        self.depth = self.pair.truth.depth_ref
+        self.anchor = self.fitted.views.anchor
 
     def by(self, prior: np.ndarray, kind: str | None = None) -> tuple[Start, Given]:
         start_data = self.start, replace(self.pair, depth_prior=prior), self.fitted

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from helpers_start import facing, squares
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.geometry.components import find_components
-from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.motion import RigidMotion, fit_motion
 from soup_nlp.geometry.rotation import exp
-from soup_nlp.geometry.soup import Soup
 from soup_nlp.pipeline.case import prepare
 
 K = intrinsics(100.0, 100.0, 39.5, 29.5)
@@ -21,18 +22,16 @@ ROUNDING = 1e-9
 """Rounding error of some thousand float64 operations on numbers of the order of 1."""
 
 
-def tiles():
-    """60 x 80 pixels in 12 superpixels of 20 x 20, numbered by rows."""
-    v, u = np.mgrid[0:60, 0:80] // 20
-    labels = (4 * v + u).astype(np.int32)
-    return build_segmentation(labels, np.zeros((60, 80, 3), np.uint8), neighbours=3)
+@pytest.fixture(scope="module")
+def seg():
+    """60 x 80 pixels in 12 superpixels."""
+    return squares(3, 4, side=20, neighbours=3)
 
 
 def soup_of(motions):
     """Planes at depth 2, parallel to the image, with these motions."""
-    n = len(motions)
     R, t = (np.array([getattr(m, name) for m in motions]) for name in ("R", "t"))
-    return Soup(np.full(n, 2.0), np.tile([0.0, 0.0, -1.0], (n, 1)), np.ones(n), R, t / 2)
+    return replace(facing(np.full(len(motions), 2.0), t), R=R)
 
 
 def test_motions_are_chained_and_inverted():
@@ -49,8 +48,7 @@ def test_motions_are_chained_and_inverted():
     np.testing.assert_allclose(fitted.matrix, CAR.matrix, atol=ROUNDING)
 
 
-def test_groups_of_one_motion_are_one_component():
-    seg = tiles()
+def test_groups_of_one_motion_are_one_component(seg):
     # the last group has the camera's motion again
     group = np.array([0, 0, 0, 0, 0, 0, 5, 5, 0, 0, 0, 7])
     soup = soup_of([CAR if g == 5 else CAMERA for g in group])
@@ -71,8 +69,7 @@ def test_groups_of_one_motion_are_one_component():
     assert components[1].centre[2] == pytest.approx(2)
 
 
-def test_one_stray_superpixel_keeps_its_components_motion():
-    seg = tiles()
+def test_one_stray_superpixel_keeps_its_components_motion(seg):
     soup = soup_of([*[CAMERA] * 11, CAR])
     components = find_components(soup, seg, np.zeros(12, int), K, K)
     assert len(components) == 1
@@ -80,24 +77,23 @@ def test_one_stray_superpixel_keeps_its_components_motion():
     np.testing.assert_allclose(components.camera.matrix, CAMERA.matrix, atol=1e-3)
 
 
-def test_the_first_group_is_the_background():
+def test_the_first_group_is_the_background(seg):
     group = np.r_[np.zeros(4, int), np.ones(8, int)]
     soup = soup_of([*[CAMERA] * 4, *[CAR] * 8])
-    components = find_components(soup, tiles(), group, K, K)
+    components = find_components(soup, seg, group, K, K)
     np.testing.assert_array_equal(components.of_superpixel, group)
     np.testing.assert_allclose(components.camera.matrix, CAMERA.matrix, atol=ROUNDING)
 
 
-def test_a_component_that_is_not_rigid_has_a_large_residual():
+def test_a_component_that_is_not_rigid_has_a_large_residual(seg):
     rng = np.random.default_rng(1)
     motions = [RigidMotion(np.eye(3), t) for t in rng.normal(0, 0.1, (12, 3))]
-    components = find_components(soup_of(motions), tiles(), np.zeros(12, int), K, K)
+    components = find_components(soup_of(motions), seg, np.zeros(12, int), K, K)
     # translations of 0.1 at depth 2 are 5 pixels
     assert 1 < components[0].residual_px < 15
 
 
-def test_a_component_behind_the_camera_takes_its_first_motion():
-    seg = tiles()
+def test_a_component_behind_the_camera_takes_its_first_motion(seg):
     group = np.r_[np.zeros(11, int), 1]
     back = RigidMotion(np.eye(3), np.array([0.0, 0.0, -5.0]))
     components = find_components(soup_of([*[CAMERA] * 11, back]), seg, group, K, K)

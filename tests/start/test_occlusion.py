@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers_start import fitted, rendered, squares
 
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.geometry import camera
-from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.geometry.superpixels import segment
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.solve.stages import solve_soup
@@ -21,8 +19,6 @@ from soup_nlp.start import occlusion
 from soup_nlp.start.components import TIES
 from soup_nlp.start.occlusion import IN_FRONT, SURE, covering, in_order, vote
 from soup_nlp.start.propose import Start, propose
-from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import FlowFit
 
 HEIGHT, WIDTH, CELL = 96, 128, 16
 K = camera.intrinsics(120.0, 120.0, 63.5, 47.5)
@@ -38,8 +34,6 @@ def textured(seed: int) -> np.ndarray:
 
 def sliding(covers: bool) -> tuple[Pair, Segmentation]:
     """Two parts of 3 x 2 cells that approach each other before a wall, or behind holes in it."""
-    labels = np.arange(HEIGHT * WIDTH // CELL**2, dtype=np.int32)
-    labels = np.kron(labels.reshape(HEIGHT // CELL, WIDTH // CELL), np.ones((CELL, CELL), np.int32))
     wall, inside = textured(0), textured(1)
     before, after, uv = wall.copy(), wall.copy(), np.zeros((HEIGHT, WIDTH, 2), np.float32)
     for left, shift in ((CELL, SHIFT), (5 * CELL, -SHIFT)):
@@ -48,13 +42,8 @@ def sliding(covers: bool) -> tuple[Pair, Segmentation]:
         before[part], uv[part] = inside[part], (shift, 0)
         seen = np.roll(part, shift, axis=1) if covers else part
         after[seen] = np.roll(inside, shift, axis=1)[seen]
-    flow = Flow(uv, np.ones((HEIGHT, WIDTH), np.float32), "made")
-    pair = Pair(before, after, K, K).with_flow(flow)
-    return pair, build_segmentation(labels, before)
-
-
-def fitted(pair: Pair, seg: Segmentation) -> FlowFit:
-    return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart())
+    pair = Pair(before, after, K, K).with_flow(Flow(uv))
+    return pair, squares(HEIGHT // CELL, WIDTH // CELL, CELL, neighbours=15)
 
 
 def ordered(before: Start, seg: Segmentation, pair: Pair) -> Start:
@@ -81,7 +70,7 @@ def test_the_side_that_loses_or_gains_pixels_is_behind(covers):
 def test_a_vote_needs_several_strips_and_agreement():
     _, seg = sliding(True)
     region = (seg.anchors[:, 0] > WIDTH / 2).astype(int)
-    across = np.flatnonzero(region[seg.pairs[:, 0]] != region[seg.pairs[:, 1]])
+    across = np.flatnonzero(seg.across(region))
     assert len(across) == 6
     says = np.zeros(len(seg.pairs))
     says[across[:3]] = 20.0
@@ -99,7 +88,7 @@ def test_a_vote_needs_several_strips_and_agreement():
 @pytest.mark.parametrize("covers", [True, False])
 def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     pair, seg = sliding(covers)
-    before = propose(FlowFit.of(seg, pair.flow, K, K, SeededStart()))
+    before = propose(fitted(pair, seg))
     start = ordered(before, seg, pair)
     assert before.at_rest
     z = np.log(start.soup.depth_at(camera.rays(K, seg.anchors)))
@@ -118,16 +107,13 @@ def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
 
 @pytest.fixture(scope="module")
 def swing() -> tuple[Pair, Segmentation]:
-    pair = render_scene("swing", 1, 320, 240)
-    return pair.with_flow(flow_from_truth(pair)), build_segmentation(
-        segment(pair.image_ref, 150), pair.image_ref
-    )
+    return rendered("swing", 1, 320, 240, 150)
 
 
 @pytest.mark.slow
 def test_a_swinging_object_comes_before_the_wall(swing):
     pair, seg = swing
-    before = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart()))
+    before = propose(fitted(pair, seg))
     start = ordered(before, seg, pair)
     u, v = np.rint(seg.anchors).astype(int).T
     truth = np.log(pair.truth.depth_ref[v, u])
@@ -150,11 +136,9 @@ def test_a_swinging_object_comes_before_the_wall(swing):
 
 @pytest.mark.slow
 def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
-    pair = render_scene("room", 1, 512, 218)
-    pair = pair.with_flow(flow_from_truth(pair))
-    seg = build_segmentation(segment(pair.image_ref, 300), pair.image_ref)
-    before = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart()))
+    pair, seg = rendered("room", 1, 512, 218, 300)
     one = fitted(pair, seg)
+    before = propose(one)
 
     def changed() -> int:
         start = in_order(before, pair, one)
@@ -168,7 +152,7 @@ def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
 
 def test_small_pieces_have_no_order(monkeypatch):
     pair, seg = sliding(True)
-    before = propose(FlowFit.of(seg, pair.flow, K, K, SeededStart()))
+    before = propose(fitted(pair, seg))
     monkeypatch.setattr(occlusion, "SMALL", 5 / len(seg))
     assert ordered(before, seg, pair) is not before
     monkeypatch.setattr(occlusion, "SMALL", 6 / len(seg))
@@ -178,7 +162,7 @@ def test_small_pieces_have_no_order(monkeypatch):
 def test_an_image_without_discontinuities_keeps_its_start(swing):
     pair, seg = swing
     still = pair.with_flow(Flow(0 * pair.flow.uv, pair.flow.confidence, "zero"))
-    start = propose(FlowFit.of(seg, still.flow, pair.K_ref, pair.K_next, SeededStart()))
+    start = propose(fitted(still, seg))
     assert ordered(start, seg, still) is start
 
 

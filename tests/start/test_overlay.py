@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers_start import squares
 
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
-from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.start.components import FIXED
 from soup_nlp.start.overlay import towards_border
-from soup_nlp.start.propose import SeededStart, propose
+from soup_nlp.start.propose import propose
 from soup_nlp.start.views import FlowFit
 
 K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
@@ -20,10 +20,7 @@ AHEAD, TURN = np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.02, 0.0])
 
 @pytest.fixture(scope="module")
 def seg():
-    v, u = np.mgrid[0:H, 0:W]
-    labels = (v // TILE * (W // TILE) + u // TILE).astype(np.int32)
-    noise = np.random.default_rng(0).integers(0, 255, (H, W, 3), dtype=np.uint8)
-    return build_segmentation(labels, noise, neighbours=6)
+    return squares(H // TILE, W // TILE, TILE, neighbours=6)
 
 
 def scene_flow(turn=TURN, shift=AHEAD):
@@ -41,9 +38,8 @@ def scene_flow(turn=TURN, shift=AHEAD):
     return (camera.project(K, X) - uv).astype(np.float32)
 
 
-def start_of(seg, flow, **options):
-    confidence = np.ones(flow.shape[:2], np.float32)
-    return propose(FlowFit.of(seg, Flow(flow, confidence, "made"), K, K, SeededStart(**options)))
+def start_of(seg, flow):
+    return propose(FlowFit.of(seg, Flow(flow), K, K))
 
 
 def share(start, seg, mask):

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 import pytest
-from helpers_model import (
-    corner_scene,
-    cut_by_part,
-    motion,
-    plane_pose,
-    plane_world,
-    with_true_flow,
-)
+from helpers_model import corner_scene, cut_by_part, motion, plane_pose, plane_world, with_true_flow
+from helpers_start import fitted
 
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.raycast import Scene, render
@@ -23,7 +17,6 @@ from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.start.propose import Start, propose
-from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
 
 WIDTH, HEIGHT = 192, 144
@@ -78,6 +71,12 @@ def cut(scene: Scene, count: int = 48) -> tuple[Pair, Segmentation, np.ndarray]:
     return pair, build_segmentation(labels, pair.image_ref, neighbours=10), pure
 
 
+def with_uv(pair: Pair, uv: np.ndarray, confidence: np.ndarray | float = 1.0) -> Pair:
+    """The pair with another flow."""
+    whole = np.broadcast_to(confidence, uv.shape[:2]).astype(float)
+    return pair.with_flow(Flow(uv, whole, "test"))
+
+
 def assert_usable(start: Start, seg: Segmentation, K_ref: np.ndarray = K) -> None:
     """No NaN, and every constraint of the NLP holds but visibility's margin."""
     for f in fields(start.soup):
@@ -102,7 +101,7 @@ def assert_usable(start: Start, seg: Segmentation, K_ref: np.ndarray = K) -> Non
 @pytest.mark.parametrize("shift", [(0.35, 0.05, 0.1), (1.0, 0.1, 0.2), (-0.2, 0.0, 0.5)])
 def test_one_motion_is_recovered_exactly(shift):
     pair, seg, pure = cut(corner_scene(motion((0.5, -1.5, 0.3), shift)))
-    start = propose(FlowFit.of(seg, pair.flow, K, K))
+    start = propose(fitted(pair, seg))
     assert_usable(start, seg)
     assert pure.mean() > 0.85
     e = compare(start, pair, seg, pure)
@@ -122,7 +121,7 @@ def test_one_motion_is_recovered_exactly(shift):
 def test_two_motions_are_told_apart():
     component = motion((0, 3, 0), (-0.15, 0.02, 0.1))
     pair, seg, pure = cut(corner_scene(CAMERA, component, turn=10))
-    start = propose(FlowFit.of(seg, pair.flow, K, K))
+    start = propose(fitted(pair, seg))
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
     for b, (turn, direction, normal, depth) in enumerate(
@@ -145,7 +144,7 @@ def test_noise_makes_it_worse_but_not_wild():
     """Half a pixel of noise raises the errors, but to a limit."""
     pair, seg, pure = cut(corner_scene(CAMERA))
     noise = np.random.default_rng(99).normal(0, 0.5, pair.flow.uv.shape)
-    start = propose(FlowFit.of(seg, replace(pair.flow, uv=pair.flow.uv + noise), K, K))
+    start = propose(fitted(with_uv(pair, pair.flow.uv + noise), seg))
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
     ratio = np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1)
@@ -160,7 +159,7 @@ def test_confident_pixels_decide():
     rng = np.random.default_rng(99)
     bad = rng.random(pair.size) < 0.4
     uv = np.where(bad[..., None], rng.normal(0, 50, pair.flow.uv.shape), pair.flow.uv)
-    start = propose(FlowFit.of(seg, Flow(uv, (~bad).astype(float), "test"), K, K))
+    start = propose(fitted(with_uv(pair, uv, ~bad), seg))
     e = compare(start, pair, seg, pure)
     assert e.rotation.max() < 1e-5
     assert np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1).max() < 2e-3
@@ -173,7 +172,7 @@ def test_outliers_of_full_confidence_are_outvoted():
     uv = np.where(
         bad[..., None], pair.flow.uv + rng.normal(0, 20, pair.flow.uv.shape), pair.flow.uv
     )
-    start = propose(FlowFit.of(seg, replace(pair.flow, uv=uv), K, K))
+    start = propose(fitted(with_uv(pair, uv), seg))
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
     assert np.median(e.rotation) < 0.1
@@ -185,7 +184,7 @@ def test_two_cameras_with_different_intrinsics():
     K_next = camera.intrinsics(230.0, 210.0, 80.0, 60.0)
     grid = camera.pixel_grid(*pair.size)
     target = camera.project(K_next, camera.rays(K, grid + pair.flow.uv))
-    start = propose(FlowFit.of(seg, replace(pair.flow, uv=target - grid), K, K_next))
+    start = propose(FlowFit.of(seg, Flow(target - grid), K, K_next))
     e = compare(start, pair, seg, pure)
     assert e.rotation.max() < 1e-5
     assert np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1).max() < 2e-3
@@ -198,9 +197,8 @@ def test_two_cameras_with_different_intrinsics():
 def test_the_start_is_a_function_of_its_seed():
     pair, seg, _ = cut(corner_scene(CAMERA, motion((0, 3, 0), (-0.15, 0.02, 0.1))))
     noise = np.random.default_rng(99).normal(0, 0.3, pair.flow.uv.shape)
-    flow = replace(pair.flow, uv=pair.flow.uv + noise)
-    one, two = (propose(FlowFit.of(seg, flow, K, K, SeededStart(seed=3))) for _ in range(2))
-    other = propose(FlowFit.of(seg, flow, K, K, SeededStart(seed=4)))
+    noisy = with_uv(pair, pair.flow.uv + noise)
+    one, two, other = (propose(fitted(noisy, seg, seed=seed)) for seed in (3, 3, 4))
     for f in fields(one.soup):
         np.testing.assert_array_equal(getattr(one.soup, f.name), getattr(two.soup, f.name))
     np.testing.assert_array_equal(one.motion, two.motion)
@@ -219,8 +217,7 @@ def test_superpixels_without_confidence_borrow(corner):
     pair, seg, pure = corner
     blind = np.zeros(len(seg), bool)
     blind[[0, 7, 20, 21, 22, 40]] = True
-    confidence = np.where(blind[seg.labels], 0.0, 1.0)
-    start = propose(FlowFit.of(seg, Flow(pair.flow.uv, confidence, "test"), K, K))
+    start = propose(fitted(with_uv(pair, pair.flow.uv, ~blind[seg.labels]), seg))
     assert_usable(start, seg)
     assert start.borrowed[blind].all()
     assert not start.borrowed[~blind & pure].any()
@@ -237,7 +234,7 @@ def test_a_superpixel_without_parallax_borrows_its_depth(corner):
     grid = camera.pixel_grid(*pair.size)
     turned = camera.project(K, camera.rays(K, grid) @ CAMERA[:3, :3].T) - grid
     uv = np.where((seg.labels == far)[..., None], turned, pair.flow.uv)
-    start = propose(FlowFit.of(seg, replace(pair.flow, uv=uv), K, K))
+    start = propose(fitted(with_uv(pair, uv), seg))
     assert_usable(start, seg)
     assert start.borrowed[far]
     z = start.soup.depth_at(camera.rays(K, seg.anchors))
@@ -254,7 +251,7 @@ def test_flow_that_determines_no_depth_is_finite_and_flagged(corner, what):
     else:
         confidence[(seg.labels == 11) | (what == "zero flow")] = 1
     uv = np.zeros((HEIGHT, WIDTH, 2)) if what == "zero flow" else pair.flow.uv
-    start = propose(FlowFit.of(seg, Flow(uv, confidence, what), K, K))
+    start = propose(fitted(with_uv(pair, uv, confidence), seg))
     assert_usable(start, seg)
     blind = np.bincount(seg.labels.ravel(), confidence.ravel()) == 0
     assert start.borrowed[blind].all()
@@ -266,7 +263,7 @@ def test_flow_that_determines_no_depth_is_finite_and_flagged(corner, what):
 def test_pure_rotation_is_finite_explains_the_flow_and_is_flagged(turn):
     """The flow does not determine any depth."""
     pair, seg, _ = cut(corner_scene(motion(turn, (0, 0, 0))))
-    start = propose(FlowFit.of(seg, pair.flow, K, K))
+    start = propose(fitted(pair, seg))
     assert_usable(start, seg)
     assert np.median(start.error) < 0.3
     assert start.borrowed.mean() > 0.9
@@ -290,7 +287,7 @@ def test_one_plane_in_superpixels_of_any_shape_is_finite(name):
     labels = PLANE_LABELS[name](pair.image_ref)
     neighbours = min(8, int(labels.max()))
     seg = build_segmentation(labels, pair.image_ref, neighbours=max(1, neighbours))
-    start = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next))
+    start = propose(fitted(pair, seg))
     assert_usable(start, seg, pair.K_ref)
     if name == "grid":
         assert np.median(start.error) < 0.05
@@ -298,9 +295,9 @@ def test_one_plane_in_superpixels_of_any_shape_is_finite(name):
 
 @pytest.mark.slow
 def test_random_flow_is_finite(corner):
-    _, seg, _ = corner
+    pair, seg, _ = corner
     uv = np.random.default_rng(99).normal(0, 30, (HEIGHT, WIDTH, 2))
-    assert_usable(propose(FlowFit.of(seg, Flow(uv, np.ones((HEIGHT, WIDTH)), "noise"), K, K)), seg)
+    assert_usable(propose(fitted(with_uv(pair, uv), seg)), seg)
 
 
 @pytest.mark.parametrize("usable", [0, 7])
@@ -309,6 +306,6 @@ def test_too_few_usable_pixels_are_an_error(corner, usable):
     confidence = np.zeros((HEIGHT, WIDTH))
     confidence[70, 50 : 50 + usable] = 1
     with pytest.raises(DataError, match="too few pixels") as caught:
-        propose(FlowFit.of(seg, Flow(pair.flow.uv, confidence, "thin"), K, K))
+        FlowFit.of(seg, Flow(pair.flow.uv, confidence, "thin"), K, K)
     assert "thin" in str(caught.value)
     assert str(usable) in str(caught.value)

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from helpers_model import flow_of, motion, plane_pose, plane_world
+from helpers_model import motion, plane_pose, plane_world
+from helpers_start import facing, fitted, flow_of, squares
 
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.plane import PlaneFit
-from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start import choice as choosing
 from soup_nlp.start import merge as gathering
@@ -41,20 +41,13 @@ PER_RADIAN = 10.0
 """Pixels of error by which a motion misses, per radian of its turn."""
 
 
-def cells(rows: int, columns: int) -> Segmentation:
-    """Squares of 8 pixels."""
-    v, u = np.mgrid[0 : 8 * rows, 0 : 8 * columns]
-    labels = (v // 8 * columns + u // 8).astype(np.int32)
-    return build_segmentation(labels, np.zeros((*v.shape, 3), np.uint8), neighbours=4)
-
-
 @dataclass
 class Turns:
     """Replaces views; superpixels turn about the optical axis by known angles (N,)."""
 
     true: np.ndarray
     weight: np.ndarray | None = None
-    focal: tuple[float, float] = (100.0, 100.0)
+    focal = np.array([100.0, 100.0])
 
     def __post_init__(self) -> None:
         n = len(self.true)
@@ -111,7 +104,7 @@ def turning(*angles: float) -> list[Motion]:
 @pytest.mark.parametrize(("error", "kept"), [(0.0, True), (0.05, False)])
 def test_a_small_motion_counts_where_the_flow_is_exact(error, kept):
     """A block leaves 0.1 px: more than three median errors of exact flow, less than 0.15 px."""
-    seg = cells(6, 10)
+    seg = squares(6, 10)
     block = seg.anchors[:, 0] > 48
     views = Turns(np.where(block, 0.1 / PER_RADIAN, 0.0))
     angle = np.where(block, 0.1 + error, error) / PER_RADIAN
@@ -131,7 +124,7 @@ def test_a_motion_needs_a_piece_of_superpixels(missing):
 
 @pytest.mark.parametrize(("confidence", "trusted"), [(1.0, True), (0.1, False)])
 def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, trusted):
-    seg = cells(4, 6)
+    seg = squares(4, 6)
     odd = seg.anchors[:, 0] > 24
     views = Turns(np.zeros(24), np.where(odd[:, None], confidence, 1.0) * np.ones((24, 4)))
     monkeypatch.setattr(choosing, "estimate", lambda *a: Motion(np.eye(3), np.array([0, 1.0, 0])))
@@ -146,12 +139,6 @@ def test_pieces_of_untrusted_flow_have_no_motion(monkeypatch, confidence, truste
 # --- components ----------------------------------------------------------------------------------
 
 
-def across(seg: Segmentation, label: np.ndarray) -> np.ndarray:
-    """(P,) whether two neighbours lie on both sides of an outline."""
-    i, k = seg.pairs.T
-    return label[i] != label[k]
-
-
 def offered(monkeypatch, *angles: float) -> None:
     """Make these turns the candidate motions."""
     monkeypatch.setattr(gathering, "candidates", lambda *a: turning(*angles))
@@ -159,7 +146,7 @@ def offered(monkeypatch, *angles: float) -> None:
 
 @pytest.mark.parametrize("enough", [True, False])
 def test_a_contradicted_motion_is_not_the_components(monkeypatch, enough):
-    seg = cells(6, 10)
+    seg = squares(6, 10)
     column = (seg.anchors[:, 0] // 8).astype(int)
     component = column >= 6
     agree = np.flatnonzero(component)
@@ -171,7 +158,7 @@ def test_a_contradicted_motion_is_not_the_components(monkeypatch, enough):
     # two motions explain the flow
     before = taken(views, true)
     offered(monkeypatch, 0.2)
-    jump = np.where(across(seg, component), 10.0, 0.0)
+    jump = np.where(seg.across(component), 10.0, 0.0)
     after = gathering.gather(flow_of_turns(views, seg, jump), before)
     assert (after.label[~component] == 0).all()
     if enough:
@@ -183,7 +170,7 @@ def test_a_contradicted_motion_is_not_the_components(monkeypatch, enough):
 
 def test_components_with_a_gap_in_their_discontinuity_are_parted_there(monkeypatch):
     """No motion explains both: the smaller jump between them is the outline then."""
-    seg = cells(6, 10)
+    seg = squares(6, 10)
     column = (seg.anchors[:, 0] // 8).astype(int)
     component = np.where(column >= 8, 2, np.where(column >= 6, 1, 0))
     true = np.array([0.0, 0.3, -0.3])[component]
@@ -194,8 +181,8 @@ def test_components_with_a_gap_in_their_discontinuity_are_parted_there(monkeypat
     least, most = gathering.DISCONTINUITIES[-1], gathering.DISCONTINUITIES[0]
     assert least < most
     between = 0.5 * (least + most) * OPTIONS.discontinuity_px
-    jump = np.where(across(seg, component), between, 0.0)
-    jump[across(seg, component > 0)] = 10.0
+    jump = np.where(seg.across(component), between, 0.0)
+    jump[seg.across(component > 0)] = 10.0
     after = gathering.gather(flow_of_turns(views, seg, jump), before)
     for b in (1, 2):
         assert len(np.unique(after.label[component == b])) == 1
@@ -206,7 +193,7 @@ def test_components_with_a_gap_in_their_discontinuity_are_parted_there(monkeypat
 
 def test_one_of_a_component_goes_with_its_neighbours():
     """By itself it prefers the main motion, by less than the price of its outline."""
-    seg = cells(4, 9)
+    seg = squares(4, 9)
     right = seg.anchors[:, 0] > 48
     odd = np.argmax(seg.anchors @ [1.0, 0.1])
     assert right[odd]
@@ -216,13 +203,13 @@ def test_one_of_a_component_goes_with_its_neighbours():
     label = np.where(right, 1, 0)
     label[odd] = 0
     before = taken(views, np.where(label == 1, 0.2, 0.0))
-    jump = np.where(across(seg, right), 10.0, 0.0)
+    jump = np.where(seg.across(right), 10.0, 0.0)
     after = gathering.gather(flow_of_turns(views, seg, jump), before)
     np.testing.assert_array_equal(after.label, right)
 
 
 def test_the_main_motion_wins_between_equal_ones():
-    seg = cells(4, 9)
+    seg = squares(4, 9)
     right = seg.anchors[:, 0] > 48
     # the other motion is better by a fifth of the least unexplained error
     middle = 0.1 + 0.1 * UNEXPLAINED_PX / PER_RADIAN
@@ -242,7 +229,7 @@ def test_the_main_motion_wins_between_equal_ones():
 
 
 def test_one_wild_neighbour_does_not_decide_a_borrowed_depth():
-    seg = cells(3, 3)
+    seg = squares(3, 3)
     mu = np.full(9, 0.5)
     mu[1], mu[4] = 50.0, 0.01
     weak = np.arange(9) == 4
@@ -253,25 +240,18 @@ def test_one_wild_neighbour_does_not_decide_a_borrowed_depth():
         np.testing.assert_array_equal(new[~weak], mu[~weak])
 
 
-def facing(z: np.ndarray) -> Soup:
-    """Fronto-parallel planes at depths z (N,)."""
-    n = len(z)
-    still = np.tile(np.eye(3), (n, 1, 1))
-    return Soup(np.full(n, 1 / n), np.tile([0, 0, -1.0], (n, 1)), n * z, still, np.ones((n, 3)))
-
-
 K = camera.intrinsics(50.0, 50.0, 27.5, 19.5)
+AHEAD = np.array([0.0, 0.0, 1.0])
 
 
 def test_one_wild_plane_behind_an_outline_does_not_decide():
-    seg = cells(3, 3)
+    seg = squares(3, 3)
     label = (np.arange(9) == 1).astype(int)
     z = np.full(9, 4.0)
     # the component is the middle cell of the top row; the cell below has three inner neighbours
     z[1], z[4], z[5] = 1.0, 2.0, 40.0
-    i, k = seg.pairs.T
-    across = seg.pairs[label[i] != label[k]]
-    depth = depth_from_inside(facing(z), label, seg, K)
+    across = seg.pairs[seg.across(label)]
+    depth = depth_from_inside(flow_of(seg, K=K), facing(z, AHEAD), label)
     below = np.flatnonzero((across == [1, 4]).all(axis=1))
     assert below.size == 1
     np.testing.assert_allclose(depth[:, below[0]], [1.0, 4.0], rtol=1e-12)
@@ -283,8 +263,8 @@ def test_the_lowest_part_of_a_component_places_it():
     ground = [2.0, 2, 1.2, 1.2, 1.2, 2, 2]
     z = np.array([[9.0] * 7, [9, 1, 1, 1, 1, 1, 9], gap, ground, ground])
     component = z == 1
-    flow, none = flow_of(cells(5, 7), K=K), np.zeros(z.size, bool)
-    scale, tie = contact_scales(flow, facing(z.ravel()), component.ravel().astype(int), none)
+    flow, none = flow_of(squares(5, 7), K=K), np.zeros(z.size, bool)
+    scale, tie = contact_scales(flow, facing(z.ravel(), AHEAD), component.ravel().astype(int), none)
     np.testing.assert_allclose(scale.reshape(z.shape), np.where(component, 2.0, 1.0), rtol=1e-12)
     named = np.array(TIES)[tie].reshape(z.shape)
     assert (named == np.where(component, "contact below", "reference")).all()
@@ -297,9 +277,7 @@ def test_superpixels_of_hardly_any_confidence_borrow():
     seg = build_segmentation(segment(pair.image_ref, 30, "grid"), pair.image_ref, neighbours=8)
     faint = np.isin(np.arange(len(seg)), [8, 9, 20])
     confidence = np.where(faint[seg.labels], 0.01, 1.0)
-    start = propose(
-        FlowFit.of(seg, Flow(pair.flow.uv, confidence, "test"), pair.K_ref, pair.K_next)
-    )
+    start = propose(fitted(pair.with_flow(Flow(pair.flow.uv, confidence, "test")), seg))
     assert start.borrowed[faint].all()
     assert start.borrowed[~faint].mean() < 0.2
 
@@ -317,7 +295,7 @@ def test_motions_that_are_hardly_different_do_not_mix(monkeypatch):
     def taken(motion: Motion, *motions: Motion) -> np.ndarray:
         result = list(motions), np.zeros(len(seg), bool)
         monkeypatch.setattr(proposing, "surface_motions", lambda *a: result)
-        start = propose(FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next))
+        start = propose(fitted(pair, seg))
         return np.abs(start.soup.R - motion.R).max(axis=(1, 2)) < 1e-9
 
     assert taken(exact, near, exact).all()
@@ -327,7 +305,7 @@ def test_motions_that_are_hardly_different_do_not_mix(monkeypatch):
 
 
 def test_only_a_piece_with_usable_flow_moves():
-    seg = cells(4, 8)
+    seg = squares(4, 8)
     component = np.zeros(32, int)
     component[[2, 3]] = 1  # usable
     component[[4, 5]] = 2  # not, but beside the first
@@ -354,7 +332,7 @@ def test_only_a_piece_with_usable_flow_moves():
 )
 def test_a_mixture_of_two_flows_does_not_move(shift, own_error, size, mixed):
     """Eight rows move by 0, eight by 4 px; a piece in the middle column turns by itself."""
-    seg = cells(16, 32)
+    seg = squares(16, 32)
     row, column = (seg.anchors // 8).astype(int).T[::-1]
     piece = np.isin(row, (7, 8)) & (abs(column - 16) < size / 4)
     views = Turns(np.where(piece, 0.1, 0.0))
@@ -368,7 +346,7 @@ def test_a_mixture_of_two_flows_does_not_move(shift, own_error, size, mixed):
 @pytest.mark.parametrize(("gain", "moves"), [(0.04, False), (0.06, True)])
 def test_a_motion_that_explains_little_more_is_dropped(gain, moves):
     """The noise of the flow is 0.05 px."""
-    seg = cells(16, 32)
+    seg = squares(16, 32)
     row, column = (seg.anchors // 8).astype(int).T[::-1]
     piece = (row < 8) & (column < 8)
     views = Turns(np.where(piece, gain / PER_RADIAN, 0.0))

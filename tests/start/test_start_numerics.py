@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.optimize import OptimizeResult
@@ -183,8 +181,9 @@ def test_a_plane_behind_the_camera_costs_more_than_its_error():
 
 def test_a_translation_with_points_in_front_is_cheaper():
     m, r, q = rigid(40)
-    views = Views(r[None], q[None], np.ones((1, 40)), np.array([[0.0, 0, 1]]), np.ones(1), (1.0, 1))
-    fit = replace(views, focal=(FOCAL, FOCAL)).fit([m, Motion(m.R, -m.t)])
+    anchor, focal = np.array([[0.0, 0, 1]]), np.full(2, FOCAL)
+    views = Views(r[None], q[None], np.ones((1, 40)), anchor, np.ones(1), focal)
+    fit = views.fit([m, Motion(m.R, -m.t)])
     assert fit.inverse_depth[0, 0] == pytest.approx(-fit.inverse_depth[0, 1], rel=0.2)
     front, behind = fit.penalised()[0]
     assert behind > front + 1.0
@@ -198,7 +197,7 @@ def flat_views(target: np.ndarray, off_centre: np.ndarray, weight: np.ndarray) -
     one = np.ones((len(target), 1))
     ray, targets = np.hstack([off_centre, one]), np.hstack([target, one])
     anchor, radius = np.array([[0.0, 0.0, 1.0]]), np.array([0.1])
-    return Views(ray[None], targets[None], weight[None], anchor, radius, (FOCAL, FOCAL))
+    return Views(ray[None], targets[None], weight[None], anchor, radius, np.full(2, FOCAL))
 
 
 def test_constant_depth_turns_with_the_image():

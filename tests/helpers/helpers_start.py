@@ -1,0 +1,66 @@
+"""Flows, superpixels and planes for tests of the initialisation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.data.flow.sources import flow_from_truth
+from soup_nlp.data.pair import Pair
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.geometry import camera
+from soup_nlp.geometry.graph import Segmentation, build_segmentation
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.geometry.superpixels import segment
+from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.views import FlowFit, Views
+
+Float = NDArray[np.float64]
+
+
+def squares(rows: int, columns: int, side: int = 8, neighbours: int = 4) -> Segmentation:
+    """A black image in square superpixels of `side` pixels, numbered by rows."""
+    labels = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    labels = labels.repeat(side, axis=0).repeat(side, axis=1)
+    return build_segmentation(labels, np.zeros((*labels.shape, 3), np.uint8), neighbours)
+
+
+def facing(z: Float, T: Float) -> Soup:
+    """Planes parallel to the image at depths z (N,) with translations T (3,) or (N, 3)."""
+    n = len(z)
+    normal, still = np.tile([0.0, 0.0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
+    return Soup(np.full(n, 1 / n), normal, n * z, still, np.broadcast_to(n * T, (n, 3)))
+
+
+def rendered(
+    scene: str, seed: int, width: int, height: int, count: int
+) -> tuple[Pair, Segmentation]:
+    """A rendered pair with its true flow as a solve sees it, in about `count` superpixels."""
+    pair = render_scene(scene, seed, width, height)
+    labels = segment(pair.image_ref, count)
+    return pair.with_flow(flow_from_truth(pair)), build_segmentation(labels, pair.image_ref)
+
+
+def fitted(pair: Pair, seg: Segmentation, **options: Any) -> FlowFit:
+    """The flow of a pair in superpixels, with options of the start."""
+    return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart(**options))
+
+
+def flow_of(
+    seg: Segmentation,
+    jump: np.ndarray | float = 0.0,
+    usable: np.ndarray | None = None,
+    K: np.ndarray | None = None,
+    **options: bool,
+) -> FlowFit:
+    """A flow that jumps by (P,) pixels, known in the superpixels `usable` (N,); all without it."""
+    n = len(seg)
+    K = np.eye(3) if K is None else K
+    weight = np.ones((n, 1)) if usable is None else usable[:, None].astype(float)
+    anchor, none = camera.rays(K, seg.anchors), np.zeros(n)
+    views = Views(anchor[:, None], anchor[:, None], weight, anchor, np.ones(n), np.ones(2))
+    jump = np.broadcast_to(jump, len(seg.pairs))
+    affine = np.zeros((n, 3, 2))
+    return FlowFit(seg, K, K, SeededStart(**options), views, none > 0, affine, none, jump)
