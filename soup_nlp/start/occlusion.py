@@ -153,7 +153,7 @@ def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
     a, b = ends.min(axis=1), ends.max(axis=1)
     turned = np.where(ends[:, 0] == a, 1.0, -1.0)
     votes = np.where((a != b) & (np.abs(contrast) > CONTRAST), np.sign(contrast) * turned, 0.0)
-    outline = np.unique(a * (int(region.max()) + 1) + b, return_inverse=True)[1].ravel()
+    outline = numbered(a * (int(region.max()) + 1) + b)
     total = np.bincount(outline, np.abs(votes))
     lead = np.bincount(outline, votes)
     sure = ((total + np.abs(lead)) / 2 + 1) / (total + 2)

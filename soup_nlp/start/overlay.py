@@ -33,13 +33,15 @@ LEAST_SHARE = 0.5
 def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     """(N,) True where the image stands still, which the camera's motion contradicts.
 
+    Nothing does between frames with different intrinsics.
+
     Returns:
         The mask, and (N,) the mean displacement of every superpixel, pixels.
     """
     seg, views, usable = flow.seg, flow.views, flow.views.usable
     none, shift = np.zeros(len(seg), bool), views.distance(views.ray)
     may = usable & (shift < STILL_PX)
-    if may.sum() < PIECE_SIZE:
+    if may.sum() < PIECE_SIZE or not np.array_equal(flow.K_ref, flow.K_next):
         return none, shift
     camera = dominant(flow.without(may | ~usable))[0]
     error = _error_under(flow, camera, usable & ~may)

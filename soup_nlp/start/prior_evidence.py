@@ -27,7 +27,7 @@ from soup_nlp.start.choice import CLIP
 from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.propose import Start
-from soup_nlp.start.settle import MOST_SYSTEMATIC_PX, RELIEF, SYSTEMATIC, most_probable
+from soup_nlp.start.settle import RELIEF, common_error, most_probable
 from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
 
 Kind = Literal["metric", "relative", "inverse", "ordinal"]
@@ -168,12 +168,11 @@ class Seen(NamedTuple):
         """
         start, views = self.start, self.flow.views
         mask, use = start.component == c, self.members(c)
-        error = min(SYSTEMATIC * start.noise, MOST_SYSTEMATIC_PX)
         _, *by_prior, _ = self.motion(use, np.exp(-prior[use]))
         tried = (soup.R[use[0]], soup.translation[use[0]]), by_prior
         motions = [Motion(R, T / np.linalg.norm(T)) for R, T in tried if np.any(T)]
         matches = self.flow.anchor_matches(use)
-        best = most_probable(motions, matches, error, prior[use], sigma)
+        best = most_probable(motions, matches, common_error(start.noise), prior[use], sigma)
         planes = views.fit([best])
         mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
         strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP)

@@ -126,9 +126,7 @@ def propose(flow: FlowFit) -> Start:
         soup = soup.normalised()
         error = views.distance(soup.moved(soup.points(views.ray)))
         return Start.whole(views, soup, error, borrowed, limited_noise(error))
-    fixed, shift = np.zeros(len(seg), bool), np.zeros(len(seg))
-    if np.array_equal(flow.K_ref, flow.K_next):
-        fixed, shift = fixed_to_camera(flow)
+    fixed, shift = fixed_to_camera(flow)
     flow = flow.without(fixed)
     surface = surfaces(flow)
     motions, bends = surface_motions(flow, surface)

@@ -33,12 +33,17 @@ CLIP_PX = 0.3
 """Scale of the Cauchy loss of epipolar distances, pixels."""
 
 
+def common_error(noise: float) -> float:
+    """Error, pixels, that large parts of a flow with this noise have in common."""
+    return min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX)
+
+
 def settle(flow: FlowFit, choice: Choice) -> Choice:
     """The choice with the most probable motion of every rigid component."""
     views, usable, motions = flow.views, flow.views.usable, list(choice.motions)
     if not usable.any() or np.median(choice.error[usable]) < EXACT_PX:
         return choice
-    error = min(SYSTEMATIC * limited_noise(flow.residual), MOST_SYSTEMATIC_PX)
+    error = common_error(limited_noise(flow.residual))
     for c, motion in enumerate(motions):
         at = np.flatnonzero((choice.label == c) & usable)
         if len(at) >= PIECE_SIZE:

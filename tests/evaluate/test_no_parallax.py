@@ -6,12 +6,12 @@ import re
 
 import numpy as np
 import pytest
+from helpers_start import squares
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera
-from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
@@ -28,10 +28,7 @@ K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
 
 @pytest.fixture(scope="module")
 def tiles():
-    v, u = np.mgrid[0:120, 0:160]
-    labels = (v // 20 * 8 + u // 20).astype(np.int32)
-    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
-    return build_segmentation(labels, noise, neighbours=6)
+    return squares(6, 8, side=20, neighbours=6)
 
 
 def turned(angle: float) -> np.ndarray:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from helpers_model import corner_scene, cut_by_part, motion, with_true_flow
 from numpy.typing import NDArray
 
 from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.data.scenes.raycast import render
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
@@ -18,6 +20,26 @@ from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit, Views
 
 Float = NDArray[np.float64]
+
+
+CORNER_K = camera.intrinsics(180.0, 180.0, 95.5, 71.5)
+CAMERA, WEDGE = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1)), motion((0, 3, 0), (-0.15, 0.02, 0.1))
+"""Intrinsics and motions of `corner`."""
+
+
+def corner(
+    camera_motion: Float = CAMERA, wedge: Float | None = None, count: int = 48
+) -> tuple[Pair, Segmentation, NDArray[np.bool_]]:
+    """A corner of a room, with a wedge that moves, at 192 x 144 pixels.
+
+    Returns:
+        The pair with its exact flow, superpixels cut along the outlines of planes, and which of
+        them lie on one plane.
+    """
+    scene = corner_scene(camera_motion, wedge, turn=10)
+    pair = with_true_flow(render(scene, CORNER_K, 144, 192))
+    labels, pure = cut_by_part(scene, pair, count)
+    return pair, build_segmentation(labels, pair.image_ref, neighbours=10), pure
 
 
 def squares(rows: int, columns: int, side: int = 8, neighbours: int = 4) -> Segmentation:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers_model import corner_scene, cut_by_part, motion, with_true_flow
-from helpers_start import fitted
+from helpers_start import WEDGE, corner, fitted
+from helpers_truth import majority
 
-from soup_nlp.data.scenes.raycast import render
 from soup_nlp.geometry import camera, rotation
-from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start.choice import Choice, flow_affinity, smooth_choice
 from soup_nlp.start.components import borrow
@@ -17,24 +15,12 @@ from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.merge import gather
 from soup_nlp.start.propose import propose
 
-WIDTH, HEIGHT = 192, 144
-K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
-CAMERA = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
-WEDGE = motion((0, 3, 0), (-0.15, 0.02, 0.1))
-
 
 @pytest.fixture(scope="module")
 def world():
     """A wedge that moves in a room: flow of superpixels, true component and motions."""
-    scene = corner_scene(CAMERA, WEDGE, turn=10)
-    pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
-    labels, _ = cut_by_part(scene, pair, 100)
-    seg = build_segmentation(labels, pair.image_ref, neighbours=10)
-    flow = fitted(pair, seg)
-    component = np.array(
-        [np.bincount(pair.truth.components[labels == i]).argmax() for i in range(len(seg))]
-    )
-    return flow, component, unit(pair.truth.motions)
+    pair, seg, _ = corner(wedge=WEDGE, count=100)
+    return fitted(pair, seg), majority(pair.truth, seg)[0], unit(pair.truth.motions)
 
 
 def unit(M: np.ndarray) -> list[Motion]:
@@ -157,16 +143,10 @@ def test_a_motion_without_known_depth_borrows_from_another(world):
 
 def test_a_camera_at_rest_starts_near_its_flow():
     """The room has no parallax; the depths that it borrows must not throw it across the image."""
-    scene = corner_scene(np.eye(4), WEDGE, turn=10)
-    pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
-    labels, _ = cut_by_part(scene, pair, 100)
-    seg = build_segmentation(labels, pair.image_ref, neighbours=10)
-
+    pair, seg, _ = corner(np.eye(4), WEDGE, count=100)
     start = propose(fitted(pair, seg))
-    anchor = camera.rays(K, seg.anchors)
-    X = start.soup.depth_at(anchor)[:, None] * anchor
-    X = np.einsum("nij,nj->ni", start.soup.R, X) + start.soup.translation
-    uv = (X / X[:, 2:]) @ K[:2].T
+    anchor = camera.rays(pair.K_ref, seg.anchors)
+    uv = camera.project(pair.K_next, start.soup.moved(start.soup.points(anchor)))
     shift = np.linalg.norm(uv - seg.anchors, axis=1)[start.borrowed]
     assert len(shift) > 20
     assert np.median(shift) < 0.1

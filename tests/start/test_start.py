@@ -6,11 +6,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import pytest
-from helpers_model import corner_scene, cut_by_part, motion, plane_pose, plane_world, with_true_flow
-from helpers_start import fitted
+from helpers_model import motion, plane_pose, plane_world
+from helpers_start import CAMERA, CORNER_K, WEDGE, corner, fitted
+from helpers_truth import majority
 
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.scenes.raycast import Scene, render
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
@@ -19,9 +19,11 @@ from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.views import FlowFit
 
-WIDTH, HEIGHT = 192, 144
-K = camera.intrinsics(180.0, 180.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
-CAMERA = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
+
+@pytest.fixture(scope="module")
+def room() -> tuple[Pair, Segmentation, np.ndarray]:
+    """A rigid corner of a room."""
+    return corner()
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,11 @@ class Errors:
     normal: np.ndarray
     depth_ratio: np.ndarray
 
+    def depth(self, of: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Relative errors of depths in the median scale of the superpixels `of`."""
+        ratio = self.depth_ratio[of]
+        return np.abs(ratio / np.median(ratio) - 1)
+
 
 def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Degrees between rows; exact for small angles too."""
@@ -44,31 +51,23 @@ def compare(start: Start, pair: Pair, seg: Segmentation, pure: np.ndarray) -> Er
     """Errors against the truth that the pixels of each superpixel carry."""
     truth, soup = pair.truth, start.soup
     X = truth.depth_ref[..., None] * camera.rays(pair.K_ref, camera.pixel_grid(*pair.size))
-    component, normal, depth = [], [], []
+    component, normal, depth = majority(truth, seg)[0], [], []
     anchor = camera.rays(pair.K_ref, seg.anchors)
     for i in range(len(seg)):
-        mine = seg.labels == i
-        component.append(np.bincount(truth.components[mine]).argmax())
-        P = X[mine]
+        P = X[seg.labels == i]
         n = np.linalg.svd(P - P.mean(0), full_matrices=False)[2][2]
         n *= -np.sign(n @ P.mean(0))
         normal.append(n)
         depth.append((n @ P.mean(0)) / (n @ anchor[i]))
-    M = truth.motions[np.array(component)]
+    M = truth.motions[component]
     turn = rotation.log(np.swapaxes(M[:, :3, :3], 1, 2) @ soup.R)
     return Errors(
-        component=np.array(component)[pure],
+        component=component[pure],
         rotation=np.degrees(np.linalg.norm(turn, axis=1))[pure],
         direction=angle(soup.translation, M[:, :3, 3])[pure],
         normal=angle(np.array(normal), soup.n)[pure],
         depth_ratio=(soup.depth_at(anchor) / np.array(depth))[pure],
     )
-
-
-def cut(scene: Scene, count: int = 48) -> tuple[Pair, Segmentation, np.ndarray]:
-    pair = with_true_flow(render(scene, K, HEIGHT, WIDTH))
-    labels, pure = cut_by_part(scene, pair, count)
-    return pair, build_segmentation(labels, pair.image_ref, neighbours=10), pure
 
 
 def with_uv(pair: Pair, uv: np.ndarray, confidence: np.ndarray | float = 1.0) -> Pair:
@@ -77,7 +76,7 @@ def with_uv(pair: Pair, uv: np.ndarray, confidence: np.ndarray | float = 1.0) ->
     return pair.with_flow(Flow(uv, whole, "test"))
 
 
-def assert_usable(start: Start, seg: Segmentation, K_ref: np.ndarray = K) -> None:
+def assert_usable(start: Start, seg: Segmentation, K_ref: np.ndarray = CORNER_K) -> None:
     """No NaN, and every constraint of the NLP holds but visibility's margin."""
     for f in fields(start.soup):
         assert np.isfinite(getattr(start.soup, f.name)).all(), f.name
@@ -100,7 +99,7 @@ def assert_usable(start: Start, seg: Segmentation, K_ref: np.ndarray = K) -> Non
 
 @pytest.mark.parametrize("shift", [(0.35, 0.05, 0.1), (1.0, 0.1, 0.2), (-0.2, 0.0, 0.5)])
 def test_one_motion_is_recovered_exactly(shift):
-    pair, seg, pure = cut(corner_scene(motion((0.5, -1.5, 0.3), shift)))
+    pair, seg, pure = corner(motion((0.5, -1.5, 0.3), shift))
     start = propose(fitted(pair, seg))
     assert_usable(start, seg)
     assert pure.mean() > 0.85
@@ -110,17 +109,15 @@ def test_one_motion_is_recovered_exactly(shift):
     # the prior of the slopes counts for half a pixel of noise: it bends planes of little parallax
     assert np.median(e.normal) < 0.1
     assert e.normal.max() < 3.0
-    ratio = e.depth_ratio / np.median(e.depth_ratio)
-    assert np.median(np.abs(ratio - 1)) < 1e-4
-    assert np.abs(ratio - 1).max() < 2e-3
+    assert np.median(e.depth()) < 1e-4
+    assert e.depth().max() < 2e-3
     assert start.error[pure].max() < 0.05
     assert not start.borrowed[pure].any()
     assert (start.motion == 0).mean() > 0.9
 
 
 def test_two_motions_are_told_apart():
-    component = motion((0, 3, 0), (-0.15, 0.02, 0.1))
-    pair, seg, pure = cut(corner_scene(CAMERA, component, turn=10))
+    pair, seg, pure = corner(wedge=WEDGE)
     start = propose(fitted(pair, seg))
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
@@ -132,41 +129,39 @@ def test_two_motions_are_told_apart():
         assert np.median(e.rotation[mine]) < turn
         assert np.median(e.direction[mine]) < direction
         assert np.median(e.normal[mine]) < normal
-        ratio = e.depth_ratio[mine] / np.median(e.depth_ratio[mine])
-        assert np.median(np.abs(ratio - 1)) < depth
+        assert np.median(e.depth(mine)) < depth
     assert str(start).startswith(f"Start({len(seg)} superpixels, ")
     # the motions must explain the flow
     assert np.median(start.error[pure]) < 0.1
     assert np.quantile(start.error[pure], 0.95) < 0.5
 
 
-def test_noise_makes_it_worse_but_not_wild():
+def test_noise_makes_it_worse_but_not_wild(room):
     """Half a pixel of noise raises the errors, but to a limit."""
-    pair, seg, pure = cut(corner_scene(CAMERA))
+    pair, seg, pure = room
     noise = np.random.default_rng(99).normal(0, 0.5, pair.flow.uv.shape)
     start = propose(fitted(with_uv(pair, pair.flow.uv + noise), seg))
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
-    ratio = np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1)
-    assert 1e-3 < np.median(ratio) < 0.05
+    assert 1e-3 < np.median(e.depth()) < 0.05
     assert 0.01 < np.median(e.direction) < 5
     assert 0.3 < np.median(start.error) < 1.0
 
 
-def test_confident_pixels_decide():
+def test_confident_pixels_decide(room):
     """Wrong flow with confidence 0 has no effect."""
-    pair, seg, pure = cut(corner_scene(CAMERA))
+    pair, seg, pure = room
     rng = np.random.default_rng(99)
     bad = rng.random(pair.size) < 0.4
     uv = np.where(bad[..., None], rng.normal(0, 50, pair.flow.uv.shape), pair.flow.uv)
     start = propose(fitted(with_uv(pair, uv, ~bad), seg))
     e = compare(start, pair, seg, pure)
     assert e.rotation.max() < 1e-5
-    assert np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1).max() < 2e-3
+    assert e.depth().max() < 2e-3
 
 
-def test_outliers_of_full_confidence_are_outvoted():
-    pair, seg, pure = cut(corner_scene(CAMERA))
+def test_outliers_of_full_confidence_are_outvoted(room):
+    pair, seg, pure = room
     rng = np.random.default_rng(99)
     bad = rng.random(pair.size) < 0.1
     uv = np.where(
@@ -176,18 +171,18 @@ def test_outliers_of_full_confidence_are_outvoted():
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
     assert np.median(e.rotation) < 0.1
-    assert np.median(np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1)) < 0.02
+    assert np.median(e.depth()) < 0.02
 
 
-def test_two_cameras_with_different_intrinsics():
-    pair, seg, pure = cut(corner_scene(CAMERA))
+def test_two_cameras_with_different_intrinsics(room):
+    pair, seg, pure = room
     K_next = camera.intrinsics(230.0, 210.0, 80.0, 60.0)
     grid = camera.pixel_grid(*pair.size)
-    target = camera.project(K_next, camera.rays(K, grid + pair.flow.uv))
-    start = propose(FlowFit.of(seg, Flow(target - grid), K, K_next))
+    target = camera.project(K_next, camera.rays(CORNER_K, grid + pair.flow.uv))
+    start = propose(FlowFit.of(seg, Flow(target - grid), CORNER_K, K_next))
     e = compare(start, pair, seg, pure)
     assert e.rotation.max() < 1e-5
-    assert np.abs(e.depth_ratio / np.median(e.depth_ratio) - 1).max() < 2e-3
+    assert e.depth().max() < 2e-3
 
 
 # --- same seed, same start -----------------------------------------------------------------------
@@ -195,7 +190,7 @@ def test_two_cameras_with_different_intrinsics():
 
 @pytest.mark.slow
 def test_the_start_is_a_function_of_its_seed():
-    pair, seg, _ = cut(corner_scene(CAMERA, motion((0, 3, 0), (-0.15, 0.02, 0.1))))
+    pair, seg, _ = corner(wedge=WEDGE)
     noise = np.random.default_rng(99).normal(0, 0.3, pair.flow.uv.shape)
     noisy = with_uv(pair, pair.flow.uv + noise)
     one, two, other = (propose(fitted(noisy, seg, seed=seed)) for seed in (3, 3, 4))
@@ -208,13 +203,8 @@ def test_the_start_is_a_function_of_its_seed():
 # --- degenerate input ----------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def corner() -> tuple[Pair, Segmentation, np.ndarray]:
-    return cut(corner_scene(CAMERA))
-
-
-def test_superpixels_without_confidence_borrow(corner):
-    pair, seg, pure = corner
+def test_superpixels_without_confidence_borrow(room):
+    pair, seg, pure = room
     blind = np.zeros(len(seg), bool)
     blind[[0, 7, 20, 21, 22, 40]] = True
     start = propose(fitted(with_uv(pair, pair.flow.uv, ~blind[seg.labels]), seg))
@@ -223,34 +213,33 @@ def test_superpixels_without_confidence_borrow(corner):
     assert not start.borrowed[~blind & pure].any()
     e = compare(start, pair, seg, np.ones(len(seg), bool))
     assert e.rotation[blind].max() < 1e-3
-    ratio = e.depth_ratio / np.median(e.depth_ratio)
-    assert (np.abs(ratio[blind] - 1) < 0.5).all()
+    assert (e.depth()[blind] < 0.5).all()
 
 
-def test_a_superpixel_without_parallax_borrows_its_depth(corner):
+def test_a_superpixel_without_parallax_borrows_its_depth(room):
     """The camera's rotation alone moves it, as it does the sky."""
-    pair, seg, _ = corner
+    pair, seg, _ = room
     far = 27
     grid = camera.pixel_grid(*pair.size)
-    turned = camera.project(K, camera.rays(K, grid) @ CAMERA[:3, :3].T) - grid
+    turned = camera.project(CORNER_K, camera.rays(CORNER_K, grid) @ CAMERA[:3, :3].T) - grid
     uv = np.where((seg.labels == far)[..., None], turned, pair.flow.uv)
     start = propose(fitted(with_uv(pair, uv), seg))
     assert_usable(start, seg)
     assert start.borrowed[far]
-    z = start.soup.depth_at(camera.rays(K, seg.anchors))
+    z = start.soup.depth_at(camera.rays(CORNER_K, seg.anchors))
     assert 0.3 < z[far] / np.median(z[seg.knn[far]]) < 3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["zero flow", "one superpixel", "eight pixels"])
-def test_flow_that_determines_no_depth_is_finite_and_flagged(corner, what):
-    pair, seg, _ = corner
-    confidence = np.zeros((HEIGHT, WIDTH))
+def test_flow_that_determines_no_depth_is_finite_and_flagged(room, what):
+    pair, seg, _ = room
+    confidence = np.zeros(pair.size)
     if what == "eight pixels":
         confidence[70, 50:58] = 1
     else:
         confidence[(seg.labels == 11) | (what == "zero flow")] = 1
-    uv = np.zeros((HEIGHT, WIDTH, 2)) if what == "zero flow" else pair.flow.uv
+    uv = np.zeros((*pair.size, 2)) if what == "zero flow" else pair.flow.uv
     start = propose(fitted(with_uv(pair, uv, confidence), seg))
     assert_usable(start, seg)
     blind = np.bincount(seg.labels.ravel(), confidence.ravel()) == 0
@@ -262,7 +251,7 @@ def test_flow_that_determines_no_depth_is_finite_and_flagged(corner, what):
 @pytest.mark.parametrize("turn", [(0.0, 2.0, 0.0), (1.0, -1.0, 3.0)])
 def test_pure_rotation_is_finite_explains_the_flow_and_is_flagged(turn):
     """The flow does not determine any depth."""
-    pair, seg, _ = cut(corner_scene(motion(turn, (0, 0, 0))))
+    pair, seg, _ = corner(motion(turn, (0, 0, 0)))
     start = propose(fitted(pair, seg))
     assert_usable(start, seg)
     assert np.median(start.error) < 0.3
@@ -294,18 +283,18 @@ def test_one_plane_in_superpixels_of_any_shape_is_finite(name):
 
 
 @pytest.mark.slow
-def test_random_flow_is_finite(corner):
-    pair, seg, _ = corner
-    uv = np.random.default_rng(99).normal(0, 30, (HEIGHT, WIDTH, 2))
+def test_random_flow_is_finite(room):
+    pair, seg, _ = room
+    uv = np.random.default_rng(99).normal(0, 30, (*pair.size, 2))
     assert_usable(propose(fitted(with_uv(pair, uv), seg)), seg)
 
 
 @pytest.mark.parametrize("usable", [0, 7])
-def test_too_few_usable_pixels_are_an_error(corner, usable):
-    pair, seg, _ = corner
-    confidence = np.zeros((HEIGHT, WIDTH))
+def test_too_few_usable_pixels_are_an_error(room, usable):
+    pair, seg, _ = room
+    confidence = np.zeros(pair.size)
     confidence[70, 50 : 50 + usable] = 1
     with pytest.raises(DataError, match="too few pixels") as caught:
-        FlowFit.of(seg, Flow(pair.flow.uv, confidence, "thin"), K, K)
+        FlowFit.of(seg, Flow(pair.flow.uv, confidence, "thin"), CORNER_K, CORNER_K)
     assert "thin" in str(caught.value)
     assert str(usable) in str(caught.value)

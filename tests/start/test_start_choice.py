@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from helpers_model import motion, plane_pose, plane_world
-from helpers_start import facing, fitted, flow_of, squares
+from helpers_model import plane_pose, plane_world
+from helpers_start import CAMERA, facing, fitted, flow_of, squares
 
-from soup_nlp.data.pair import Flow
+from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.plane import PlaneFit
@@ -270,11 +270,17 @@ def test_the_lowest_part_of_a_component_places_it():
     assert (named == np.where(component, "contact below", "reference")).all()
 
 
-def test_superpixels_of_hardly_any_confidence_borrow():
+@pytest.fixture(scope="module")
+def plane() -> tuple[Pair, Segmentation]:
+    """A plane before a camera that moves by `CAMERA`."""
+    pair = plane_world(plane_pose(3.0, yaw=20), CAMERA, 96, 72)
+    labels = segment(pair.image_ref, 30, "grid")
+    return pair, build_segmentation(labels, pair.image_ref, neighbours=8)
+
+
+def test_superpixels_of_hardly_any_confidence_borrow(plane):
     """Their flow is right here, but its confidence is low."""
-    move = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
-    pair = plane_world(plane_pose(3.0, yaw=20), move, 96, 72)
-    seg = build_segmentation(segment(pair.image_ref, 30, "grid"), pair.image_ref, neighbours=8)
+    pair, seg = plane
     faint = np.isin(np.arange(len(seg)), [8, 9, 20])
     confidence = np.where(faint[seg.labels], 0.01, 1.0)
     start = propose(fitted(pair.with_flow(Flow(pair.flow.uv, confidence, "test")), seg))
@@ -282,12 +288,10 @@ def test_superpixels_of_hardly_any_confidence_borrow():
     assert start.borrowed[~faint].mean() < 0.2
 
 
-def test_motions_that_are_hardly_different_do_not_mix(monkeypatch):
+def test_motions_that_are_hardly_different_do_not_mix(plane, monkeypatch):
     """One motion is off by a hundredth of a pixel: in any order, all take the exact motion."""
-    move = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1))
-    pair = plane_world(plane_pose(3.0, yaw=20), move, 96, 72)
-    seg = build_segmentation(segment(pair.image_ref, 30, "grid"), pair.image_ref, neighbours=8)
-    exact = Motion(move[:3, :3], move[:3, 3] / np.linalg.norm(move[:3, 3]))
+    pair, seg = plane
+    exact = Motion(CAMERA[:3, :3], CAMERA[:3, 3] / np.linalg.norm(CAMERA[:3, 3]))
     near = Motion(turn(4e-4) @ exact.R, exact.t)
     monkeypatch.setattr(choosing, "of_pieces", lambda *a: [])
     monkeypatch.setattr(proposing, "settle", lambda flow, choice: choice)
