@@ -46,7 +46,9 @@ def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> 
     close(J, nlp.jacobian(x).toarray()[np.ix_(r, v)])
     rng = np.random.default_rng(seed)
     lam_f, lam_g = rng.normal(), rng.normal(size=nlp.ng)
-    close(back.hess(x[v], lam_f, lam_g[r]), nlp.hessian(x, lam_g, lam_f).toarray()[np.ix_(v, v)])
+    H = nlp.hessian(x, lam_g, lam_f)
+    for way in rng.normal(size=(2, nlp.nx)):
+        close(back.hess(x[v], lam_f, lam_g[r], way[v]), (H @ way)[v])
 
 
 # --- the soup ------------------------------------------------------------------------------------

@@ -85,7 +85,9 @@ def same_as_sx(problem: dict, file: NLFile, at: np.ndarray) -> None:
     close(d1, d0[v])
     close(J1, J0[np.ix_(r, v)])
     lam = np.linspace(-1, 2, len(r))
-    close(back.hess(at[v], 0.3, lam[r]), np.array(hess(at, 0.3, lam))[np.ix_(v, v)])
+    H = np.array(hess(at, 0.3, lam))
+    for way in np.eye(len(v)):
+        close(back.hess(at[v], 0.3, lam[r], way[v]), (H @ way)[v])
 
 
 UNARY = (

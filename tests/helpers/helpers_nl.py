@@ -73,9 +73,11 @@ class ReadBack:
 
     @cached_property
     def hess(self) -> ca.Function:
-        """The Lagrangian's Hessian at (x, lam_f, lam_g)."""
-        H = ca.hessian(self._lagrangian, self._inputs[0])[0]
-        return ca.Function("h", self._inputs, [H])
+        """The Lagrangian's Hessian at (x, lam_f, lam_g) times a vector: sooner built than whole."""
+        x, v = self._inputs[0], ca.SX.sym("v", self._inputs[0].numel())
+        return ca.Function(
+            "h", [*self._inputs, v], [ca.jtimes(ca.gradient(self._lagrangian, x), x, v)]
+        )
 
 
 def close(actual: object, expected: object) -> None:
