@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from helpers_files import sets
 from helpers_rows import square, threads
 
 from soup_nlp.bench.processes import machine
@@ -128,9 +129,11 @@ def test_bad_input_ends_with_2(tmp_path, capsys, words):
 def test_a_real_run_and_its_table(tmp_path):
     out = tmp_path / "out"
     size = ["--scenes", "street", "--sizes", "24", "--neighbours", "4", "--seeds", "0"]
-    small = ["--width", "128", "--set", "solver.max_iter=5"]
-    small += ["--set", "formulation.compiled=false", "--set", "solver.eps=0.3"]
-    small += ["--set", "solver.presolve_eps=[0.3]"]
+    small = sets(
+        "formulation.compiled=false solver.presolve_eps=[0.3] solver.presolve_iterations=3"
+        " solver.exact_iterations=0 solver.max_iter=1"
+    )
+    small += ["--width", "128"]
     words = ["bench", "speed", *size, *small, "--quiet", "--out", str(out)]
     assert main(words) == 0
     (row,) = read_rows(out / "table.jsonl")
