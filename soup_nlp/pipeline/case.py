@@ -89,25 +89,7 @@ def prepare(
         if on_stage:
             on_stage(stage)
 
-    full = problem.depth_prior.load(pair or problem.load_pair(), problem.path)
-    pair = working_size(full, problem.max_size)
-    check_fits(problem, pair)
-    if pair is not full and log:
-        (h, w), (rows, columns) = full.size, pair.size
-        log(f"{w}x{h} is solved at {columns}x{rows} (max_size {problem.max_size:g} megapixels)")
-    done("load")
-    pair, seen = with_flow(problem, full, pair, log)
-    done("flow", pair)
-    labels = superpixels(problem, pair)
-    seg = _segmented(problem, pair, labels)
-    done("segmentation", seg)
-    if pair.focal_sigma >= GUESS_SIGMA:
-        matches = _flow_fit(problem, pair, seg).views.matches()
-        better = focal_length(matches, pair.focal_sigma, problem.seed)
-        full, pair = full.with_focal(*better), pair.with_focal(*better)
-        seen = None if seen is None else seen.with_focal(*better)
-        if log:
-            log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
+    full, pair, seen, labels, seg = _observed(problem, pair, log, done)
     begun, evidence, given_depth = _begun(problem, pair, seg), None, None
     if pair.depth_prior is not None and problem.energy.weights.depth > 0:
         begun, evidence = _judged(problem, labels, begun)
@@ -133,6 +115,45 @@ def prepare(
     watch = Watch(say=log) if log else None
     answer = solve_soup(start.soup, data, weights, case.formulation(), once, watch=watch)
     return replace(case, soup=answer.soup)
+
+
+def observed_pair(problem: Problem) -> Pair:
+    """The pair of a problem with its flow, its focal length by the flow where it was a guess.
+
+    Raises:
+        SoupError: the input cannot be used.
+    """
+    return _observed(problem, None, None, lambda *_: None)[1]
+
+
+def _observed(
+    problem: Problem,
+    pair: Pair | None,
+    log: Callable[[str], None] | None,
+    done: Callable[..., None],
+) -> tuple[Pair, Pair, Pair | None, Labels, Segmentation]:
+    """Everything before the start: the pair in full size, the pair that is solved, that pair as the
+    images show it if it differs, labels and graphs of the superpixels; see `prepare`."""
+    full = problem.depth_prior.load(pair or problem.load_pair(), problem.path)
+    pair = working_size(full, problem.max_size)
+    check_fits(problem, pair)
+    if pair is not full and log:
+        (h, w), (rows, columns) = full.size, pair.size
+        log(f"{w}x{h} is solved at {columns}x{rows} (max_size {problem.max_size:g} megapixels)")
+    done("load")
+    pair, seen = with_flow(problem, full, pair, log)
+    done("flow", pair)
+    labels = superpixels(problem, pair)
+    seg = _segmented(problem, pair, labels)
+    done("segmentation", seg)
+    if pair.focal_sigma >= GUESS_SIGMA:
+        matches = _flow_fit(problem, pair, seg).views.matches()
+        better = focal_length(matches, pair.focal_sigma, problem.seed)
+        full, pair = full.with_focal(*better), pair.with_focal(*better)
+        seen = None if seen is None else seen.with_focal(*better)
+        if log:
+            log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
+    return full, pair, seen, labels, seg
 
 
 Begun = tuple[Start, Pair, FlowFit]

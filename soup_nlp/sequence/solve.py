@@ -16,7 +16,7 @@ from soup_nlp.config.problem import Problem, make_problem, title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import DataWarning, read_image
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
-from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.report.figures import write_png
 from soup_nlp.report.folder import run
 from soup_nlp.sequence.chain import Chain, SolvedPair, make_chain, read_pair
@@ -209,7 +209,7 @@ def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:
         pairs = []
         for k in np.unique(np.linspace(0, last, min(last + 1, PROBED)).astype(int)):
             with suppress(SoupError):
-                pairs.append(prepare(_problem(frames, int(k), overrides)).pair)
+                pairs.append(observed_pair(_problem(frames, int(k), overrides)))
     if not pairs:
         return frames
     guess = first.K_ref[0, 0] / first.size[1]

@@ -199,6 +199,12 @@ def without_gaps(pair: Pair, seg: Segmentation) -> tuple[Float, Mask, Float]:
     return value, with_value, np.where(valid, prior, value[seg.labels])
 
 
+def ranks(values: Float) -> Float:
+    """(N,) ranks of numbers; equal ones share their mean rank."""
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(count) - (count - 1) / 2)[place])
+
+
 def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Evidence:
     """Evidence of flow and image for the depth prior of a pair.
 
@@ -208,9 +214,6 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Eviden
         flow: The flow of these superpixels.
         kind: Kind of the prior's values; None to find it.
     """
-    # imported here: it takes a quarter of the CPU time in which the program starts
-    from scipy.stats import rankdata
-
     seen = Seen(start, flow)
     value, with_value, whole = without_gaps(pair, flow.seg)
     anchor, relief = flow.views.anchor, seen.relief(SCENE)
@@ -218,10 +221,10 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Eviden
     determined, tells = relief > seen.tells, relief > seen.tells / 3 and known.sum() >= FEWEST
     sure = known & ~start.borrowed & (SURE * flow.views.parallax(start.soup) > start.noise)
     if tells and sure.sum() >= FEWEST:
-        far = rankdata(start.soup.depth_at(anchor)[sure]), rankdata(value[sure])
+        far = ranks(start.soup.depth_at(anchor)[sure]), ranks(value[sure])
     else:
         # lower parts of an image are mostly nearer
-        far = rankdata(-anchor[:, 1]), rankdata(value)
+        far = ranks(-anchor[:, 1]), ranks(value)
     kind = kind or ("inverse" if np.cov(*far)[0, 1] < 0 else "relative")
     log_depth, ratio, gap = as_log_depth(kind, value), np.nan, np.inf
     if tells:

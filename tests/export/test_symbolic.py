@@ -22,7 +22,7 @@ QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 @pytest.mark.slow
 def test_nlpsol_finds_the_minimum_of_solve():
     nlp = soup_nlp.nlp(
-        "orbit", superpixels=16, overrides=SMALL, coordinates="tangent", hessian="gauss-newton"
+        "orbit", superpixels=9, overrides=SMALL, coordinates="tangent", hessian="gauss-newton"
     )
     options = {**QUIET, "ipopt.mu_init": 1e-6, **nlp.derivatives}
     solver, start = ca.nlpsol("s", "ipopt", nlp.problem, options), nlp.start

@@ -47,8 +47,8 @@ from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.pipeline.run import run
 from soup_nlp.solve.ipopt import Ipopt
+from soup_nlp.solve.stages import solve_soup
 
 ENTRIES = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)]
 """Of R'R, in the order of the rows."""
@@ -359,12 +359,11 @@ def test_ipopt_gets_every_kind_of_bound(side):
 )
 def test_the_raw_answer_of_a_default_solve_keeps_every_constraint(scene, gauge):
     small = ["input.width=96", "input.height=72", "segmentation.superpixels=30"]
-    own = [f"formulation.gauge={gauge}", "flow.source=truth", "refine.enabled=false"]
-    problem = load_problem(scene, [*small, *own])
-    case = prepare(problem)
-    solution = run(problem).solution
-    assert solution.converged, solution.status
+    own = [f"formulation.gauge={gauge}", "flow.source=truth"]
+    case = prepare(load_problem(scene, [*small, *own]))
     f = case.formulation()
+    solution = solve_soup(case.soup, case.data, case.weights, f, case.options)
+    assert solution.converged, solution.status
     nlp, _ = case.nlp(f)
     found = violations(nlp, solution.stages[-1].x, case.data, f)
     assert max(found.values()) <= RAW, found
