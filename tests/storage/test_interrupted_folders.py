@@ -66,8 +66,11 @@ def killed(target: Path, moves: int) -> None:
 def test_the_next_run_removes_temporary_folders_of_a_kill(tmp_path):
     target = tmp_path / "out"
     write(target, a="1", b="1")
-    killed(target, 0)
-    assert len(os.listdir(target)) == 4
+    for clean in (recover, lambda folder: None):
+        killed(target, 0)
+        assert len(os.listdir(target)) == 4
+        clean(target)
+        assert (len(os.listdir(target)) == 3) == (clean is recover)
     with staged(target) as new:
         assert {*os.listdir(target)} == {MARK, "a", "b", new.name}
         # a folder that is in use is not removed
