@@ -234,9 +234,9 @@ def test_similarities_are_found_exactly():
 START_ALONE = sets("refine.enabled=false solver.presolve=false solver.max_iter=1")
 
 
-@pytest.mark.parametrize("order", [[0, 0, 1, 1, 2], [0, 0]])
+@pytest.mark.parametrize("order", [[0, 0, 1, 1, 2, 2], [0, 0]])
 def test_duplicate_frames_are_bridged(order, tmp_path):
-    """A recording that starts and pauses at rest, or rests all the time."""
+    """A recording that starts, pauses and ends at rest, or rests all the time."""
     for k, frame in enumerate(order):
         write_png(tmp_path / f"{k}.png", render_scene("orbit", 0, 128, 86, frame).image_ref)
     np.savetxt(tmp_path / "K.txt", render_scene("orbit", 0, 128, 86).K_ref)
