@@ -24,6 +24,8 @@ LEAST_PARALLAX_PX = 0.25
 """Parallax from which the flow of a superpixel determines its depth, pixels."""
 LEAST_PIXELS = 8
 """Least number of usable pixels of a superpixel that has views of its own, and of an image."""
+CACHED = 1 << 16
+"""Pixels times motions that are fitted at once: 0.5 MB per array, so that the cache holds them."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,13 @@ class Views:
         each = np.arange(len(motions))[None] if label is None else label[:, None]
         each = np.broadcast_to(each, (len(self.ray), each.shape[1]))
         R, t = stacked(motions)
-        samples = self.ray, self.target, self.weight
-        return fit_planes(R[each], t[each], *samples, self.anchor, self.radius, self.focal)
+        size = max(1, CACHED // (each.shape[1] * self.weight.shape[1]))
+        fits = []
+        for k in range(0, len(each), size):
+            m, v = each[k : k + size], self.subset(slice(k, k + size))
+            samples = v.ray, v.target, v.weight
+            fits.append(fit_planes(R[m], t[m], *samples, v.anchor, v.radius, v.focal))
+        return PlaneFit(*map(np.concatenate, zip(*(vars(fit).values() for fit in fits))))
 
     def distance(self, moved: Float) -> Float:
         """(N,) mean distance of points (N, S, 3) of the next camera from the targets, pixels."""
@@ -92,7 +99,7 @@ class Views:
         r, q = (v.reshape(-1, 3)[::step] for v in (self.ray, self.target))
         return Matches(r, q, self.weight.ravel()[::step], self.focal[0])
 
-    def subset(self, at: Int | Mask) -> Views:
+    def subset(self, at: Int | Mask | slice) -> Views:
         """The views of superpixels `at`."""
         ray, target, weight = self.ray[at], self.target[at], self.weight[at]
         return Views(ray, target, weight, self.anchor[at], self.radius[at], self.focal)
