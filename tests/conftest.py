@@ -1,7 +1,5 @@
 """What every test file shares."""
 
-from __future__ import annotations
-
 import gc
 from functools import lru_cache
 from pathlib import Path

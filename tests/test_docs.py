@@ -1,7 +1,5 @@
 """The documents agree with the code: links, names, keys, rooms; the recipes of docs/adding.md."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """Each room imports only the rooms before it, as docs/architecture.md says."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

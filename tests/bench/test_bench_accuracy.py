@@ -1,7 +1,5 @@
 """Accuracy of pairs: contents of rows, the page."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The tables and figures of the paper: sections from artificial rows, real rows of tiny pairs."""
 
-from __future__ import annotations
-
 import json
 from operator import attrgetter
 from pathlib import Path

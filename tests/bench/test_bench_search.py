@@ -1,7 +1,5 @@
 """The search for defaults on rows from a formula; the commands of `make results`."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """bench speed: plan, costs and page on artificial rows; one tiny real run."""
 
-from __future__ import annotations
-
 import os
 from functools import partial
 from pathlib import Path

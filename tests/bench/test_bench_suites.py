@@ -1,7 +1,5 @@
 """Suites: lists of pairs, available pairs, and messages on the source of missing ones."""
 
-from __future__ import annotations
-
 import pytest
 
 from soup_nlp.bench.suites import SUITES, Options, list_suite, spread

@@ -1,7 +1,5 @@
 """Comparison of solvers: isolation, verification, resuming; real solvers on a tiny soup."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

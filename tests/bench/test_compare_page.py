@@ -1,7 +1,5 @@
 """Page and pictures of a comparison of solvers from artificial rows; its command."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Solves whose numbers do not matter."""
 
-from __future__ import annotations
-
 import pytest
 
 from soup_nlp.cli import solve

@@ -1,7 +1,5 @@
 """Pictures as people have them: turned by EXIF, flows of other programs with their confidence."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

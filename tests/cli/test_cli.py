@@ -1,7 +1,5 @@
 """The command line: exit codes, messages, files, rejection of bad input."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

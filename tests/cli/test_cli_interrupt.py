@@ -1,7 +1,5 @@
 """Ctrl-C in every stage of `solve`: message, exit code, and no incomplete folder."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

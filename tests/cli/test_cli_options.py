@@ -1,7 +1,5 @@
 """Options of `solve` that can, or cannot, be combined with a problem file."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The preset that is the method as printed: its options, its start, its unit, its proposals."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

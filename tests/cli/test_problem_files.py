@@ -1,7 +1,5 @@
 """Problem files and their errors; help that is quick, problems by name, version, completion."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Python has what the command line has: cameras, images, progress, scores, stored results."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil

@@ -1,7 +1,5 @@
 """Dataset layouts as tiny files in a temporary folder, and real pairs if available."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Flow sources: DIS with its confidence, files, truth, plug-ins."""
 
-from __future__ import annotations
-
 from importlib.metadata import EntryPoint
 from itertools import pairwise
 from pathlib import Path

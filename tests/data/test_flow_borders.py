@@ -1,7 +1,5 @@
 """Superpixel borders move to flow discontinuities, and nothing else changes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_truth import assert_partition, majority

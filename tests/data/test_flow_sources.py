@@ -1,7 +1,5 @@
 """Flow sources beside DIS: noise, networks, files in wrong units, frames of other focal lengths."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

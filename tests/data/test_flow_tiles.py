@@ -1,7 +1,5 @@
 """Flow of small surfaces that move far: found where right, refused where it would be a guess."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

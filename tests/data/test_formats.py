@@ -1,7 +1,5 @@
 """Files of flow, depth, cameras and images: golden bytes, real and malformed files."""
 
-from __future__ import annotations
-
 import io
 import struct
 from functools import partial

@@ -1,7 +1,5 @@
 """Input checks of a pair and its flow."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Pictures and cameras of the kinds on public trackers: metadata, 16 bits, intrinsics, lenses."""
 
-from __future__ import annotations
-
 import re
 import struct
 import warnings

@@ -1,7 +1,5 @@
 """The flow of a moving scene is found behind a static layer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

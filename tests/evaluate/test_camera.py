@@ -1,7 +1,5 @@
 """Errors of a given camera that the flow of a rigid scene shows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shares of the image whose depth is determined, and the reasons for guesses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Marginal variances of depth: dense inverses, derivatives, scale, missing flow, calibration."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Evidence for depth: residuals of a turn, of a constant depth, and of the answer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

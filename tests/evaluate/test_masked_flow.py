@@ -1,7 +1,5 @@
 """Where flow is missing, depth is plausible and uncertain; elsewhere it hardly changes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Errors of depth, scene flow and components; sparsification and coverage; all by hand."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Flow without parallax or without confidence: depth is borrowed, the flow is reproduced."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

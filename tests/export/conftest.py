@@ -1,7 +1,5 @@
 """The exported problem is the same for all answers to it."""
 
-from __future__ import annotations
-
 import pytest
 
 from soup_nlp.config.problem import Problem

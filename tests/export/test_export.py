@@ -1,7 +1,5 @@
 """Commands export, import and check: exported files, and answers of other solvers."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Exported folders: files after one and two exports, broken manifests, tangent coordinates."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The .nl file equals the NLP: read back by CasADi, ASL, POUNCE and SCIP."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Plain CasADi SX NLPs as .nl files: textbook and random programs read back, errors."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """AMPL's .sol format, and the multipliers and residuals with which answers are verified."""
 
-from __future__ import annotations
-
 import subprocess
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The NLP in CasADi's words: `nlpsol` solves it from a few lines and finds the same minimum."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

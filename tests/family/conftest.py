@@ -1,7 +1,5 @@
 """A small set under the names of a published size."""
 
-from __future__ import annotations
-
 import pytest
 from freeze_family import record_of
 

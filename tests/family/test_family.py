@@ -1,7 +1,5 @@
 """The SOUP family: names, the same bytes on every processor, index, best points, answers."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

@@ -1,7 +1,5 @@
 """Files beside the instances: what solvers reached; a solver of one's own."""
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -1,7 +1,5 @@
 """A page in a real browser: headless Chromium, spoken to through a pipe (DevTools protocol)."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

@@ -1,7 +1,5 @@
 """Files that readers are tested with, written by hand; a reader of PLY files; overrides."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Results of a few text files in an output folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

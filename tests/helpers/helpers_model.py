@@ -1,7 +1,5 @@
 """Tiny problems, finite differences and rendered planes of known energy, for tests of the model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Textbook problems of kernels, plain SX problems as .nl files, and files as CasADi reads them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures with metadata, and pairs of them with the warnings of their loading."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

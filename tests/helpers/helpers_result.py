@@ -1,7 +1,5 @@
 """A small result by hand: a wall, and a board before it that moves by itself."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

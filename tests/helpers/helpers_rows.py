@@ -1,7 +1,5 @@
 """Rows that need no solve, in a module that worker processes import quickly."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 

@@ -15,8 +15,6 @@ vector counts scales as `N lam` and lengths in `1 / N`:
 `tests/tools/constraint_mutants.py` deletes each of these and each bound, and runs this file.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """The exact energy: invariances, values by hand, pixel samples, degenerate problems."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

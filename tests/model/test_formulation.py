@@ -1,7 +1,5 @@
 """One problem in every gauge: packing, names, sizes."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Three faces of one NLP agree: plain numpy, kernels in tables, finite differences."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

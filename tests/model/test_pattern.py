@@ -1,7 +1,5 @@
 """Patterns of sparse matrices: the union of many elements' nonzeros, and where each stands."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

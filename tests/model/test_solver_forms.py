@@ -1,7 +1,5 @@
 """Smooth and epigraph forms against the exact energy, and worlds where that is zero."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

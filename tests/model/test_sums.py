@@ -1,7 +1,5 @@
 """Machine code, numpy and CasADi's graph give the same numbers; the cache of machine code."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Arguments of wrong types for the Python API, and unusual uses of a run."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Odd files and texts as inputs of all commands."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Iterator

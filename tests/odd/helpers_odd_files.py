@@ -1,7 +1,5 @@
 """Arrays, images and networks whose contents contradict their headers."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Useless numbers, solves at the limits of options, and odd values of every option."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

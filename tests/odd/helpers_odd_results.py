@@ -1,7 +1,5 @@
 """Results whose parts do not belong together, files of the user, sequences without an answer."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path

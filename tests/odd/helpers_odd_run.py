@@ -1,7 +1,5 @@
 """Odd inputs: a generator of cases from tables, and the check of the program's answer."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil

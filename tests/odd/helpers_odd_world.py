@@ -1,7 +1,5 @@
 """A tiny pair with its result and export, and names of files that no reader should trust."""
 
-from __future__ import annotations
-
 import os
 import socket
 import struct

@@ -4,8 +4,6 @@
 it has the cases that solve as well.
 """
 
-from __future__ import annotations
-
 from itertools import chain
 
 import pytest

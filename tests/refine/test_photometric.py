@@ -1,7 +1,5 @@
 """E_photo is its sum, depends on neither scale nor exposure, and corrects wrong flow."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

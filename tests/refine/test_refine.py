@@ -1,7 +1,5 @@
 """Proposals are feasible and of the right size; rounds never raise E and repair superpixels."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

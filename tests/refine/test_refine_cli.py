@@ -1,7 +1,5 @@
 """`solve` refines by default; each half can be left out; the history is stored and checked."""
 
-from __future__ import annotations
-
 import json
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Costs of particles are the exact energy, label by label and pair by pair."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

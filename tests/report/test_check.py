@@ -1,7 +1,5 @@
 """The check detects every changed file and entry, and rejects damaged ones without a crash."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

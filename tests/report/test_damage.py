@@ -1,7 +1,5 @@
 """Result files that are damaged or strange: an error of the file, and nothing else."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

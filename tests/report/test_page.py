@@ -1,7 +1,5 @@
 """report.html: its contents, and that any result folder can make it."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

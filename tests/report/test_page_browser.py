@@ -1,7 +1,5 @@
 """report.html in a real browser: it loads, draws, moves and recolours."""
 
-from __future__ import annotations
-
 import base64
 
 import cv2

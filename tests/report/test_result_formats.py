@@ -1,7 +1,5 @@
 """Files for other programs, read back by other programs."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The printed verdict: what was found comes first, what concerns the solver only on request."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Frames of a sequence: files, videos and scenes; which of them are refused or left out."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

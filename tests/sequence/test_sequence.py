@@ -1,7 +1,5 @@
 """Common scale of the pairs of a sequence."""
 
-from __future__ import annotations
-
 import json
 from contextlib import nullcontext
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Ipopt on textbook problems as kernels: known optima, multipliers, limits, interruption."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Soups solved: constraints, gauges, limits, interruption, a world whose truth is the optimum."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Kills, signals, several processes and full disks: a folder has the old result or the new one."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

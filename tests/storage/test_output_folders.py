@@ -1,7 +1,5 @@
 """Output folders are written whole or not at all, and never overwrite files of the user."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat

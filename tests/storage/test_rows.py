@@ -1,7 +1,5 @@
 """Rows of numbers: stored as JSON lines, measured once, here or by worker processes."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import replace

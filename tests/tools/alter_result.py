@@ -5,8 +5,6 @@ its files, or one value: an entry of summary.json, an element of an array or an 
 result.h5 (written by HDF5, so that its checksums are right). The result is checked and restored.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import random

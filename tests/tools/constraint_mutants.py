@@ -4,8 +4,6 @@ A mutant is one change in a copy of the package. The fast tests of `test_constra
 fail; the table says which test saw it. The exit code is the number of mutants that survive.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

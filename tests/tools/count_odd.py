@@ -3,8 +3,6 @@
 python tests/tools/count_odd.py [WORD ...]     # only cases whose name holds one of the words
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 import time

@@ -3,8 +3,6 @@
 Run as `python tests/tools/freeze_family.py SCENE SIZE FILE`.
 """
 
-from __future__ import annotations
-
 import io
 import sys
 import zipfile

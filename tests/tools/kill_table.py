@@ -9,8 +9,6 @@ which needs the right to mount): as large as its files and the space that they t
 replaced, then with every free byte taken, then on a disk of half the size from the beginning.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

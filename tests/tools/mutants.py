@@ -8,8 +8,6 @@ mutant runs the fast ones of them until one fails. Annotations and decorators ar
 report has a row per mutant that survives and the counts by room.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import difflib
