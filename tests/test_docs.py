@@ -1,11 +1,9 @@
 """The documents agree with the code: links, names, keys, rooms; the recipes of docs/adding.md."""
 
 import ast
-import os
 import re
 import runpy
 import shutil
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,19 +14,14 @@ import numpy as np
 import pytest
 import typer
 from constraint_mutants import MUTANTS
-from helpers_model import PAPER, Tiny
 from pydantic import BaseModel, Field
 
-from soup_nlp.bench.solvers.plugins import Task
-from soup_nlp.bench.solvers.runner import find_solver
 from soup_nlp.cli.main import app
 from soup_nlp.config.problem import Problem
-from soup_nlp.data.flow.sources import flow_sources, resolve_flow
+from soup_nlp.data.flow.sources import resolve_flow
 from soup_nlp.data.inputs import Input, PairInput, PriorOptions, Resolve
 from soup_nlp.data.pair import Pair
-from soup_nlp.export.verify import Limits
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.check import check_folder
 
@@ -292,32 +285,22 @@ def test_a_dataset_is_a_section_that_loads_itself(tmp_path):
     assert len(case) > 4
 
 
-def test_a_flow_source_is_an_entry_point(tmp_path, monkeypatch, small_room):
-    (tmp_path / "my_flow_package.py").write_text(
-        "import numpy as np\n"
-        "from soup_nlp import Flow\n"
-        "def my_flow(image_ref, image_next):\n"
-        "    shape = image_ref.shape[:2]\n"
-        "    uv = np.full((*shape, 2), 3.0, np.float32)\n"
-        "    return Flow(uv, np.ones(shape, np.float32), 'mine')\n"
-    )
-    info = tmp_path / "my_flow_package-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-flow-package\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[soup_nlp.flow]\nmine = my_flow_package:my_flow\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    assert "mine" in flow_sources()
-    flow = resolve_flow(small_room.pair, "mine")
-    assert flow.source == "mine"
-    assert (flow.uv == 3.0).all()
-
-
-def test_a_network_is_any_onnx_file(tmp_path, monkeypatch):
+@pytest.fixture
+def run_example(tmp_path, monkeypatch):
+    """Runs the first program of a page, which writes a network, in an empty folder."""
     pytest.importorskip("onnx", reason="no onnx")
     pytest.importorskip("onnxruntime", reason="no onnxruntime")
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs/networks.md").read_text(encoding="utf-8")
-    exec(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0], {})
+
+    def run(page: str) -> None:
+        text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+        exec(re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0], {})
+
+    return run
+
+
+def test_a_network_is_any_onnx_file(run_example):
+    run_example("networks.md")
     rng = np.random.default_rng(0)
     wide = cv2.GaussianBlur(rng.integers(0, 255, (80, 101, 3), dtype=np.uint8), (0, 0), 3)
     pair = Pair(wide[:, 1:], wide[:, :-1], *[intrinsics(90, 90, 50, 40)] * 2)
@@ -328,47 +311,15 @@ def test_a_network_is_any_onnx_file(tmp_path, monkeypatch):
     assert np.median(flow.confidence) > 0.9
 
 
-def test_a_depth_prior_may_be_an_onnx_file(tmp_path, monkeypatch):
-    pytest.importorskip("onnx", reason="no onnx")
-    pytest.importorskip("onnxruntime", reason="no onnxruntime")
-    monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs/depth_prior.md").read_text(encoding="utf-8")
-    exec(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0], {})
+def test_a_depth_prior_may_be_an_onnx_file(run_example):
+    run_example("depth_prior.md")
     image = np.zeros((50, 60, 3), np.uint8)
     pair = Pair(image, image, *[intrinsics(90, 90, 50, 40)] * 2)
-    found = PriorOptions(source="ramp.onnx").load(pair, lambda name: tmp_path / name).depth_prior
+    found = PriorOptions(source="ramp.onnx").load(pair, Path).depth_prior
     assert found.shape == (50, 60)
     # lower is nearer
     np.testing.assert_allclose(np.diff(found, axis=0), found[1, 0] - found[0, 0], rtol=1e-3)
     assert found[1, 0] > found[0, 0] > 0
-
-
-def test_a_solver_is_any_program_that_reads_nl(tmp_path, monkeypatch):
-    solver = tmp_path / "my-solver"
-    solver.write_text(
-        f"#!{sys.executable}\n"
-        "import sys\n"
-        "from pathlib import Path\n"
-        "import numpy as np\n"
-        "import casadi as ca\n"
-        "from soup_nlp.export.sol import write_sol\n"
-        "builder = ca.NlpBuilder()\n"
-        "builder.import_nl(sys.argv[1] + '.nl', {})\n"
-        "x = np.array(builder.x_init)\n"
-        "rows = np.arange(len(builder.g_lb))\n"
-        "write_sol(Path(sys.argv[1] + '.sol'), x, 0.0 * rows, np.arange(len(x)), rows, 'start')\n"
-    )
-    solver.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    tiny = Tiny(neighbours=2, samples=3, boundary_samples=1)
-    form = Formulation(hessian="exact", compiled=False)
-    nlp, layout = tiny.nlp(PAPER, form)
-    task = Task(nlp, layout, tiny.soup, tiny.data, PAPER, form, Limits(seconds=60))
-    monkeypatch.chdir(tmp_path)
-    answer = find_solver("my-solver")(task)
-    assert answer.x == pytest.approx(nlp.x0)
-    assert answer.status == "start"
-    assert answer.claimed
 
 
 # --- notebooks -----------------------------------------------------------------------------------

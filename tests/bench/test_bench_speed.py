@@ -1,18 +1,13 @@
 """bench speed: plan, costs and page on artificial rows; one tiny real run."""
 
-import os
-from functools import partial
-from pathlib import Path
-
 import pytest
 from helpers_files import sets
-from helpers_rows import square, threads
 
 from soup_nlp.bench.processes import machine
 from soup_nlp.bench.speed import speed_cells, speed_page, timed_pairs, with_costs
 from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
-from soup_nlp.storage.rows import ONE_THREAD, Job, attempt, measure_all, read_rows
+from soup_nlp.storage.rows import read_rows
 
 pytestmark = pytest.mark.slow
 
@@ -63,24 +58,6 @@ def test_the_plan_has_every_run_once_small_ones_first():
     assert not problems[0].refine.enabled
 
 
-def test_rows_of_new_processes(tmp_path, monkeypatch):
-    # the children must find the module of the function
-    monkeypatch.setenv("PYTHONPATH", str(Path(square.__code__.co_filename).parent), os.pathsep)
-    for name in ONE_THREAD:
-        monkeypatch.delenv(name, raising=False)
-    numbers = {2: False, 3: False, 4: True}
-    works = [partial(attempt, partial(square, n, breaks=b)) for n, b in numbers.items()]
-    jobs = [Job({"key": k}, work) for k, work in enumerate(works)]
-    *rows, failed_row = measure_all(jobs, tmp_path / "rows.jsonl", fresh=True)
-    assert [row["square"] for row in rows] == [4, 9]
-    assert len({os.getpid(), *(row["process"] for row in rows)}) == 3
-    assert [row["threads"] for row in rows] == [["1"] * 4] * 2
-    assert threads() == [None] * 4
-    assert all(row["peak_bytes"] > 1e6 for row in rows)
-    assert "out of numbers" in failed_row["error"]
-    assert {"processor", "cores", "memory", "code"} <= machine().keys()
-
-
 def test_costs_outside_the_nlp_and_of_the_whole_solve():
     frame = with_costs(frame_of([made("street", 250)]))
     # loading is not counted, and the NLP is not outside itself
@@ -93,6 +70,7 @@ def test_the_page_of_runs():
     rows = [made(scene, n) for scene in ("street", "room") for n in (250, 500)]
     rows += [made("room", 500, 20, metrics={}), failed("no answer")]
     text = speed_page(frame_of(rows))
+    assert {"processor", "cores", "memory", "code"} <= machine().keys()
     # E of start and answer, with no MRE where there is no metric
     assert text.count("| 90.00 | 51.000 | 0.2000 | 0.1000 |") == 4
     assert text.count("| 90.00 | 51.000 | - | - |") == 1

@@ -1,6 +1,5 @@
 """Flow sources: DIS with its confidence, files, truth, plug-ins."""
 
-from importlib.metadata import EntryPoint
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,12 +13,12 @@ from hypothesis import strategies as st
 
 from soup_nlp.data.datasets.benchmarks import KittiInput
 from soup_nlp.data.flow import dis
-from soup_nlp.data.flow import sources as flow_module
 from soup_nlp.data.flow.consistency import confidence_of, leaves, round_trip_error
 from soup_nlp.data.flow.dis import dominant_homographies, guided_flow
 from soup_nlp.data.flow.sources import (
     dis_flow,
     flow_from_truth,
+    flow_sources,
     load_flow,
     resolve_flow,
 )
@@ -128,6 +127,13 @@ def test_a_consistent_round_trip_gives_confidence() -> None:
     confidence = confidence_of(round_trip_error(forward, backward))
     assert confidence[10:30, 5:20].min() == pytest.approx(1.0)
     assert confidence[:, 40:].max() == confidence[0, 0] == 0.0
+    # a pixel without backward flow affects its neighbourhood alone
+    forward, backward = np.zeros((2, 40, 60, 2), np.float32)
+    backward[20, 30] = np.nan
+    gap = round_trip_error(forward, backward)
+    assert np.isinf(gap[20, 30])
+    assert not np.isnan(gap).any()
+    assert (confidence_of(gap, support=5) == 1).mean() > 0.98
 
 
 def test_load_flow(tmp_path: Path) -> None:
@@ -175,26 +181,33 @@ def test_resolve_flow(tmp_path: Path) -> None:
     assert pair.with_flow(flow).flow is flow
 
 
-PLUGINS = {
-    "zero": lambda first, _: Flow(np.zeros((*first.shape[:2], 2), np.float32), source="zero"),
-    "cropped": lambda first, _: Flow(np.zeros((*first[1:].shape[:2], 2), np.float32)),
-    "array_only": lambda first, _: np.zeros((*first.shape[:2], 2)),
-    "broken": lambda first, _: first.weights,
-}
+PLUGINS = SimpleNamespace(
+    mine=lambda first, _: Flow(np.full((*first.shape[:2], 2), 3.0, np.float32), source="mine"),
+    cropped=lambda first, _: Flow(np.zeros((*first[1:].shape[:2], 2), np.float32)),
+    array_only=lambda first, _: np.zeros((*first.shape[:2], 2)),
+    broken=lambda first, _: first.weights,
+)
 
 
-def test_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
-    points = [SimpleNamespace(name=n, value="a:b", load=lambda f=f: f) for n, f in PLUGINS.items()]
-    points.append(EntryPoint("absent", f"{__name__}:absent", flow_module.ENTRY_POINTS))
-    monkeypatch.setattr(flow_module, "entry_points", lambda group: points)
+def test_a_flow_source_is_an_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recipe of docs/adding.md: an installed package declares the functions above."""
+    info = tmp_path / "flows-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: flows\nVersion: 1.0\n")
+    points = [f"{name} = {__name__}:PLUGINS.{name}" for name in (*vars(PLUGINS), "absent")]
+    (info / "entry_points.txt").write_text("\n".join(["[soup_nlp.flow]", *points]))
+    monkeypatch.syspath_prepend(tmp_path)
+    assert flow_sources().keys() >= {*vars(PLUGINS), "absent"}
     pair = pair_of()
-    assert resolve_flow(pair, "zero").source == "zero"
+    flow = resolve_flow(pair, "mine")
+    assert flow.source == "mine"
+    assert (flow.uv == 3.0).all()
     for name, match in [
         ("cropped", "differ in size"),
         ("array_only", r"returned no Flow[\s\S]*ndarray"),
         ("broken", r"plug-in failed[\s\S]*AttributeError: .*weights"),
         ("absent", r"plug-in failed[\s\S]*AttributeError"),
-        ("unheard", r"SIGMA, absent, array_only, broken, cropped, zero, or the path"),
+        ("unheard", r"SIGMA, absent, array_only, broken, cropped, mine, or the path"),
     ]:
         with raises(match):
             resolve_flow(pair, name)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
@@ -34,21 +35,20 @@ def test_a_confidence_is_between_0_and_1(bad):
 
 
 def test_images_are_taken_as_arrays_files_and_pictures(tmp_path):
-    pil = pytest.importorskip("PIL.Image")
     rng = np.random.default_rng(0)
     rgb = rng.integers(0, 256, (40, 60, 3)).astype(np.uint8)
     grey = rgb[:, :, 0]
     path = tmp_path / "a.png"
-    pil.fromarray(rgb).save(path)
-    for source in (rgb, rgb.tolist(), path, str(path), pil.fromarray(rgb)):
+    Image.fromarray(rgb).save(path)
+    for source in (rgb, rgb.tolist(), path, str(path), Image.fromarray(rgb)):
         source = np.array(source, np.uint8) if isinstance(source, list) else source
         np.testing.assert_array_equal(Pair(source, source, K).image_next, rgb)
-    for source in (grey, grey[:, :, None], pil.fromarray(grey)):
+    for source in (grey, grey[:, :, None], Image.fromarray(grey)):
         image = Pair(source, rgb, K).image_ref
         np.testing.assert_array_equal(image, np.repeat(grey[:, :, None], 3, axis=2))
     with_alpha = np.dstack([rgb, grey])
     np.testing.assert_array_equal(Pair(with_alpha, rgb, K).image_ref, rgb)
-    np.testing.assert_array_equal(Pair(pil.fromarray(with_alpha), rgb, K).image_ref, rgb)
+    np.testing.assert_array_equal(Pair(Image.fromarray(with_alpha), rgb, K).image_ref, rgb)
 
 
 def test_cameras_are_taken_as_matrices_numbers_and_files(tmp_path):

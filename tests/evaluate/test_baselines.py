@@ -10,6 +10,8 @@ from soup_nlp.evaluate.metrics import depth_metrics
 from soup_nlp.evaluate.scoring import FAR, fill_nearest, rigid_depth
 from soup_nlp.geometry import rotation
 
+K = np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]])
+
 
 @pytest.fixture(scope="module")
 def orbit() -> Pair:
@@ -21,7 +23,6 @@ def made(
     K_next, height=60, width=80, turn=(0.01, -0.04, 0.02), shift=(0.3, 0.05, 0.1), dtype=np.float32
 ):
     """A wavy surface in front of two cameras, with its exact flow; (pair, depth, R, t)."""
-    K = np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]])
     v, u = np.mgrid[:height, :width].astype(float)
     z = 4 + np.sin(u / 9) + 0.5 * np.cos(v / 7)
     X = z[..., None] * (np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T)
@@ -51,7 +52,7 @@ def test_exact_flow_gives_exact_depth_whatever_the_second_camera(fx, fy, skew, c
 
 def test_depth_without_parallax_is_unknown():
     """Pixels with the flow of a point at infinity have no depth."""
-    pair, z, R, t = made(np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]]), dtype=np.float64)
+    pair, z, R, t = made(K, dtype=np.float64)
     v, u = np.mgrid[:60, :80]
     far = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(pair.K_ref).T * 10 * FAR * 4
     x = (far @ R.T + t) @ pair.K_next.T
@@ -93,7 +94,6 @@ def test_confidence_weighs_the_motion(orbit):
 
 
 def test_points_behind_a_camera_are_unknown():
-    K = np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]])
     pair, *_ = made(K, turn=(0.0, 0.0, 0.0), shift=(0.3, 0.0, 0.0))
     uv = pair.flow.uv.copy()
     uv[20:40, 20:40] *= -1

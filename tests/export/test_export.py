@@ -170,6 +170,8 @@ def test_a_point_with_nan_is_not_verified(exported, optimum):
     _, nlp, _, _, _ = problem_of(exported)
     x, lam = optimum
     assert examine(nlp, x, lam).within(Limits())
+    # multipliers that are not numbers are not used
+    assert examine(nlp, x, np.nan * lam).multipliers == "least squares"
     bad = x.copy()
     bad[3] = np.nan
     assert violations(nlp, bad)["bounds"].max() == np.inf

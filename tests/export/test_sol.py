@@ -148,22 +148,24 @@ def program(gradient, jacobian, g, **bounds):
     )
 
 
-def test_only_signs_that_a_bound_can_have_are_multipliers():
-    rows = {"jacobian": np.eye(4), "g": [1.0, 2.0, 1.0, 2.0]}
-    bounds = {"lbg": [1, -np.inf, 1, -np.inf], "ubg": [np.inf, 2, np.inf, 2]}
-    # grad f + lam = 0: a lower bound pushes with lam < 0, an upper one with lam > 0
-    nlp = program([3.0, -4.0, -5.0, 6.0], **rows, **bounds)
-    lam = verify.least_squares_multipliers(nlp, np.zeros(4))
-    np.testing.assert_allclose(lam, [-3, 4, 0, 0], atol=1e-9)
+NEAR, BEYOND = 0.5 * verify.ACTIVE, 2 * verify.ACTIVE
 
 
-def test_rows_near_a_bound_of_zero_are_active():
-    near, far = 0.5 * verify.ACTIVE, 2 * verify.ACTIVE
-    rows = {"jacobian": np.eye(4), "g": [-near, -far, near, far]}
-    bounds = {"lbg": [-np.inf, -np.inf, 0, 0], "ubg": [0, 0, np.inf, np.inf]}
-    nlp = program([-1.0, -1.0, 1.0, 1.0], **rows, **bounds)
+@pytest.mark.parametrize(
+    ("gradient", "g", "lower", "upper", "expected"),
+    [
+        # grad f + lam = 0: a lower bound pushes with lam < 0, an upper one with lam > 0
+        ([3, -4, -5, 6], [1, 2, 1, 2], 1, 2, [-3, 4, 0, 0]),
+        # rows near a bound of 0 are active
+        ([1, -1, 1, -1], [NEAR, -NEAR, BEYOND, -BEYOND], 0, 0, [-1, 1, 0, 0]),
+    ],
+)
+def test_only_active_bounds_give_multipliers_of_their_sign(gradient, g, lower, upper, expected):
+    """Rows have a lower and an upper bound in turn."""
+    sides = {"lbg": [lower, -np.inf] * 2, "ubg": [np.inf, upper] * 2}
+    nlp = program(np.array(gradient, float), np.eye(4), g, **sides)
     lam = verify.least_squares_multipliers(nlp, np.zeros(4))
-    np.testing.assert_allclose(lam, [1, 0, -1, 0], atol=1e-9)
+    np.testing.assert_allclose(lam, expected, atol=1e-9)
 
 
 def test_a_variable_at_its_bound_takes_the_whole_gradient():

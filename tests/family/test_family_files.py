@@ -1,16 +1,15 @@
 """Files beside the instances: what solvers reached; a solver of one's own."""
 
 import json
+import os
 import sys
 
 import pytest
-from freeze_family import record_of
 
 from soup_nlp.bench.solvers import runner
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import make_problem
 from soup_nlp.family.write import _reached
-from soup_nlp.pipeline.case import prepare
+from soup_nlp.storage.rows import read_rows
 
 pytestmark = pytest.mark.slow
 
@@ -49,24 +48,18 @@ open(stub + ".sol", "w").write("\\n".join(map(str, [*head, *values, "objno 0 0"]
 """
 
 
-def test_a_solver_of_ones_own_is_a_command_line(tmp_path, monkeypatch, capsys):
+def test_a_solver_of_ones_own_is_a_command_line(record, tmp_path, monkeypatch, capsys):
+    """The recipe of docs/adding.md: a program that reads .nl, found by its name on the PATH."""
     program = tmp_path / "mine"
     program.write_text(PROGRAM.format(python=sys.executable))
     program.chmod(0o755)
-    scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 128, "height": 64}
-    own = {
-        "input": scene,
-        "segmentation": {"superpixels": 20, "neighbours": 4},
-        "energy": {"pixel_samples": 4},
-        "flow": {"source": "truth"},
-    }
-    record = record_of(prepare(make_problem(own)))
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setattr(runner, "load_frozen", lambda scene, size: record)
     entry = {"name": f"{STUB}-hard", "best_known": {"objective": 1.0}}
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "index.json").write_text(json.dumps({"instances": [entry]}))
     out = tmp_path / "out"
-    words = ["compare", str(tmp_path / "set"), "-o", str(out), "--solvers", f"{program} fast=1"]
+    words = ["compare", str(tmp_path / "set"), "-o", str(out), "--solvers", "mine fast=1"]
     # a false claim is no verified run
     assert main(words) == 1
     assert "-" in capsys.readouterr().out
@@ -75,5 +68,8 @@ def test_a_solver_of_ones_own_is_a_command_line(tmp_path, monkeypatch, capsys):
     assert result["claimed"]
     assert not result["verified"]
     assert result["dual"] > 1e-2
+    (row,) = read_rows(out / "runs.jsonl")
+    # its point is the start, as read from its file
+    assert row["energy"] == pytest.approx(row["energy_start"], rel=1e-12)
     for name in ("README.md", "profiles.png", "reached.json", "runs.jsonl"):
         assert (out / name).stat().st_size > 0

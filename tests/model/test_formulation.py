@@ -1,4 +1,4 @@
-"""One problem in every gauge: packing, names, sizes."""
+"""One problem in every gauge: packing, names, sizes, patterns."""
 
 import re
 from dataclasses import replace
@@ -26,6 +26,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.pattern import Entries, Pattern
 from soup_nlp.model.symbolic import Graph
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 
@@ -171,6 +172,22 @@ def test_a_table_must_fit_its_kernel_and_be_finite():
     data[1, 2] = np.nan
     with pytest.raises(ModelError, match="NaN"):
         Group(arap.kernel, Table(arap.table.index, data, arap.table.rows))
+
+
+@pytest.mark.parametrize("size", [40, 100_000])
+def test_a_pattern_is_the_union_of_its_sets(size):
+    """Also where keys need more than four bytes, and elements stand where another does."""
+    rng = np.random.default_rng(2)
+    whole = rng.integers(0, size, (2, 7, 5))[:, [0, 0, 1, 2, 2, 2, 3, 4, 5, 6]]
+    other = rng.integers(0, size, (2, 4, 3))
+    other[:, 1] = whole[:, 6, :3]
+    pattern = Pattern((size, size), lambda: [Entries(*whole), Entries(*other)])
+    keys = pattern.columns * size + pattern.rows
+    assert (np.diff(keys) > 0).all()
+    for (rows, columns), place in zip((whole, other), pattern.places):
+        np.testing.assert_array_equal(pattern.rows[place], rows)
+        np.testing.assert_array_equal(pattern.columns[place], columns)
+    assert len(keys) == len(set(np.concatenate([p.ravel() for p in pattern.places]).tolist()))
 
 
 # --- one problem in every gauge ------------------------------------------------------------------

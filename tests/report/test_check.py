@@ -30,16 +30,14 @@ def pair() -> Pair:
     return render_scene("street", 0, 128, 96)
 
 
+SMALL = {"segmentation": {"superpixels": 25, "neighbours": 4}, "flow": {"source": "truth"}}
+
+
 @pytest.fixture(scope="module")
 def solved(pair, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("solved") / "out"
-    run = solve_pair(
-        pair,
-        segmentation={"superpixels": 25, "neighbours": 4},
-        flow={"source": "truth"},
-        solver={"presolve_eps": [0.3, 0.03]},
-        refine={"rounds": 1, "particles": 8},
-    )
+    options = {"solver": {"presolve_eps": [0.3, 0.03]}, "refine": {"rounds": 1, "particles": 8}}
+    run = solve_pair(pair, **SMALL, **options)
     write_folder(prepare_folder(out), run, "a log\n", formats=["npy"])
     return out
 
@@ -156,13 +154,7 @@ def test_entries_are_as_written(how, place, folder):
 
 def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
     # without the presolve there is no other answer, whatever the rounding
-    run = solve_pair(
-        pair,
-        segmentation={"superpixels": 25, "neighbours": 4},
-        flow={"source": "truth"},
-        solver={"presolve": False},
-        refine={"enabled": False},
-    )
+    run = solve_pair(pair, **SMALL, solver={"presolve": False}, refine={"enabled": False})
     folder = tmp_path / "out"
     write_folder(prepare_folder(folder), run, "a log\n")
     assert "nlp is Ipopt's answer" not in bad(check_folder(folder))

@@ -6,8 +6,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from helpers_files import read_ply
 from helpers_result import BOARD, BOARD_Z, CAMERA, WALL_Z, K, board, small_result
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from soup_nlp.data.formats.map_files import read_pfm
@@ -48,7 +50,6 @@ def test_clouds_leave_out_jumps_and_what_is_hidden(result):
 
 @pytest.mark.parametrize("frame", [0, 1])
 def test_ply_is_read_by_trimesh(tmp_path, result, frame):
-    trimesh = pytest.importorskip("trimesh")
     assert write_formats(tmp_path, result, ["ply"]) == ["points_ref.ply", "points_next.ply"]
     path = tmp_path / ("points_ref.ply", "points_next.ply")[frame]
     cloud = trimesh.load(path)
@@ -72,7 +73,6 @@ def test_ply_is_read_by_trimesh(tmp_path, result, frame):
 
 @pytest.mark.parametrize("frame", [0, 1])
 def test_glb_is_read_by_trimesh(tmp_path, result, frame):
-    trimesh = pytest.importorskip("trimesh")
     write_formats(tmp_path, result, ["glb"])
     scene = trimesh.load(tmp_path / ("mesh_ref.glb", "mesh_next.glb")[frame])
     assert scene.metadata["unit"] == result.unit
@@ -152,7 +152,6 @@ def test_cameras_with_skew_have_no_colmap_model(tmp_path, result):
 
 
 def test_depth_is_read_by_numpy_opencv_and_pillow(tmp_path, result):
-    pil = pytest.importorskip("PIL.Image")
     write_formats(tmp_path, result, ["npy", "pfm", "png"])
     scale = json.loads((tmp_path / "depth_png.json").read_text())["values_per_unit"]
     for name, depth in zip(("ref", "next"), result.depths):
@@ -162,7 +161,7 @@ def test_depth_is_read_by_numpy_opencv_and_pillow(tmp_path, result):
         found = cv2.imread(str(tmp_path / f"depth_{name}.pfm"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(found, np.where(known, depth, np.inf).astype(np.float32))
         np.testing.assert_array_equal(read_pfm(tmp_path / f"depth_{name}.pfm")[known], found[known])
-        found = np.asarray(pil.open(tmp_path / f"depth_{name}.png"), float) / scale[name]
+        found = np.asarray(Image.open(tmp_path / f"depth_{name}.png"), float) / scale[name]
         np.testing.assert_allclose(found[known], depth[known], atol=0.5 / scale[name])
         assert not found[~known].any()
 

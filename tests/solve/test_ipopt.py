@@ -99,12 +99,18 @@ def test_kkt_residuals_are_small_at_the_optimum_only():
     assert residual(lam_x=stage.lam_x - [0, 0.5, 0, 0]) > 0.1
 
 
+def of_one_variable(f, g=None, x0: float = 1.0, **bounds: float) -> NLP:
+    """min f(x), subject to bounds of x and of g(x)."""
+    x, row, one = symbols(1)
+    kernel = Kernel("one", x, row, one, objective=f(x), constraints=None if g is None else g(x))
+    rows = np.zeros((1, 0 if g is None else 1), int)
+    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), rows)
+    return textbook([Group(kernel, table)], [x0], **bounds)
+
+
 def test_a_multiplier_of_the_wrong_sign_is_no_optimum():
     """max x, x >= 0: at 0 the gradient is balanced only by a force from an upper bound."""
-    x, row, one = symbols(1)
-    kernel = Kernel("line", x, row, one, objective=-x)
-    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 0), int))
-    nlp = textbook([Group(kernel, table)], [0.0], lbx=0)
+    nlp = of_one_variable(lambda x: -x, lbx=0)
     residual = optimality(nlp, np.zeros(1), np.array([1.0]), np.zeros(0))
     assert max(residual.values()) >= 1
 
@@ -131,16 +137,8 @@ def test_a_bound_beyond_the_optimum_is_active():
     assert (stage.x <= 0.5 + 1e-8).all()
 
 
-def infeasible() -> NLP:
-    """x^2 <= -1."""
-    x, row, one = symbols(1)
-    kernel = Kernel("square", x, row, one, objective=x, constraints=x**2)
-    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 1), int))
-    return textbook([Group(kernel, table)], [1.0], ubg=-1.0)
-
-
 def test_an_infeasible_problem_is_a_result_with_its_status():
-    stage = solve(infeasible(), max_iter=200)
+    stage = solve(of_one_variable(lambda x: x, lambda x: x**2, ubg=-1.0), max_iter=200)
     assert not stage.converged
     assert stage.status in ("Infeasible_Problem_Detected", "Restoration_Failed")
     assert np.isfinite(stage.x).all()
@@ -262,10 +260,6 @@ def test_control_c_ends_a_solve_at_the_next_iteration(number):
 
 
 def test_a_nan_in_the_objective_is_a_result_too():
-    x, row, one = symbols(1)
-    kernel = Kernel("root", x, row, one, objective=ca.sqrt(x - 2))
-    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), np.zeros((1, 0), int))
-    nlp = textbook([Group(kernel, table)], [1.0])
-    stage = solve(nlp)
+    stage = solve(of_one_variable(lambda x: ca.sqrt(x - 2)))
     assert not stage.converged
     assert np.isfinite(stage.x).all()

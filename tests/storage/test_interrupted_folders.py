@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from helpers_folders import content, write
 from kill_table import full_disks, table
+from test_output_folders import content, write
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.folders import MARK, claim, digest_of, mark_of, recover, staged

@@ -3,11 +3,11 @@
 import json
 import os
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from helpers_folders import content, put, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,6 +23,33 @@ from soup_nlp.storage.folders import (
     mark_of,
     staged,
 )
+
+
+def put(folder: Path, files: Mapping[str, str]) -> None:
+    """Write files by name, with their folders."""
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def write(
+    folder: Path,
+    whole: bool = True,
+    overwrite: bool = False,
+    end: type[BaseException] | None = None,
+    **files: str,
+) -> None:
+    """Write a result, or end with an exception after its files are written."""
+    with staged(folder, whole, overwrite) as new:
+        put(new, files)
+        if end:
+            raise end("ended")
+
+
+def content(folder: Path) -> dict[str, str]:
+    """Texts by name of a folder's files, without the mark."""
+    return {p.name: p.read_text() for p in folder.iterdir() if p.name != MARK}
+
 
 NAMES = st.sets(st.sampled_from(["a", "b", "c/x", "c/d/y"]), min_size=1)
 ENDS = st.sampled_from([None, None, None, RuntimeError, KeyboardInterrupt, OSError, DataError])

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_rows import fake_row
+from helpers_rows import fake_row, square, threads
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.rows import Job, append_row, attempt, measure_all, read_rows
+from soup_nlp.storage.rows import ONE_THREAD, Job, append_row, attempt, measure_all, read_rows
 from soup_nlp.storage.versions import code_version
 
 pytestmark = pytest.mark.slow
@@ -76,11 +76,30 @@ def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
         append_row(tmp_path / "rows.jsonl" / "x.jsonl", {})
 
 
+@pytest.fixture
+def found_by_children(monkeypatch):
+    """The functions of rows, in the processes that measure them."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(square.__code__.co_filename).parent), os.pathsep)
+
+
+@pytest.mark.usefixtures("found_by_children")
+def test_rows_of_new_processes(tmp_path, monkeypatch):
+    for name in ONE_THREAD:
+        monkeypatch.delenv(name, raising=False)
+    numbers = {2: False, 3: False, 4: True}
+    works = [partial(attempt, partial(square, n, breaks=b)) for n, b in numbers.items()]
+    jobs = [Job({"key": k}, work) for k, work in enumerate(works)]
+    *rows, failed = measure_all(jobs, tmp_path / "rows.jsonl", fresh=True)
+    assert [row["square"] for row in rows] == [4, 9]
+    assert len({os.getpid(), *(row["process"] for row in rows)}) == 3
+    assert [row["threads"] for row in rows] == [["1"] * 4] * 2
+    assert threads() == [None] * 4
+    assert all(row["peak_bytes"] > 1e6 for row in rows)
+    assert "out of numbers" in failed["error"]
+
+
+@pytest.mark.usefixtures("found_by_children")
 def test_parallel_processes_and_a_process_that_dies(tmp_path):
-    # the children must find this module's function
-    os.environ["PYTHONPATH"] = os.pathsep.join(
-        [str(Path(__file__).parents[1] / "helpers"), os.environ.get("PYTHONPATH", "")]
-    )
     path = tmp_path / "rows.jsonl"
     rows = measure_all(fake_jobs(dies=True), path, workers=2)
     assert [r["key"] for r in rows] == ["orbit", "street", "sheet", "room"]
