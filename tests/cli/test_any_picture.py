@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 from helpers_files import sets, write_flo, write_pair
-from PIL import ExifTags, Image
+from helpers_photos import photo
+from PIL import Image
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
@@ -23,10 +24,7 @@ def stored_turned(path, image, orientation):
     back = {1: None, 2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}[orientation]
     stored = Image.fromarray(image)
     stored = stored if back is None else stored.transpose(Image.Transpose(back))
-    exif = stored.getexif()
-    exif[ExifTags.Base.Orientation] = orientation
-    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 43
-    stored.save(path, exif=exif)
+    photo(path, np.asarray(stored), orientation, FocalLengthIn35mmFilm=43)
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])

@@ -254,6 +254,13 @@ def images(H: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, cv2.warpPerspective(first, H, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
 
 
+def match(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Flow of two grey images in both directions."""
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    method.setFinestScale(0)
+    return method.calc(first, second, None), method.calc(second, first, None)
+
+
 def test_homographies_are_recovered_one_after_the_other():
     left = np.arange(WIDTH) < WIDTH // 3
     shift = np.array([[1.0, 0, 3], [0, 1, -2], [0, 0, 1]])
@@ -276,11 +283,6 @@ def test_a_first_flow_that_is_half_wrong_is_completed(monkeypatch):
     backward = np.full((HEIGHT, WIDTH, 2), 50.0, np.float32)
     back = truth(np.linalg.inv(ROAD))
     backward[:, : WIDTH // 2] = back[:, : WIDTH // 2]
-
-    def match(a, b):
-        dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        dis.setFinestScale(0)
-        return dis.calc(a, b, None), dis.calc(b, a, None)
 
     flow, gap = guided_flow(ref, nxt, match, forward, backward)
     at = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1) + true

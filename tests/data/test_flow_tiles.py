@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from test_flow import texture
+from test_flow import match, texture
 
 from soup_nlp.data.flow import dis, tiles
 from soup_nlp.data.flow.tiles import with_tiles
@@ -23,12 +23,6 @@ def frames(surface: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     moved = np.roll(surface, tuple((END - START)[::-1]), axis=(0, 1))
     first = np.where(disk(START), surface, back[1:, 2:])
     return first, np.where(disk(END), moved, back[:-1, :-2])
-
-
-def match(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    method.setFinestScale(0)
-    return method.calc(first, second, None), method.calc(second, first, None)
 
 
 def completed(

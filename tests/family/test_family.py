@@ -248,10 +248,22 @@ def test_an_answer_off_the_constraints_is_told(folder, tmp_path, capsys):
     assert "FAIL rows" in capsys.readouterr().out
 
 
-def test_other_files_are_not_overwritten(tmp_path, capsys):
-    (tmp_path / "mine.txt").write_text("mine")
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("mine.txt", "holds other files"),
+        (".hidden", "holds other files"),
+        ("index.json", "would be overwritten"),
+    ],
+)
+def test_other_files_are_not_overwritten(name, said, tmp_path, capsys):
+    (tmp_path / name).write_text("mine")
     assert main(["family", str(tmp_path), "--sizes", "100"]) == 2
-    assert "holds other files" in capsys.readouterr().err
+    assert said in capsys.readouterr().err
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_a_size_that_is_not_of_the_family_makes_no_folder(tmp_path):
     assert main(["family", str(tmp_path / "new"), "--sizes", "99"]) == 2
     assert not (tmp_path / "new").exists()
 

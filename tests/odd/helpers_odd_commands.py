@@ -190,16 +190,13 @@ USES: dict[str, tuple[str, Any, tuple[int, ...]]] = {
 }
 """Commands that read a text, by the file or argument that has it."""
 
-ROWS: dict[str, bytes] = {
-    "binary": bytes(range(256)) * 8,
-    "one line": b"a" * 2_000_000,
-    "deep": b"[" * 100_000 + b"\n",
+ROWS: dict[str, str | bytes] = {
+    **{name: TEXTS[name] for name in ("binary", "one line", "deep JSON", "nul bytes")},
     "latin": b'{"key": "caf\xe9"}\n',
     "huge integer": b'{"seconds": 1' + b"0" * 400 + b"}\n",
     "very huge integer": b'{"seconds": 1' + b"0" * 10_000 + b"}\n",
     "other keys": b'{"a": 1}\n{"b": [1]}\n',
     "no mapping": b'3\n"x"\n[1]\nnull\n',
-    "nul bytes": b"\0" * 4096,
     "NaN": b'{"key": NaN, "ok": NaN}\n',
     "control": b'{"key": "\\u001b[31m", "error": "\\u001b]0;t\\u0007"}\n',
     "cut": b'{"key": "a", "val',

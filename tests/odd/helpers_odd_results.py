@@ -1,4 +1,4 @@
-"""Results whose parts do not belong together, files of the user, sequences without an answer."""
+"""Results whose parts do not belong together, sequences without an answer."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import h5py
 import numpy as np
-from helpers_odd_run import ANY, DOORS, Case, cases, changed, h5_damage, words, write
+from helpers_odd_run import ANY, DOORS, Case, cases, changed, h5_damage, words
 from helpers_odd_world import SIZE, World, encoded_noise
 
 
@@ -164,31 +164,6 @@ def result_cases() -> Iterator[Case]:
     yield from cases(DOORS, "view {}", "view {exported} --no-open", ["an export"])
 
 
-def mine(*names: str) -> Any:
-    """Writes files of the user into the folder of the case."""
-
-    def make(w: World, o: Path, value: Any) -> None:
-        for name in names or (value,):
-            (o / name).parent.mkdir(parents=True, exist_ok=True)
-            (o / name).write_text("mine")
-
-    return make
-
-
-def lost_cases() -> Iterator[Case]:
-    """Files of the user that a command would replace."""
-    line = "family {o} --sizes=100 --scenes=orbit --starts=hard"
-    names = ("notes.txt", "index.json", ".hidden")
-    yield from cases(DOORS, "family over {}", line, names, make=mine())
-    over = {"mesh_ref.glb": "glb", "colmap/notes.txt": "colmap"}
-    for name, to in over.items():
-        line, codes = f"convert {{result}} --to {to} -o {{o}}", (0, 2) if to == "colmap" else (2,)
-        yield from cases("1 lost", "convert over {}", line, [name], codes, make=mine(name))
-    for name, to in {"depth_ref.npy": "npy", "points_ref.ply": "ply"}.items():
-        copy = changed("result", name, lambda path, value: write(path, "mine"))
-        yield from cases("1 lost", "convert over {}", f"convert {{x}} --to {to}", [name], make=copy)
-
-
 # --- sequences -----------------------------------------------------------------------------------
 
 
@@ -224,7 +199,8 @@ def video(frames: int, size: tuple[int, int] = SIZE, options: str = "", user_fil
             coder.write(cv2.imdecode(np.frombuffer(encoded_noise(size), np.uint8), 1))
         coder.release()
         if user_file:
-            mine(user_file)(w, o, None)
+            (o / user_file).parent.mkdir(parents=True)
+            (o / user_file).write_text("mine")
         return words(f"chain {{o}}/c.avi {options} -q -o {{out}}", w, o)
 
     return do

@@ -11,7 +11,7 @@ from helpers_odd_api import api_cases
 from helpers_odd_commands import path_cases, text_cases, untrusted_cases
 from helpers_odd_files import array_cases, image_cases, network_cases
 from helpers_odd_options import number_cases, option_cases, preset_cases, solve_cases
-from helpers_odd_results import chain_cases, lost_cases, result_cases
+from helpers_odd_results import chain_cases, result_cases
 from helpers_odd_run import Case, fault
 from helpers_odd_world import World
 
@@ -22,7 +22,7 @@ CASES: list[Case] = list(
         *(path_cases(), text_cases(), untrusted_cases()),
         *(number_cases(), solve_cases(), preset_cases(), option_cases()),
         *(array_cases(), image_cases(), network_cases()),
-        *(result_cases(), lost_cases(), chain_cases(), api_cases()),
+        *(result_cases(), chain_cases(), api_cases()),
     )
 )
 

@@ -109,6 +109,7 @@ def test_forged_arrays_are_recomputed(place, folder):
         file.attrs[DIGEST] = read_digest(folder / "result.h5")
     report = check_folder(folder)
     assert FORGED[place] in bad(report)
+    assert f"FAIL {FORGED[place]}" in str(report)
     if place == "answer/R":
         (so3,) = (row for row in report.rows if row.name == "answer so3")
         # R'R = 1.02 I
