@@ -20,8 +20,11 @@ VIVID = (
 )
 """Colours of tab10 without its grey, which means unknown."""
 
-LEAST_RANGE = 1.02
-"""Least ratio of the two ends of a colour scale of depth."""
+LEAST_RANGE = 1.1
+"""Least ratio of the two ends of a colour scale of depth.
+
+Bending papers have a relief of 7 to 27 %, guesses without parallax mostly one of 0 to 5 %.
+"""
 
 _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 
@@ -29,7 +32,7 @@ _WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 def depth_range(depth: AnyFloat) -> tuple[float, float]:
     """(near, far) of the colour scale of a depth map: its 2nd and 98th percentile.
 
-    They are at least 2 % apart, so that a constant depth has one colour in spite of its rounding.
+    They are at least a tenth apart, so that a nearly constant depth has nearly one colour.
 
     Args:
         depth: (H, W) z; values that are not finite or not positive are left out.

@@ -57,7 +57,7 @@ UNSURE_FOCAL = 0.2
 SAME_PX = 0.1
 """Median length of the flow, pixels, below which the frames count as the same."""
 MATCHED = 0.2
-"""Share of usable flow below which the frames may show two scenes."""
+"""Share of usable flow below which the frames may show two scenes, if most of it is a guess."""
 LISTED = 5
 """Number of moving components that are listed."""
 WAYS = (("to the right", "to the left"), ("down", "up"), ("ahead", "back"))
@@ -94,7 +94,10 @@ def _parts(shares: Mapping[str, float], names: tuple[str, ...]) -> str:
 def found_words(run: Run) -> list[str]:
     """Motion of the camera and of the large components, bending, size, depth prior."""
     start, parts, labels = run.start, run.components, run.segmentation.labels
+    assert run.pair.flow is not None
     turn = f"by {parts.camera.angle:.2f} degrees"
+    if _unmatched(run.pair.flow.usable, run.confidence.guessed):
+        turn += " (a guess: hardly any flow is usable)"
 
     def shift(label: int, vector: Float) -> str:
         unsure = run.confidence.sigma[parts.of_pixel == label] > MOST_SIGMA
@@ -133,6 +136,16 @@ def found_words(run: Run) -> list[str]:
         scored = "" if run.full.metrics is None else f": MRE {run.full.metrics.mre:.4f}"
         lines.append(f"solved at {w}x{h}, brought to {width}x{height}{scored}")
     return lines
+
+
+def _unmatched(usable: float, guess: float) -> bool:
+    """True if hardly any flow is usable, so that neither motion nor its causes can be told.
+
+    Args:
+        usable: Share of the pixels with a usable flow.
+        guess: Share of the pixels whose depth is a guess.
+    """
+    return usable < MATCHED and guess > 0.5
 
 
 def _shift(run: Run, shift: Float) -> str:
@@ -182,9 +195,10 @@ def hints(
     """
     usable, out = confidence > 0, []
     length = float(np.median(np.linalg.norm(uv, axis=-1)[usable])) if usable.any() else 0.0
-    if usable.mean() < MATCHED and shares["guess"] > 0.5:
-        out.append("two frames of the same scene, closer in time: hardly anything is in both")
-    elif usable.mean() < USABLE:
+    if _unmatched(float(usable.mean()), shares["guess"]):
+        # what the little flow suggests (no parallax, a wrong camera) is no cause
+        return ["two frames of the same scene, closer in time: hardly anything is in both"]
+    if usable.mean() < USABLE:
         fast = length > FAST * uv.shape[1]
         out.append("frames closer in time" if fast else "a better flow (--flow)")
     elif length < SAME_PX and shares["guess"] > 0.5:

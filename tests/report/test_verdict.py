@@ -66,6 +66,27 @@ def test_hints_name_what_would_help(small_run):
     assert "--fov" in told
 
 
+def test_frames_without_a_common_scene_are_told_nothing_else(small_run):
+    """Where hardly any flow is usable, its parallax, camera and motion are no evidence."""
+    guess = {**certainty(small_run), "guess": 1.0, "flat": 0.1, "scale": 0.1}
+    flow = small_run.pair.flow
+    few = np.zeros_like(flow.confidence)
+    few[:5] = 1.0
+    for camera in (None, "zoom between the frames"):
+        (told,) = findings.hints(flow.uv, few, guess, 0.4, camera)
+        assert told.endswith("closer in time: hardly anything is in both")
+    assert "farther apart" in findings.hints(flow.uv, np.ones_like(few), guess)[0]
+    unsure = np.full_like(small_run.confidence.sigma, 1.2)
+    for confidence, expected in ((few, True), (np.ones_like(few), False)):
+        run = replace(
+            small_run,
+            pair=replace(small_run.pair, flow=replace(flow, confidence=confidence)),
+            confidence=replace(small_run.confidence, sigma=unsure),
+        )
+        camera = findings.found_words(run)[0]
+        assert camera.endswith("(a guess: hardly any flow is usable)") == expected
+
+
 def test_the_table_of_energies_ends_with_what_the_refinement_lowers():
     start, nlp, end = ({"total": v, "arap": 1.0} for v in (9.0, 5.0, 6.0))
     solution = SimpleNamespace(energy_start=start, energy=nlp, stages=("one",))
