@@ -1,7 +1,5 @@
 """Large images: a resized pair shows the same scene; depth at full size follows image edges."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

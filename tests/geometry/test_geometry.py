@@ -1,7 +1,5 @@
 """Cameras, rotations, homographies, soups and reconstructions against hand answers and truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_model import K_NEXT, K_REF, motion, plane_pose, plane_soup, plane_world, random_soup

@@ -1,7 +1,5 @@
 """Superpixels and graphs: connected, complete, and equal to brute force on small images."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

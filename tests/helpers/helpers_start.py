@@ -1,7 +1,5 @@
 """Flows, superpixels and planes for tests of the initialisation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

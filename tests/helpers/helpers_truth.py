@@ -1,7 +1,5 @@
 """Superpixels and truth of test pairs: partitions, components."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

@@ -1,7 +1,5 @@
 """The original TRW-S node by node, brute force and random problems."""
 
-from __future__ import annotations
-
 import itertools
 from types import SimpleNamespace
 

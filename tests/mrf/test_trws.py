@@ -1,7 +1,5 @@
 """TRW-S against plain loops of the original and brute force; its inputs, options and ends."""
 
-from __future__ import annotations
-
 import itertools
 import tracemalloc
 

@@ -1,7 +1,5 @@
 """Surfaces that bend are told from components that move apart, and solved without rigid pieces."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scales of components by contact; weights of the energy across components and occlusions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A guessed focal length is corrected by the flow where the flow determines it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Components get one motion each: pieces are gathered, lost halves return, others do not change."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_start import WEDGE, corner, fitted

@@ -1,7 +1,5 @@
 """A depth prior counts where the flow confirms it, and decides what the flow leaves open."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

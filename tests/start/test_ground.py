@@ -1,7 +1,5 @@
 """Nothing lies below the ground, and nothing floats above it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rigid motions and rigid components of a solved soup."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

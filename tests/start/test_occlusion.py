@@ -1,7 +1,5 @@
 """Which side of an outline covers the other, and what is placed in that order."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_start import fitted, rendered, squares

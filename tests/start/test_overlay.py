@@ -1,7 +1,5 @@
 """What stands still in the image while the camera moves: found, apart from the scene, a guess."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers_start import squares

@@ -1,7 +1,5 @@
 """Motions that the flow leaves open are settled by the least relief; the others are not moved."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The start: exact on noise-free planes, finite and flagged on everything degenerate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np

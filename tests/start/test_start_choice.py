@@ -1,8 +1,6 @@
 """Who takes which motion, by made-up errors: what is asked of a motion, a component, a
 neighbour."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +63,7 @@ class Turns:
         whole = np.broadcast_to(R, (len(self.true), *R.shape))
         return self.planes(whole if label is None else R[label][:, None])
 
-    def subset(self, at: np.ndarray) -> Turns:
+    def subset(self, at: np.ndarray) -> "Turns":
         return Turns(self.true[at])
 
     matches = Views.matches

@@ -1,7 +1,5 @@
 """Formulas of the start on exact rays: motions, planes, borrowed depths and affine flows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import OptimizeResult
