@@ -125,6 +125,9 @@ def found_words(run: Run) -> list[str]:
         size = "below 1%" if most < SHARE / 5 else f"at most {most:.0%}"
         kind = "more components" if large else "components that move by themselves"
         lines.append(f"{kind}: {rest} ({size} of the image{' each' * (rest > 1)})")
+    camera = run.confidence.evidence.camera
+    if camera is not None and shares:
+        lines.append(f"the flow suggests an error of {camera}, which may look like such motion")
     if run.pair.focal_sigma > 0:
         focal, error = run.pair.K_ref[0, 0], run.pair.focal_sigma
         by = "by the flow" if error <= UNSURE_FOCAL else "a guess"

@@ -152,7 +152,8 @@ class FlowFit(NamedTuple):
                 where=f"flow {flow.source}",
                 found=int(filled.sum()),
                 expected=f"at least {LEAST_PIXELS}",
-                hint="check the flow file, or lower the confidence threshold",
+                hint="two frames of one scene, with texture and closer in time; "
+                "of a flow from a file, look at its values and confidence",
             )
         poor = filled.sum(axis=1) < LEAST_PIXELS
         if not poor.all():

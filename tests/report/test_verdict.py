@@ -37,6 +37,16 @@ def test_what_moves_is_told_with_its_size_length_and_direction(small_run):
     ]
 
 
+def test_a_wrong_camera_may_look_like_motion(small_run):
+    sure = small_run.confidence
+    wrong = replace(sure, evidence=replace(sure.evidence, camera="lens distortion"))
+    told = findings.found_words(replace(small_run, confidence=wrong))
+    words = "the flow suggests an error of lens distortion, which may look like such motion"
+    assert [line for line in told if line not in findings.found_words(small_run)] == [words]
+    moving = [k for k, line in enumerate(told) if "moves by itself" in line]
+    assert told.index(words) > moving[-1]
+
+
 @pytest.mark.parametrize(
     ("vector", "way"),
     [([0, -2, 1], "up"), ([0, 2, 1], "down"), ([0, 0, 3], "ahead"), ([-3, 0, 1], "to the left")],

@@ -296,3 +296,5 @@ def test_too_few_usable_pixels_are_an_error(room, usable):
         FlowFit.of(seg, Flow(pair.flow.uv, confidence, "thin"), CORNER_K, CORNER_K)
     assert "thin" in str(caught.value)
     assert str(usable) in str(caught.value)
+    # what a user of two frames can do: with the default flow there is no file to look at
+    assert "try: two frames of one scene" in str(caught.value)
