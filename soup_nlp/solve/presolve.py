@@ -63,6 +63,8 @@ UNTRUNCATED: Mapping[float, float] = {1.0: 0.3, 0.3: 1.0, 0.1: 1.0}
 reweighted step brings a little, follows the curvature of the residuals at once."""
 EXACT = "exact"
 """Name of the last stage."""
+LEAST_SECONDS = 1.0
+"""Time that every stage has at least, whatever the limit of all stages."""
 STOPPED = ("Interrupted", "Time_Limit")
 """Statuses of a stage after which no further stage begins."""
 
@@ -199,7 +201,7 @@ class Presolve:
                 lam_g0=program.lam_g,
                 p=nlp.thetas(eps=planned.eps, eps_pixel=planned.eps, **planned.theta),
                 tol=o.presolve_tol,
-                seconds=max(1.0, self.deadline - time.perf_counter()),
+                seconds=max(LEAST_SECONDS, self.deadline - time.perf_counter()),
                 watch=self.watch,
                 max_iter=o.presolve_iterations if max_iter is None else max_iter,
                 stagnation=o.stagnation * planned.share,

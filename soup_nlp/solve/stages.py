@@ -21,7 +21,7 @@ from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import UNMET, WARM, feasible, residuals, warm_start
-from soup_nlp.solve.presolve import EXACT, STOPPED, Presolve
+from soup_nlp.solve.presolve import EXACT, LEAST_SECONDS, STOPPED, Presolve
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.storage.progress import Watch
 
@@ -234,7 +234,7 @@ class _Solve:
             **first,
             max_iter=limit,
             tol=o.tol,
-            seconds=max(1.0, self.laps.begin + o.max_seconds - time.perf_counter()),
+            seconds=max(LEAST_SECONDS, self.laps.begin + o.max_seconds - time.perf_counter()),
             stage="constrained NLP",
             watch=self.watch,
         )

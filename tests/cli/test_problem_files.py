@@ -145,16 +145,22 @@ def text(name):
     return (ROOT / name).read_text(encoding="utf-8")
 
 
-def test_help_and_version_import_no_library_of_the_method():
-    code = (
-        "import sys\nfrom soup_nlp.cli.main import main\n"
-        "for words in (['--help'], ['--version'], ['bench', '--help']):\n    main(words)\n"
-        f"print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
-    )
+HELP = """from soup_nlp.cli.main import main
+for words in (['--help'], ['--version'], ['bench', '--help']): main(words)"""
+ON_USE = ("matplotlib", "trimesh", "pandas", "skimage.segmentation", "scipy.stats")
+
+
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [(HELP, HEAVY), pytest.param("import soup_nlp.cli.solve", ON_USE, marks=pytest.mark.slow)],
+)
+def test_libraries_are_imported_on_use(code, absent):
+    code += f"\nimport sys; print([m for m in {absent} if m in sys.modules], file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
-    assert f"soup-nlp {soup_nlp.__version__}" in done.stdout
-    assert "accuracy" in done.stdout
+    if absent is HEAVY:
+        assert f"soup-nlp {soup_nlp.__version__}" in done.stdout
+        assert "accuracy" in done.stdout
 
 
 def test_a_version_has_its_changelog_and_citation():

@@ -3,8 +3,6 @@
 import json
 import pickle
 import shutil
-import subprocess
-import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -131,14 +129,6 @@ def test_a_stored_result_has_the_arrays_of_its_run(run, saved, tmp_path):
     assert 'alt="overview"' in shown
     with pytest.raises(DataError, match="result file is missing"):
         soup_nlp.load(tmp_path)
-
-
-@pytest.mark.slow
-def test_heavy_packages_are_imported_on_use():
-    heavy = ("matplotlib", "trimesh", "pandas", "skimage.segmentation", "scipy.stats")
-    code = f"import sys, soup_nlp.cli.solve; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 # --- a pair in memory: its problem holds a hash of it and cannot be solved again

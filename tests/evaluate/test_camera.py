@@ -16,6 +16,7 @@ from soup_nlp.report.summary import certainty
 from soup_nlp.start.epipolar import Matches
 
 FOCAL = 400.0
+ORBIT = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
 
 
 def matches(seed: int = 0) -> Matches:
@@ -68,8 +69,7 @@ def test_too_few_matches_show_no_error():
 
 def started(pair: Pair):
     """The start of a pair as a run, and what is said of it."""
-    scene = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
-    raw = {"input": scene, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
+    raw = {"input": ORBIT, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
     case = prepare(make_problem(raw), pair=pair)
     done = make_run(case, skipped(case))
     shares, flow = certainty(done), done.pair.flow
@@ -79,8 +79,7 @@ def started(pair: Pair):
 
 @pytest.fixture(scope="module")
 def orbit():
-    scene = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
-    return make_problem({"input": scene, "flow": {"source": "truth"}}).load_pair()
+    return make_problem({"input": ORBIT, "flow": {"source": "truth"}}).load_pair()
 
 
 @pytest.mark.slow
@@ -102,9 +101,8 @@ def test_a_wrong_principal_point_makes_depth_unsure(orbit):
 
 @pytest.mark.slow
 def test_two_scenes_are_a_guess():
-    size = {"kind": "scene", "width": 320, "height": 136}
     one, other = (
-        make_problem({"input": {**size, "scene": name}}).load_pair() for name in ("room", "street")
+        make_problem({"input": {**ORBIT, "scene": name}}).load_pair() for name in ("room", "street")
     )
     done, told = started(replace(one, flow=None, image_next=other.image_next))
     assert not done.good
