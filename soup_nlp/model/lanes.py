@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float
 from soup_nlp.model.compile import shared_library
 from soup_nlp.model.kernel import Blocks, in_blocks
-from soup_nlp.model.operations import OPERATIONS, input_sizes, instructions
+from soup_nlp.model.operations import OPERATIONS, input_sizes, instructions, operation
 
 LANES = 8
 
@@ -91,7 +91,7 @@ def c_source(function: ca.Function) -> str:
         elif op == ca.OP_CONST:
             lines.append(f"a{to[0]} = zero + ({constant!r});")
         else:
-            term = OPERATIONS[op].c.format(*(f"a{i}" for i in source))
+            term = operation(op).c.format(*(f"a{i}" for i in source))
             lines.append(f"a{to[0]} = {term};")
     used = f.sz_w()
     size = input_sizes(f)

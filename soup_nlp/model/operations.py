@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from soup_nlp.errors import ModelError
+
 
 class Operation(NamedTuple):
     """One operation of a kernel.
@@ -91,11 +93,22 @@ OPERATIONS: Mapping[int, Operation] = {
         )
     },
 }
-"""Operations by CasADi's number; a kernel with any other one cannot be evaluated."""
+"""Operations by CasADi's number; `operation` finds them."""
 NAMES: Mapping[int, str] = {
     getattr(ca, n): n.removeprefix("OP_").lower() for n in dir(ca) if n.startswith("OP_")
 }
 """Names of all operations for error messages."""
+
+
+def operation(number: int) -> Operation:
+    """The operation of CasADi's number.
+
+    Raises:
+        ModelError: a kernel with it cannot be evaluated.
+    """
+    if number not in OPERATIONS:
+        raise ModelError("unknown operation", where="a kernel", found=NAMES[number])
+    return OPERATIONS[number]
 
 
 class Instruction(NamedTuple):

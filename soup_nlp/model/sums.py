@@ -15,14 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
-from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.lanes import LANES, NoCompilerError, Summed, compile_lanes
-from soup_nlp.model.operations import NAMES, OPERATIONS, instructions
 from soup_nlp.model.vectors import Vectors
 
 log = logging.getLogger(__name__)
-_OTHERS = frozenset((ca.OP_INPUT, ca.OP_CONST, ca.OP_OUTPUT))
 
 
 @dataclass
@@ -86,10 +83,6 @@ def summed(
     """
     sums = {key: Sum(given, size) for key, size in sizes.items()}
     for group, own_functions, own_targets in zip(groups, functions, targets):
-        for f in own_functions.values():
-            unknown = {i.operation for i in instructions(f)} - OPERATIONS.keys() - _OTHERS
-            if unknown:
-                raise ModelError("unknown operation", where=f.name(), found=NAMES[min(unknown)])
         library, blocks = None, None
         if compiled and own_functions:
             try:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
 from soup_nlp.model.kernel import Table, in_blocks
-from soup_nlp.model.operations import OPERATIONS, input_sizes, instructions
+from soup_nlp.model.operations import input_sizes, instructions, operation
 
 BLOCK = 2048
 """Elements of a block: more cost fewer calls, fewer fit into the cache."""
@@ -65,9 +65,10 @@ class Vectors:
             elif op == ca.OP_OUTPUT:
                 calls.append((np.copyto, (out[to[1]], registers[source[0]])))
             else:
-                given = [registers[i] for i in source[: OPERATIONS[op].operands]]
+                known = operation(op)
+                given = [registers[i] for i in source[: known.operands]]
                 registers[to[0]] = work[to[0]]
-                calls.append((OPERATIONS[op].numpy, (*given, work[to[0]])))
+                calls.append((known.numpy, (*given, work[to[0]])))
         return calls
 
     def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
