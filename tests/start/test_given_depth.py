@@ -14,11 +14,13 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
+from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.reweighting import with_prior
 from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.summary import certainty, summary
+from soup_nlp.start import prior_evidence
 from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
 from soup_nlp.start.prior_evidence import CONFIRMED, follows_edges, judged
@@ -229,7 +231,17 @@ def test_ordinal_values_count_by_their_order_alone(pan):
 
 
 @pytest.mark.slow
-def test_steps_on_image_edges_tell_a_map_of_it():
+def test_steps_on_image_edges_tell_a_map_of_it(monkeypatch):
+    known: dict[tuple[bytes, int], Labels] = {}
+
+    def once(picture: np.ndarray, count: int) -> Labels:
+        """The superpixels of a picture, which 24 maps share."""
+        key = picture.tobytes(), count
+        if key not in known:
+            known[key] = segment(picture, count)
+        return known[key]
+
+    monkeypatch.setattr(prior_evidence, "segment", once)
     rng = np.random.default_rng(0)
     image, depth = np.full((120, 160, 3), 90, np.uint8), np.full((120, 160), 5.0)
     for _ in range(12):
