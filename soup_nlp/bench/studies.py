@@ -168,6 +168,7 @@ DEPARTURES = (
         with_on=_SHARED,
         needs=_FINDS,
     ),
+    Departure("E_arap joins the scene", ("energy.arap_scene",), with_on=_SHARED, needs=_FINDS),
     Departure(
         "E_cont weak at occlusions", ("energy.cont_occluded",), with_on=_SHARED, needs=_FINDS
     ),

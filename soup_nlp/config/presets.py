@@ -43,6 +43,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "units": "paper",
                 "arap_at_anchors": False,
                 "arap_across": 1.0,
+                "arap_scene": 0.0,
                 "cont_occluded": 1.0,
                 "weights": {
                     "arap": 500.0,

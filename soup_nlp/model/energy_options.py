@@ -95,6 +95,9 @@ class EnergyOptions(Section):
     arap_across: Share = 0.03
     """Factor of E_arap and E_prior between superpixels of different components; 1 is the
     paper's."""
+    arap_scene: Share = 0.1
+    """Weight w1 of further edges of E_arap, from the scene's superpixel of median depth to all of
+    the scene with a flow and depth of their own; 0 is the paper's graph."""
     cont_occluded: Share = 0.03
     """Factor of E_cont where one component occludes another; 1 is the paper's."""
     pixel_samples: Samples | Literal["all"] = 16

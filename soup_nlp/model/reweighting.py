@@ -15,6 +15,8 @@ from soup_nlp.model.oracle import relief
 
 LEAST_STEP = 0.05
 """Least step of inverse depth that E_order asks for where it asks for one, relative."""
+CONFIDENT = 0.5
+"""Mean confidence of a superpixel's flow above which an edge joins it to the rest of the scene."""
 CREASE = 0.01
 """1 - cos of the angle between two planes of a depth prior that halves E_orient between them, 8
 degrees: 0.005 and 0.02 differ by at most 0.0006 in the mean relative error of robot."""
@@ -52,6 +54,43 @@ def across(
         prior_weight=np.where(edges, prior, 1.0) * data.prior_weight,
         pair_weight=np.where(split, cont, 1.0) * data.pair_weight,
         orient_weight=np.where(split, orient, 1.0) * data.orient_weight,
+    )
+
+
+def rigid_scene(data: EnergyData, soup: Soup, scene: Mask, weight: float) -> EnergyData:
+    """The same data with an E_arap edge from the superpixel of median depth to all of the scene.
+
+    K-NN edges join the near and the far part of a scene by few links. E_arap is truncated, so that
+    cutting these costs little, and each part gets a translation of a length of its own.
+
+    Args:
+        data: Data of the pair in the paper's units.
+        soup: Start.
+        scene: (N,) the scene, one rigid component; superpixels without confident flow are left out.
+        weight: w1 of these edges; 0 is the paper's graph.
+    """
+    members = np.flatnonzero(scene & (data.pixel_weight.sum(axis=1) > CONFIDENT))
+    if weight == 0 or len(members) < 2:
+        return data
+    z = soup.depth_at(data.anchor_ray)[members]
+    hub = members[np.argsort(z)[len(z) // 2]]
+    edges = np.sort(np.column_stack([np.full(len(members), hub), members]), axis=1)
+    n = len(data)
+    edges = edges[~np.isin(edges @ [n, 1], np.append(data.edges @ [n, 1], hub * (n + 1)))]
+
+    def extended(values: Float, value: float) -> Float:
+        return np.append(values, np.full(len(edges), value))
+
+    return replace(
+        data,
+        edges=np.concatenate([data.edges, edges]),
+        edge_weight=extended(data.edge_weight, weight),
+        edge_unit=extended(data.edge_unit, 1.0),
+        rotation_scale=extended(data.rotation_scale, 1.0),
+        prior_weight=extended(data.prior_weight, 0.0),
+        prior_relief=extended(data.prior_relief, 0.0),
+        depth_weight=extended(data.depth_weight, 0.0),
+        depth_change=extended(data.depth_change, 0.0),
     )
 
 

@@ -36,6 +36,7 @@ PAPER = {
     "energy.units": "paper",
     "energy.arap_at_anchors": False,
     "energy.arap_across": 1.0,
+    "energy.arap_scene": 0.0,
     "energy.cont_occluded": 1.0,
     "energy.weights.prior": 0.0,
     "energy.weights.sigma_arap": np.inf,
