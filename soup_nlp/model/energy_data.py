@@ -34,7 +34,7 @@ class EnergyData:
         pixel_ray: (N, S, 3) sampled pixels of every superpixel.
         pixel_target: (N, S, 2) their flow targets, pixels.
         pixel_weight: (N, S) confidence / S: E_proj is the confidence-weighted mean of the sample.
-        edges: (E, 2) K-NN edges i < k.
+        edges: (E, 2) edges i < k: the K-NN graph, and those of `rigid_scene`.
         edge_weight: (E,) w1 = w2, both directions folded.
         edge_unit: (E,) length unit of the edge (1: the mean plane distance).
         prior_weight: (E,) weight of E_prior: 1 / K for each direction of the edge, so that it is

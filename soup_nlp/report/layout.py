@@ -27,7 +27,7 @@ segmentation/anchors      px    N,2     centroids (u, v)
 segmentation/sizes        px    N       pixels of every superpixel
 segmentation/radius       px    N       root mean square distance from the anchor
 segmentation/knn          1     N,K     nearest anchors, nearest first
-segmentation/edge_multiplicity  1  E    directions in which an edge of energy/edges occurs
+segmentation/edge_multiplicity  1  L    directions of the K-NN edges, the first L of energy/edges
 segmentation/boundary     px    P,B,2   sampled shared boundary points (u, v)
 segmentation/boundary_length  px  P     shared boundary before sampling
 segmentation/pair_weight  1     P       w4 of the pairs, of the image alone
@@ -39,7 +39,7 @@ energy/radius             1     N       largest distance of a rim pixel from the
 energy/pixel_ray          1     N,S,3   rays of the sampled pixels of E_proj
 energy/pixel_target       px    N,S,2   where the flow brings the sampled pixels
 energy/pixel_weight       1     N,S     confidence x usable share / sample size; 0 drops a pixel
-energy/edges              1     E,2     K-NN edges i < k
+energy/edges              1     E,2     edges i < k: K-NN, and those that join the scene
 energy/edge_weight        1     E       w1 = w2 of both directions, less between two components
 energy/prior_weight       1     E       weight of E_prior: flow noise / K for each direction
 energy/prior_relief       1     E       relative difference of 1/z that costs nothing in E_prior
