@@ -35,7 +35,7 @@ from soup_nlp.model.energy_data import (
 )
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.reweighting import across, in_noise, in_pixels
+from soup_nlp.model.reweighting import across, in_noise, in_pixels, rigid_scene
 from soup_nlp.start.choice import limited_noise
 
 # --- invariances ---------------------------------------------------------------------------------
@@ -317,3 +317,34 @@ def test_ties_across_groups_keep_a_share_of_weight():
     np.testing.assert_allclose(found.prior_weight, np.where(apart, 0.3, 1.0) * data.prior_weight)
     np.testing.assert_allclose(found.pair_weight, np.where(split, 0.2, 1.0) * data.pair_weight)
     np.testing.assert_allclose(found.orient_weight, np.where(split, 0.1, 1.0) * data.orient_weight)
+
+
+def test_the_scene_is_joined_through_its_superpixel_of_median_depth():
+    """Edges to members with a flow that are no K-NN edges; E_arap alone has them."""
+    problem = tiny()
+    soup, count = problem.soup.normalised(), len(problem.soup)
+    usable = np.where(np.arange(count) == 5, 0.4, 0.6)
+    pixels = problem.data.pixel_weight.shape[1]
+    data = replace(problem.data, pixel_weight=np.tile(usable[:, None] / pixels, pixels))
+    scene = np.arange(count) != 3
+    assert rigid_scene(data, soup, scene, 0.0) is data
+    joined = rigid_scene(data, soup, scene, 0.25)
+    Z, known = soup.depth_at(data.anchor_ray), {tuple(e) for e in data.edges.tolist()}
+    members = sorted(set(range(count)) - {3, 5}, key=Z.__getitem__)
+    hub = members[len(members) // 2]
+    expected = {(min(i, hub), max(i, hub)) for i in members if i != hub} - known
+    assert 1 < len(expected) < len(members) - 1
+    np.testing.assert_array_equal(joined.edges[: len(data.edges)], data.edges)
+    assert sorted(map(tuple, joined.edges[len(data.edges) :].tolist())) == sorted(expected)
+
+    X = soup.points(data.anchor_ray)
+    moved = np.einsum("nij,nj->ni", soup.R, X) + soup.translation
+    cost = 0.0
+    for i, k in expected:
+        turn, shift = soup.R[i] - soup.R[k], soup.translation[i] - soup.translation[k]
+        stretch = np.linalg.norm(X[i] - X[k]) - np.linalg.norm(moved[i] - moved[k])
+        cost += 0.25 * (np.linalg.norm(turn) + np.linalg.norm(shift) + abs(stretch))
+    before, after = (oracle.energy(soup, d, PAPER) for d in (data, joined))
+    assert after["arap"] - before["arap"] == pytest.approx(PAPER.arap * cost)
+    others = before.keys() - {"arap", "total"}
+    assert {k: after[k] for k in others} == pytest.approx({k: before[k] for k in others})
