@@ -26,6 +26,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.reweighting import first_edges
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.pipeline.case import build_energy, solver_options
 from soup_nlp.pipeline.record import Case
@@ -179,7 +180,8 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     )
     data, weights = build_energy(problem, pair, seg, start)
     options = solver_options(problem, start)
-    data = replace(data, prior_weight=record.prior_weight)
+    # records are older than further edges of E_arap
+    data = replace(first_edges(data, len(seg.edges)), prior_weight=record.prior_weight)
     values = {f.name: np.asarray(getattr(data, f.name)) for f in fields(data)}
     reals: dict[str, Any] = {k: rounded(v) for k, v in values.items() if v.dtype == np.float64}
     data = replace(data, **reals)

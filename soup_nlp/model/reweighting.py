@@ -17,6 +17,9 @@ LEAST_STEP = 0.05
 """Least step of inverse depth that E_order asks for where it asks for one, relative."""
 CONFIDENT = 0.5
 """Mean confidence of a superpixel's flow above which an edge joins it to the rest of the scene."""
+OF_EDGES = ("edges", "edge_weight", "edge_unit", "rotation_scale", "prior_weight")
+OF_EDGES += ("prior_relief", "depth_weight", "depth_change")
+"""Arrays of `EnergyData` with a row per edge."""
 CREASE = 0.01
 """1 - cos of the angle between two planes of a depth prior that halves E_orient between them, 8
 degrees: 0.005 and 0.02 differ by at most 0.0006 in the mean relative error of robot."""
@@ -78,20 +81,14 @@ def rigid_scene(data: EnergyData, soup: Soup, scene: Mask, weight: float) -> Ene
     n = len(data)
     edges = edges[~np.isin(edges @ [n, 1], np.append(data.edges @ [n, 1], hub * (n + 1)))]
 
-    def extended(values: Float, value: float) -> Float:
-        return np.append(values, np.full(len(edges), value))
+    values = {"edge_weight": weight, "edge_unit": 1.0, "rotation_scale": 1.0}
+    more = {k: np.full(len(edges), values.get(k, 0.0)) for k in OF_EDGES} | {"edges": edges}
+    return replace(data, **{k: np.concatenate([getattr(data, k), v]) for k, v in more.items()})
 
-    return replace(
-        data,
-        edges=np.concatenate([data.edges, edges]),
-        edge_weight=extended(data.edge_weight, weight),
-        edge_unit=extended(data.edge_unit, 1.0),
-        rotation_scale=extended(data.rotation_scale, 1.0),
-        prior_weight=extended(data.prior_weight, 0.0),
-        prior_relief=extended(data.prior_relief, 0.0),
-        depth_weight=extended(data.depth_weight, 0.0),
-        depth_change=extended(data.depth_change, 0.0),
-    )
+
+def first_edges(data: EnergyData, count: int) -> EnergyData:
+    """The same data with the first `count` edges: those of the K-NN graph precede others."""
+    return replace(data, **{k: getattr(data, k)[:count] for k in OF_EDGES})
 
 
 def over_ground(data: EnergyData, soup: Soup, grounded: Mask, weight: Float) -> EnergyData:

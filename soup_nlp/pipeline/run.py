@@ -35,6 +35,7 @@ from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
+from soup_nlp.model.reweighting import first_edges
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run, full_size
 from soup_nlp.refine.mppbp import refine_soup
@@ -164,7 +165,9 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     unrefined = dense(solution.soup)
     after = unrefined if refined is None else dense(refined.soup)
     assert pair.flow is not None
-    energy = case.data, case.weights, case.problem.formulation
+    # one superpixel coupled to all of the scene would fill the factors of the information
+    data = first_edges(case.data, len(case.segmentation.edges))
+    energy = data, case.weights, case.problem.formulation
     sure = confidence(after, pair, case.start, *energy, case.given)
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.original is None else full_size(case.original, pair, after)
