@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -17,8 +18,8 @@ LEAST_STEP = 0.05
 """Least step of inverse depth that E_order asks for where it asks for one, relative."""
 CONFIDENT = 0.5
 """Mean confidence of a superpixel's flow above which an edge joins it to the rest of the scene."""
-OF_EDGES = ("edges", "edge_weight", "edge_unit", "rotation_scale", "prior_weight")
-OF_EDGES += ("prior_relief", "depth_weight", "depth_change")
+OF_EDGES: tuple[str, ...] = ("edges", "edge_weight", "edge_unit", "rotation_scale")
+OF_EDGES += ("prior_weight", "prior_relief", "depth_weight", "depth_change")
 """Arrays of `EnergyData` with a row per edge."""
 CREASE = 0.01
 """1 - cos of the angle between two planes of a depth prior that halves E_orient between them, 8
@@ -83,12 +84,14 @@ def rigid_scene(data: EnergyData, soup: Soup, scene: Mask, weight: float) -> Ene
 
     values = {"edge_weight": weight, "edge_unit": 1.0, "rotation_scale": 1.0}
     more = {k: np.full(len(edges), values.get(k, 0.0)) for k in OF_EDGES} | {"edges": edges}
-    return replace(data, **{k: np.concatenate([getattr(data, k), v]) for k, v in more.items()})
+    rows: dict[str, Any] = {k: np.concatenate([getattr(data, k), v]) for k, v in more.items()}
+    return replace(data, **rows)
 
 
 def first_edges(data: EnergyData, count: int) -> EnergyData:
     """The same data with the first `count` edges: those of the K-NN graph precede others."""
-    return replace(data, **{k: getattr(data, k)[:count] for k in OF_EDGES})
+    rows: dict[str, Any] = {k: getattr(data, k)[:count] for k in OF_EDGES}
+    return replace(data, **rows)
 
 
 def over_ground(data: EnergyData, soup: Soup, grounded: Mask, weight: Float) -> EnergyData:
