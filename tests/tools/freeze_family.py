@@ -69,7 +69,7 @@ def record_of(case: Case) -> Frozen:
         error=start.error.astype(np.float32).astype(float),
         bending=start.bending,
         pair_weight=case.segmentation.pair_weight,
-        prior_weight=rounded(case.data.prior_weight),
+        prior_weight=rounded(case.data.prior_weight[: len(case.segmentation.edges)]),
         proposal=proposal,
         minimum=proposal,
     )
