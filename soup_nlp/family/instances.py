@@ -180,7 +180,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     )
     data, weights = build_energy(problem, pair, seg, start)
     options = solver_options(problem, start)
-    # records are older than further edges of E_arap
+    # records have the K-NN graph alone
     data = replace(first_edges(data, len(seg.edges)), prior_weight=record.prior_weight)
     values = {f.name: np.asarray(getattr(data, f.name)) for f in fields(data)}
     reals: dict[str, Any] = {k: rounded(v) for k, v in values.items() if v.dtype == np.float64}

@@ -1,4 +1,4 @@
-"""Departures from the paper's weights: across components, at occlusions, in pixel units."""
+"""Departures from the paper's weights and graph: in a scene, across components, in pixels."""
 
 from __future__ import annotations
 

@@ -257,8 +257,8 @@ def build_energy(
     if whole:
         pieces = start.surface * (int(start.component.max()) + 1) + start.component
         data = across(data, pieces, **ACROSS_DISCONTINUITIES)
-    own = (start.component == 0) & (start.motion >= 0) & ~start.borrowed & ~bends
-    data = rigid_scene(data, start.soup, own, e.arap_scene)
+    scene = (start.component == 0) & (start.motion >= 0) & ~start.borrowed & ~bends
+    data = rigid_scene(data, start.soup, scene, e.arap_scene)
     if e.units == "pixel":
         data = in_pixels(data, start.soup, seg, BENDING_ROTATION_PX if whole else None)
     else:

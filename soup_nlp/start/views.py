@@ -58,9 +58,9 @@ class Views:
         each = np.arange(len(motions))[None] if label is None else label[:, None]
         each = np.broadcast_to(each, (len(self.ray), each.shape[1]))
         R, t = stacked(motions)
-        size = max(1, CACHED // (each.shape[1] * self.weight.shape[1]))
+        size = max(1, CACHED // max(1, each.shape[1] * self.weight.shape[1]))
         fits = []
-        for k in range(0, len(each), size):
+        for k in range(0, max(1, len(each)), size):
             m, v = each[k : k + size], self.subset(slice(k, k + size))
             samples = v.ray, v.target, v.weight
             fits.append(fit_planes(R[m], t[m], *samples, v.anchor, v.radius, v.focal))

@@ -196,7 +196,11 @@ def test_a_run_saves_itself_and_is_converted(run, saved, tmp_path, capsys):
         assert (other / name).read_bytes() == (out / name).read_bytes(), name
     told = json.loads((out / "motions.json").read_text())
     np.testing.assert_array_equal(told["camera"]["next_from_ref"], run.camera.matrix)
+    note = out / "colmap" / "notes.txt"
+    note.parent.mkdir()
+    note.write_text("mine")
     assert main(["convert", str(out), "--to", "colmap"]) == 0
+    assert note.read_text() == "mine"
     assert (out / "colmap" / "sparse" / "0" / "points3D.txt").is_file()
 
 
@@ -208,8 +212,12 @@ def test_what_cannot_be_converted_is_refused(saved, tmp_path, capsys):
     out, foreign = shutil.copytree(saved[0], tmp_path / "out"), tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "mesh_ref.glb").write_text("mine")
+    (out / "depth_ref.npy").write_text("mine")
+    (out / "points_ref.ply").write_text("mine")
     for arguments, said in (
         ([str(out), "--to", "glb", "--out", str(foreign)], "files"),
+        ([str(out), "--to", "npy"], "files"),
+        ([str(out), "--to", "ply"], "files"),
         ([str(out), "--to", "obj"], "unknown format"),
         ([str(out), "--to", ","], "no format"),
         ([str(out), "--to", ""], "an argument is empty"),
@@ -217,7 +225,8 @@ def test_what_cannot_be_converted_is_refused(saved, tmp_path, capsys):
     ):
         assert main(["convert", *arguments]) == 2
         assert said in capsys.readouterr().err
-    assert (foreign / "mesh_ref.glb").read_text() == "mine"
+    for kept in (foreign / "mesh_ref.glb", out / "depth_ref.npy", out / "points_ref.ply"):
+        assert kept.read_text() == "mine"
     with h5py.File(out / "result.h5", "a") as file:
         del file["input/image_ref"]
     assert main(["convert", str(out), "--to", "glb"]) == 2
