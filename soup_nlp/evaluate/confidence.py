@@ -208,6 +208,28 @@ def with_prior(sigma: Float, prior: Float | float = SIGMA_PRIOR) -> Float:
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
 
 
+def by_start(rec: Reconstruction, start: Start, anchor_ray: Float) -> Float:
+    """(N,) standard deviation of log depth because two estimates from the same flow differ.
+
+    The answer balances all terms, the initialisation triangulates with the motion of the component.
+    Their log ratio counts without its median in the component, 0 where regions bend: there the
+    initialisation is rough.
+
+    Args:
+        rec: The answer.
+        start: The initialisation.
+        anchor_ray: (N, 3) rays through the anchors.
+    """
+    answer, first = (
+        # the answer of a foreign solver may have no depth
+        np.log(np.clip(np.nan_to_num(soup.depth_at(anchor_ray)), 1e-30, 1e30))
+        for soup in (rec.soup, start.soup)
+    )
+    ratio = answer - first
+    middle = ndimage.median(ratio, start.component, np.arange(int(start.component.max()) + 1))
+    return np.where(start.bends, 0.0, np.abs(ratio - np.asarray(middle)[start.component]))
+
+
 def by_ground(off_ground: Float) -> Float:
     """(N,) standard deviation of log depth because regions may stand on the ground, or not.
 
@@ -311,6 +333,7 @@ def confidence(
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), by_motion)
     guess = flow_evidence.guess[start.component] | start.at_rest | (start.tie == FIXED)
     added = np.hypot(added, np.where(guess, GUESSED, 0.0))
+    added = np.hypot(added, by_start(rec, start, data.anchor_ray))
     before = np.full(len(added), SIGMA_PRIOR)
     if given_depth is not None:
         # where the depth is that of a prior which no flow confirms, the flow is no evidence

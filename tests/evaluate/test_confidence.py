@@ -342,6 +342,30 @@ def test_a_scale_is_open_where_contact_implies_too_fast_motion(small_room, sure)
 
 
 @pytest.mark.slow
+def test_depth_far_from_the_initialisation_is_unsure_by_the_ratio(small_room, sure):
+    parts, n = small_room.start.component, len(small_room.soup)
+    at = 25
+    inside = small_room.segmentation.labels == at
+    assert sure.sigma[inside].mean() < 0.1
+
+    def sigma(factor, **start):
+        first = small_room.start.soup
+        first = replace(first, d=first.d * factor)
+        return sure_of(replace(small_room, start=replace(small_room.start, soup=first, **start)))
+
+    for ratio in (0.8, 1.25):
+        apart = sigma(np.where(np.arange(n) == at, ratio, 1.0)).sigma
+        assert apart[inside].min() > 0.18
+        np.testing.assert_allclose(apart[~inside], sure.sigma[~inside], rtol=1e-9)
+    # a scale of a component is no evidence about its relief
+    of_component = sigma(np.where(parts == parts[at], 1.25, 1.0))
+    np.testing.assert_allclose(of_component.sigma, sure.sigma, rtol=1e-9)
+    # where surfaces bend the initialisation is rough
+    bends = np.ones(n, bool)
+    rough = sigma(np.where(np.arange(n) == at, 1.25, 1.0), bends=bends).sigma
+    np.testing.assert_allclose(rough, sigma(1.0, bends=bends).sigma, rtol=1e-9)
+
+
 def test_what_floats_above_the_ground_is_unsure_by_the_ratio(small_room, sure):
     inside = small_room.segmentation.labels == 25
     usual = sure.sigma
