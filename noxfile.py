@@ -5,8 +5,6 @@ nox -s "tests-3.13(packages='lowest')"
 nox -s surroundings bare               # a few commands, and all fast tests, without HOME, ...
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import nox

@@ -3,8 +3,6 @@
 `python docs/gallery.py` makes all, `python docs/gallery.py prior` the latter alone.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from dataclasses import replace

@@ -6,8 +6,6 @@ cell has the MRE of the prior and that of the answer, then the share of its wron
 sigma below 10 %, those within 1 and 2 sigma, those that are a guess, and the CPU seconds.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from dataclasses import replace

@@ -4,8 +4,6 @@ Documents link to source files, which the site does not hold: a link to a functi
 entry in the reference, one to another file of the repository becomes its name.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Types of arrays that many rooms use."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

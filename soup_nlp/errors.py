@@ -1,7 +1,5 @@
 """Errors that a user can act on: what, where, found, expected, what to try."""
 
-from __future__ import annotations
-
 import reprlib
 
 LONGEST = 1000

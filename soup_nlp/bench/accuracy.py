@@ -1,7 +1,5 @@
 """Measurement of one pair: a row with the errors of solution and baselines."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

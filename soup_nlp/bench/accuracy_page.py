@@ -1,7 +1,5 @@
 """The page of a suite: tables by pair, family and dataset, with their protocol; a picture."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

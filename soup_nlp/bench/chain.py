@@ -1,7 +1,5 @@
 """`bench chain`: the error that one scale for a whole sequence causes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The cells of `bench paper`: datasets and studies of the paper, by its method and the defaults."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from itertools import product

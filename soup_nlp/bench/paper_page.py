@@ -1,7 +1,5 @@
 """The page of `bench paper`: the tables and figures of the paper that the rows allow."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A function in a process of its own with limits; the description of the machine."""
 
-from __future__ import annotations
-
 import math
 import multiprocessing
 import os

@@ -4,8 +4,6 @@ Trial t000 is the default. The same pairs and code give the same trials, and an 
 search can be continued.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

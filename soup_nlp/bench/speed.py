@@ -1,7 +1,5 @@
 """`bench speed`: seconds, energy and memory of solves by stage, over N, K and the image size."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from itertools import product

@@ -1,7 +1,5 @@
 """Declared studies and departures of the paper's page, and the numbers that the paper prints."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Suites of pairs: rendered scenes, real pairs, the paper's sequences; where their data are."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Commands bench: accuracy on suites, better defaults, the paper's tables, time, one scale."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence

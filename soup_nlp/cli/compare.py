@@ -1,7 +1,5 @@
 """Command compare: other solvers on the same NLP, verified."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

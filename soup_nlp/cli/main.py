@@ -2,8 +2,6 @@
 130 Ctrl-C. An unexpected exception becomes a bug report in a file.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import re

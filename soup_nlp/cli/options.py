@@ -1,7 +1,5 @@
 """Parts that commands share: common options, lists in options, progress."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -12,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import typer
 from rich.console import Console
@@ -215,7 +213,7 @@ class SolveLog(logging.Handler):
         self._task = self._bars.add_task("", total=None, it="")
         self._step, self._done = "", 0
 
-    def __enter__(self) -> SolveLog:
+    def __enter__(self) -> Self:
         self._logger = logging.getLogger(PACKAGE)
         self._level = self._logger.level
         self._logger.setLevel(logging.INFO)

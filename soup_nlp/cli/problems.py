@@ -1,7 +1,5 @@
 """Commands show, list, export and family: problems as text, and as files for other solvers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Commands check, evaluate, import, view and convert: results are verified, shown, written."""
 
-from __future__ import annotations
-
 import webbrowser
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer

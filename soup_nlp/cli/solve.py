@@ -1,7 +1,5 @@
 """Commands solve, demo and chain: a pair or a sequence of frames becomes a result folder."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Mapping, Sequence

@@ -7,8 +7,6 @@ docs/formulation.md. E is 1 / alpha1 times the printed one, so that a pixel of r
 costs 1 as in the defaults: only ratios matter, and the solver's tolerances are absolute.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Iterator, Mapping

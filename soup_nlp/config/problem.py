@@ -1,7 +1,5 @@
 """Problem files: strict YAML, defaults beside the code that uses them, dotted overrides."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """YAML of problem files: numbers as in version 1.2, the line of every key."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

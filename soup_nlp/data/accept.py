@@ -1,7 +1,5 @@
 """Conversion of images, cameras and flows, as callers may give them, to checked arrays."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any, TypeAlias

@@ -5,8 +5,6 @@ has the number `tanh((neighbour - centre) / 10)`. In regions without texture the
 near zero, so that they hardly contribute to matching costs.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

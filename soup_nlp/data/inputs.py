@@ -1,7 +1,5 @@
 """Inputs of a problem file, each with its loader: a depth prior, and the kinds of input."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 from pathlib import Path

@@ -1,12 +1,10 @@
 """Input of a solve: two images, two cameras, a flow and, if known, the truth."""
 
-from __future__ import annotations
-
 from dataclasses import InitVar, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -313,11 +311,11 @@ class Pair:
         """(height, width) of the reference image."""
         return self.image_ref.shape[0], self.image_ref.shape[1]
 
-    def with_flow(self, flow: Flow) -> Pair:
+    def with_flow(self, flow: Flow) -> Self:
         """The same pair with another flow."""
         return replace(self, flow=flow)
 
-    def with_focal(self, factor: float, sigma: float) -> Pair:
+    def with_focal(self, factor: float, sigma: float) -> Self:
         """The same pair with focal lengths times a factor.
 
         Args:

@@ -1,7 +1,5 @@
 """Pairs at other sizes: a working size, and frames of different focal lengths at one scale."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -5,8 +5,6 @@ acts as a motion does. Each kind of error is tried by itself, because several ki
 nearly any flow. See docs/confidence.md.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from soup_nlp.arrays import Float

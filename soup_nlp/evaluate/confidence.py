@@ -3,8 +3,6 @@
 See docs/confidence.md.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ systematic error determines the depth of a component only where neither a turn a
 depth explains it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

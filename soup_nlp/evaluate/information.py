@@ -5,8 +5,6 @@ blocks of the planes are kept: marginal variances, which include the uncertainty
 conditional variances, which would take the neighbours as exact.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

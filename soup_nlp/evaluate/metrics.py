@@ -6,8 +6,6 @@ Eigen et al., NIPS 2014 (AbsRel, SqRel, RMSE, log-RMSE, delta); MRE as in "Super
 relative error, the same number as AbsRel).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, get_args
 

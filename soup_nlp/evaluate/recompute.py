@@ -4,8 +4,6 @@ Nothing of `soup_nlp.model`, `soup_nlp.solve` or `soup_nlp.evaluate.metrics` is 
 error there cannot confirm itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

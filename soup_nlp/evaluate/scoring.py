@@ -1,7 +1,5 @@
 """Scores of the depths of a run and of simpler methods against the truth."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Export of an NLP as a folder: .nl with names, CasADi functions, HDF5, problem and manifest."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args

@@ -1,7 +1,5 @@
 """The `V`, `C` and `O` segments of a .nl file: templates filled in for every element."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 

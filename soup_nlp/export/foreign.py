@@ -1,7 +1,5 @@
 """Answers of other solvers to exported problems, verified and returned as runs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

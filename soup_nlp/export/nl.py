@@ -6,8 +6,6 @@ linear) and of the rows (nonlinear before linear); `NLFile` has the permutations
 Gay, "Writing .nl files" (2005), and the AMPL/MP reader.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Conversion of an NLP of kernels and tables to the parts of a .nl file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Reading and writing of answers of solvers in the .sol text format of AMPL."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The NLP of a problem for `casadi.nlpsol`: symbols, bounds, start, derivatives."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ elements at once. An expression becomes a defined variable if an element uses it
 many elements share it, such as the 3D anchor of a superpixel with fifteen edges.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """KKT residuals of the point of another solver."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

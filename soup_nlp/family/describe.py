@@ -3,8 +3,6 @@
 Properties are sizes, classes, rank of the Jacobian and LICQ.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Records of the family in the package: superpixels, start and best known point by problem."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass

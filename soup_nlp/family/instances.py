@@ -5,8 +5,6 @@ results are records in the package (`frozen`). The rest is rendering and arithme
 depend on the processor. Every number of the NLP is therefore rounded to 20 significant bits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache

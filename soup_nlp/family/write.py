@@ -1,7 +1,5 @@
 """Writing of the family: .nl files with names, best known points, index, README, licence."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

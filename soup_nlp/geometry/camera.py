@@ -1,7 +1,5 @@
 """Pinhole cameras: pixels, rays and points (integer pixel = pixel centre, depth is z)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """The rigid components of a solved soup: their pixels and their motions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Depth at the full size of an image: superpixels grown along its edges, planes evaluated there."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

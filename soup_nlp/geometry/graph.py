@@ -1,7 +1,5 @@
 """The segmentation record: anchors, shared boundaries, K-NN and adjacency graphs, weights."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

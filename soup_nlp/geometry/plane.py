@@ -6,8 +6,6 @@ a ray r meets it at depth `Z(r) = 1 / (m . r)`. About an anchor ray a it is
 depth: `1 / Z(r) = (1 + g . (r - a)) / Z`. Leading axes are free.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rotations: exponential and logarithm, Cayley map, nearest rotation."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """Cutting the reference image into connected superpixels."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The surface of a reconstruction: its connected parts, hidden pixels and triangles."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray

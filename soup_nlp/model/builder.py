@@ -1,7 +1,5 @@
 """Kernels and tables of an NLP, collected with its slack variables and constraint rows."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Kernels as machine code: C that is compiled once and cached by content."""
 
-from __future__ import annotations
-
 import atexit
 import hashlib
 import logging

@@ -1,10 +1,8 @@
 """The terms of the energy as kinds of elements: their norms, data columns and views."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import casadi as ca
 import numpy as np
@@ -57,7 +55,7 @@ class Element:
         """Width of every data column."""
         return {k: int(np.prod(v.shape[1:], dtype=int)) for k, v in self.columns.items()}
 
-    def viewed(self, layout: Layout) -> Element:
+    def viewed(self, layout: Layout) -> Self:
         """The element with the columns that a layout's views need."""
         columns = dict(self.columns)
         for a, i in enumerate(self.superpixels.T):

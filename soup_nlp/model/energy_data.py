@@ -1,7 +1,5 @@
 """The numbers of the energy: sampled pixels, graphs, weights. No symbolic expressions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Options of the energy: weights, truncations, units and departures from the paper."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

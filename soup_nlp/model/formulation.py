@@ -1,7 +1,5 @@
 """How the energy is written for a solver: gauge, norm, Hessian, smoothing."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field

@@ -4,8 +4,6 @@ A kernel is the symbolic objective and constraints of ONE element; a table says,
 which variables it reads, which rows of g it adds to, and its data. Nothing here knows the soup.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal, get_args
@@ -124,6 +122,10 @@ def nonzeros(function: ca.Function | None) -> tuple[Int, Int]:
     return np.asarray(row, np.int64), np.asarray(column, np.int64)
 
 
+Blocks = tuple[NDArray[np.integer], Float, NDArray[np.integer]]
+"""(B, nx, width) variables, (B, np, width) data and (B, nc, width) constraint rows."""
+
+
 @dataclass(frozen=True)
 class Table:
     """Elements of one kernel.
@@ -146,10 +148,6 @@ class Table:
         """Index, data and rows in blocks of elements, the indices of a type; see `in_blocks`."""
         index, rows = (in_blocks(part, width, dtype) for part in (self.index, self.rows))
         return index, in_blocks(self.data, width, np.float64), rows
-
-
-Blocks = tuple[NDArray[np.integer], Float, NDArray[np.integer]]
-"""(B, nx, width) variables, (B, np, width) data and (B, nc, width) constraint rows."""
 
 
 def in_blocks(

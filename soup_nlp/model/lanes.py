@@ -5,8 +5,6 @@ The kernel's instructions on the compiler's vectors (GCC, clang), with gathers a
 take a fifth of the time.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,9 +1,7 @@
 """Positions of the soup's variables in the solver's vector: packing, unpacking, names."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import numpy as np
 
@@ -132,7 +130,7 @@ class TangentLayout:
     chart: Chart = "depth"
 
     @classmethod
-    def about(cls, soup: Soup, data: EnergyData, chart: Chart = "depth") -> TangentLayout:
+    def about(cls, soup: Soup, data: EnergyData, chart: Chart = "depth") -> Self:
         """Layout whose base is the soup, its rotations made exactly orthogonal."""
         s = soup.normalised(data.share)
         depth = s.depth_at(data.anchor_ray)

@@ -1,7 +1,5 @@
 """The constrained NLP: matrix rotations, unit normals, visibility."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

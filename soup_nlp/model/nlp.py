@@ -1,10 +1,9 @@
 """The NLP record: kernels, tables, bounds; its functions are made when first asked for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Self
 
 import numpy as np
 from scipy import sparse
@@ -112,7 +111,7 @@ class NLP:
         """Sizes of x, theta and lam_g."""
         return self.nx, len(self.theta), self.ng
 
-    def evaluated(self) -> NLP:
+    def evaluated(self) -> Self:
         """The same, with all its functions made now, so that later timings exclude it."""
         _ = self._first, self._second
         return self

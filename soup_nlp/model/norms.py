@@ -4,8 +4,6 @@ A term of the energy is a sum of `weight * ((1 - leak) min(|vector|, sigma) + le
 exact sum is the energy that is reported; a solver gets a smooth or an epigraph form.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

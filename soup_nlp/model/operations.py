@@ -1,7 +1,5 @@
 """Operations that kernels may have: in C on vectors of elements, in numpy, and in .nl files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Patterns of sparse matrices: the union of many elements' nonzeros, and where each stands."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

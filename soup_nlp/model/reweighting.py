@@ -1,7 +1,5 @@
 """Departures from the paper's weights and graph: in a scene, across components, in pixels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

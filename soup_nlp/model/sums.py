@@ -4,8 +4,6 @@ A kernel is machine code on vectors of eight elements (`lanes`) where a C compil
 its instructions are calls of numpy on blocks of elements (`vectors`).
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ It is what the exports write and what `soup_nlp.nlp` gives to `nlpsol`. Its eval
 the data of all tables are parameters that every call copies; `NLP.value` and the others are fast.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 

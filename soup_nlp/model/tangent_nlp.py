@@ -1,7 +1,5 @@
 """The tangent presolve: nine coordinates per superpixel, linear constraints and visibility."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

@@ -10,8 +10,6 @@ all of them. A row without "sigma" has no truncation; with "pixel", the size of 
 in the paper's unit instead of pixels. `elements` has the rows, `oracle` the same energy in numpy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import casadi as ca

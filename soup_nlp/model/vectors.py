@@ -5,8 +5,6 @@ costs one call of numpy a block. In CasADi's virtual machine, instruction by ins
 by element, a kernel takes four times as long.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any

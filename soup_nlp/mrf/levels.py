@@ -6,8 +6,6 @@ same computation as processing them one after the other. An edge leads from the 
 colour up to that of its higher colour.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

@@ -18,8 +18,6 @@ An edge stores one message, that of the last pass over it. Nodes of one colour a
 batch (:mod:`soup_nlp.mrf.levels`), which changes only the order of floating-point sums.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

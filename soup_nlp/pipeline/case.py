@@ -1,7 +1,5 @@
 """A problem ready for any solver: pair, segmentation, start and energy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

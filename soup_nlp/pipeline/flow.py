@@ -1,7 +1,5 @@
 """The flow of a problem, also behind a layer that stands still before the scene."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

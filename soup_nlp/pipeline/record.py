@@ -1,7 +1,5 @@
 """Records of a case before its solve and of a run after it: inputs, energy, solution, scores."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

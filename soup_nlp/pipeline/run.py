@@ -1,7 +1,5 @@
 """Solve a problem: prepare, solve, refine, reconstruct and evaluate."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

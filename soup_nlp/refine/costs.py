@@ -4,8 +4,6 @@ The sum of the costs of chosen labels equals `oracle.energy` of the soup that th
 same energy as a pairwise MRF, and its terms are those of `model.oracle`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from soup_nlp.arrays import AnyFloat, Float, Int, Mask

@@ -14,8 +14,6 @@ is with the exact energy, at sum(lam) = 1.
 TRW-S starts every round with messages of zero, because nearly all of its labels are new.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

@@ -14,8 +14,6 @@ E. They contradict the flow of a superpixel if, in the soup that followed this f
 samples disagree by more than `CONTRADICTION`, or most samples are not visible.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Options of the refinement, and the records of its rounds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal

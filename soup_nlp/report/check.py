@@ -4,8 +4,6 @@ Energy, constraints, depth and scores are recomputed from the arrays by `evaluat
 shares no code with the solver. Everything else is compared with a SHA-256 or a copy in result.h5.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 Unknown values are grey, which none of the colour scales contains; unusable flow is black.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -3,8 +3,6 @@
 Every writer raises `DataError` if the file cannot be written.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib.resources import files

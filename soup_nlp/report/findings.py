@@ -1,7 +1,5 @@
 """What a run found, how sure that is, what limits it and what to try, in words."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The result folder, written whole or not at all; a run that writes and draws itself."""
 
-from __future__ import annotations
-
 import base64
 import os
 import shutil

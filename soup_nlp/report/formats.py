@@ -1,7 +1,5 @@
 """Files for other programs, by the name of their format, and the motions of a result."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

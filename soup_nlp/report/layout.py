@@ -1,7 +1,5 @@
 """result.h5: one table of its arrays, from which it is written, read and checked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Point clouds as PLY (binary, 1.0), meshes as GLB (glTF 2.0, binary), COLMAP's text model."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """report.html: a result as one page that a browser opens without a network or a server."""
 
-from __future__ import annotations
-
 import base64
 import json
 import zlib

@@ -1,7 +1,5 @@
 """The pictures of a result with titles, and legends with units."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

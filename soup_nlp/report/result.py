@@ -1,7 +1,5 @@
 """A solved pair for pictures, the page and files, from a run in memory or from a result folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """What a run found and how sure that is, as numbers: summary.json and the shares of the verdict."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The printed verdict: findings, accuracy, energies, what concerns the solver, files."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

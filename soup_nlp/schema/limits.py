@@ -1,7 +1,5 @@
 """Limits of input sizes: larger inputs are of no use and would take all memory or time."""
 
-from __future__ import annotations
-
 from soup_nlp.errors import DataError
 
 MAX_SIDE = 20_000

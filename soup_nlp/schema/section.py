@@ -3,8 +3,6 @@
 A validation error becomes a message: where, found, expected, nearest spelling.
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 import reprlib

@@ -1,7 +1,5 @@
 """A chain of solved pairs with a common scale and frame of reference; tracks of components."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import count, pairwise

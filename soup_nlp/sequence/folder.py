@@ -3,8 +3,6 @@
 It holds depth and clouds in one scale, trajectories, a table, a page and a video.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

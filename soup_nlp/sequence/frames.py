@@ -1,7 +1,5 @@
 """Frames of a sequence, of image files, a video or a rendered scene; key frames by parallax."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from contextlib import suppress

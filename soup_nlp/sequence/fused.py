@@ -1,7 +1,5 @@
 """One cloud of the static scene of a sequence, and clouds of its moving components by frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TypeAlias
 

@@ -4,8 +4,6 @@ The page has a 3D view, images and depths with a slider, tables of tracks and li
 2.0, binary) has the static scene, the moving components and the camera.
 """
 
-from __future__ import annotations
-
 import html
 import json
 import struct

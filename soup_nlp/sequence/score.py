@@ -1,7 +1,5 @@
 """Errors of a chain: depth with one scale for all or one for each frame, and the camera path."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

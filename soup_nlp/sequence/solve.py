@@ -1,7 +1,5 @@
 """A sequence from any source, solved into a folder: `soup_nlp.chain` and its command."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ CasADi's own graph of an NLP (`model.symbolic`) takes the data of all tables as 
 which it copies at every call, and takes seconds to build at real sizes. Only theta is one here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Ipopt on an `NLP`: options, progress, interruption, and the best iterate in every case."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Mapping

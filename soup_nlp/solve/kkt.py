@@ -1,7 +1,5 @@
 """KKT points: residuals recomputed in plain numpy, and the multipliers of the presolve's answer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

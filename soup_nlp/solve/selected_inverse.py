@@ -6,8 +6,6 @@ the first layer to the last, and the inverse, restricted to each layer, comes ba
 library's solves for all columns of the inverse cost several times more.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve

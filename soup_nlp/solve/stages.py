@@ -1,7 +1,5 @@
 """Solve from an initialisation: Ipopt in tangent coordinates, then on the constrained NLP."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -9,8 +9,6 @@ a bending surface no motion does. The test does not depend on the number of supe
 components.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,8 +1,7 @@
 """Choice of a motion for every superpixel: candidates, smallest sufficient set, smoothness."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -149,7 +148,7 @@ class Choice:
     noise: float
 
     @classmethod
-    def of(cls, views: Views, motions: list[Motion], label: Int, noise: float) -> Choice:
+    def of(cls, views: Views, motions: list[Motion], label: Int, noise: float) -> Self:
         """Motions by indices (N,), which are numbered by frequency, and their planes."""
         used, inverse, count = np.unique(label, return_inverse=True, return_counts=True)
         order = np.argsort(-count, kind="stable")

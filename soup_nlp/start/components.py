@@ -1,7 +1,5 @@
 """Rigid components of superpixels: connected pieces, borrowed depths, scales by contact."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

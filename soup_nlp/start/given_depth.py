@@ -3,8 +3,6 @@
 See docs/depth_prior.md. `start.prior_evidence` gives the evidence of flow and image for it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

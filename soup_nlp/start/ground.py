@@ -10,8 +10,6 @@ car, but at a depth that is too small. Such an object floats: the ground that is
 lower border is far behind it.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

@@ -9,8 +9,6 @@ scales are equal and all anchors have the same depth, which the paper takes as a
 The result is the unorganised soup.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from soup_nlp.arrays import Float, Mask

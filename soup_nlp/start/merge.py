@@ -5,8 +5,6 @@ a small region equally well with different depths. If its superpixels choose ind
 region falls apart. Flow discontinuities show the outlines of regions more reliably.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from soup_nlp.arrays import Int, Mask

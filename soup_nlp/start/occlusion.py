@@ -6,8 +6,6 @@ their own region they do not look as before. If they part, the area that appears
 belongs to the farther region, and looks like the pixels of that region beside the outline.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

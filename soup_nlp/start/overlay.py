@@ -6,8 +6,6 @@ explains that. The flow of a fixed region contradicts every depth from the groun
 one, to infinity.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import Delaunay
 

@@ -3,8 +3,6 @@
 What hangs in the air covers a surface behind it and touches nothing in front of it.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -6,8 +6,6 @@ of another scene then differs from the right map in one way: shifted or mirrored
 edges of the image as well as in its own place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple

@@ -1,8 +1,7 @@
 """Initial proposal of every superpixel: candidates, choice, planes, scales (paper, Sec. 4.4.1)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -92,7 +91,7 @@ class Start:
     __repr__ = __str__
 
     @classmethod
-    def whole(cls, views: Views, soup: Soup, error: Float, borrowed: Mask, noise: float) -> Start:
+    def whole(cls, views: Views, soup: Soup, error: Float, borrowed: Mask, noise: float) -> Self:
         """A start whose only component and surface is the whole image, without shared motions."""
         zero, none = np.zeros(len(soup), np.int64), np.zeros(len(soup), bool)
         return cls(

@@ -4,8 +4,6 @@ In a traffic jam a group of vehicles may be larger than the road. The road is th
 stands on it, and by its level ground.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from soup_nlp.arrays import Int, Mask

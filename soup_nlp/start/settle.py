@@ -6,8 +6,6 @@ their depths range from a flat scene to one that recedes to infinity. Among them
 depths vary as scenes do is the most probable.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

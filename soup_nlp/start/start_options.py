@@ -1,7 +1,5 @@
 """Options of the initialisation in a problem file."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from soup_nlp.schema.section import NonNegative, Samples, Section, Seed

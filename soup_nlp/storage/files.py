@@ -1,7 +1,5 @@
 """Files: checked reading, JSON and YAML with limits of size and nesting, and writing."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat

@@ -11,8 +11,6 @@ only with `overwrite`. The mark also has the subject of the result, such as the 
 solved.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json

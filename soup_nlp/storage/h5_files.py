@@ -1,7 +1,5 @@
 """Reading of HDF5 files, which rejects links and checks sizes before it allocates memory."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager

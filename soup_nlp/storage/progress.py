@@ -1,7 +1,5 @@
 """Progress of long work: a record of every iteration, its listeners, and interruption."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """Rows of numbers, measured here or by worker processes and stored as JSON lines."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

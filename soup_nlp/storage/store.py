@@ -3,8 +3,6 @@
 `storage.h5_files` reads these files.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The operating system: memory, its errors, streams, signals, processes, temporary folders."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import os

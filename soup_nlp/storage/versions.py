@@ -1,7 +1,5 @@
 """Versions of the program, of its code and of the packages that it uses."""
 
-from __future__ import annotations
-
 import hashlib
 import platform
 from functools import cache

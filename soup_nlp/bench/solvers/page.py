@@ -1,7 +1,5 @@
 """The page of a comparison of solvers: conclusion, tables, performance profiles, limits."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict

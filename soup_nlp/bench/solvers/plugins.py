@@ -1,7 +1,5 @@
 """Task and answer of a solver; CasADi's plug-ins and programs that read .nl as solvers."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -3,8 +3,6 @@
 Solvers are CasADi's plug-ins, programs that read .nl, and this package.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import platform

@@ -1,7 +1,5 @@
 """KITTI stereo/flow 2012 and scene flow 2015, Virtual KITTI 1 and 2, MPI Sintel, in metres."""
 
-from __future__ import annotations
-
 import re
 from typing import Annotated, Literal
 

@@ -3,8 +3,6 @@
 Each needs the two images and the camera. The truth is None without its file, and NaN where unknown.
 """
 
-from __future__ import annotations
-
 import re
 from contextlib import suppress
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shared parts of the kinds of input: base class, folder of a dataset, pair of images."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ smaller part have an unavoidable re-projection error and the depth of the other 
 are moved to the neighbouring superpixel with their flow. The flow of a superpixel is an affine fit.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

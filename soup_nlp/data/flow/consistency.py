@@ -6,8 +6,6 @@ at most half as much as without a flow (16 pairs, rendered and real); with a wro
 more.
 """
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -7,8 +7,6 @@ displacements are small. The new flow is used where its round trip closes better
 What still has no flow may be small surfaces that move far (`soup_nlp.data.flow.tiles`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

@@ -6,8 +6,6 @@ visible when the gradients that both images share at the same pixel are removed.
 scene is then searched along the epipolar lines of the rigid motion of the remaining flow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import product
 

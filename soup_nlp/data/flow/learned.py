@@ -1,7 +1,5 @@
 """Flow and depth of a trained network in an ONNX file (extra `onnx`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

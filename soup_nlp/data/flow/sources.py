@@ -4,8 +4,6 @@ A plug-in is a function `(image_ref, image_next) -> Flow` that an installed pack
 entry point of the group `soup_nlp.flow`; the name of the entry point is the name of the source.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from functools import partial

@@ -8,8 +8,6 @@ its round trip on most of their area, and it ends where no flow known before end
 rejects what is hidden in the next image: what looks like it there is mostly explained already.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

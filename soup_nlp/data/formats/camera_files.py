@@ -4,8 +4,6 @@ All intrinsics are (3, 3), in pixels. Every reader raises `DataError` for a file
 another kind, or without a valid camera.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Any

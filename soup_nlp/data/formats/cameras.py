@@ -1,7 +1,5 @@
 """Intrinsics of pictures: estimated where no file gives them, and checked for plausibility."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Mapping, Sequence

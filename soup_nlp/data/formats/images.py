@@ -3,8 +3,6 @@
 Every reader raises `DataError` for a file that is missing, empty, truncated or of another kind.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import warnings

@@ -8,8 +8,6 @@ Every reader raises `DataError` for a file that is missing, empty, of another fo
 impossible size, or longer or shorter than its header says.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import struct

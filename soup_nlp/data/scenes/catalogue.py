@@ -4,8 +4,6 @@ Scenes are laid out in level coordinates: x right, y down, z forward, the ground
 truth of the rendered pair is in the usual coordinates, those of the reference camera, in metres.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from soup_nlp.arrays import Float

@@ -3,8 +3,6 @@
 Layouts are those of `soup_nlp.data.scenes.catalogue`; some read the seed as a choice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

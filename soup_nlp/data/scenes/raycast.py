@@ -6,8 +6,6 @@ labels and visibility are computed at pixel centres in closed form; only colour 
 pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -114,7 +112,7 @@ class Scene:
         out[[b.bends for b in self.bodies]] = np.nan
         return out
 
-    def advanced(self, steps: int) -> Scene:
+    def advanced(self, steps: int) -> "Scene":
         """The scene `steps` frames later; camera and bodies repeat their motion of one frame.
 
         Raises:

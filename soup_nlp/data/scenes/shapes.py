@@ -5,8 +5,6 @@ shapes (`material` of one, `place` of the other). For all others they are the co
 shape.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 import numpy as np

@@ -5,8 +5,6 @@ rendered pair therefore have the same colours at corresponding points (brightnes
 the sampling by pixels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

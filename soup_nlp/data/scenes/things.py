@@ -1,7 +1,5 @@
 """Elements of rendered scenes: poses, colours, textures; rooms, vehicles, trees, people."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
