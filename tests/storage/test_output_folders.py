@@ -246,7 +246,11 @@ def test_a_failure_log_overwrites_only_where_allowed(tmp_path):
         ("chain scene:orbit", "chain.json"),
     ],
 )
-def test_files_of_the_user_are_refused_before_anything_is_computed(command, name, tmp_path, capsys):
+def test_files_of_the_user_are_refused_before_anything_is_computed(
+    command, name, tmp_path, monkeypatch, capsys
+):
+    for begin in ("data.pair.Pair.__post_init__", "storage.rows._measured"):
+        monkeypatch.setattr(f"soup_nlp.{begin}", None)
     (tmp_path / name).write_text("mine")
     assert main([*command.split(), "-o", str(tmp_path)]) == 2
     error = " ".join(capsys.readouterr().err.split())

@@ -14,12 +14,13 @@ from soup_nlp.errors import DataError
 from soup_nlp.storage.rows import ONE_THREAD, Job, append_row, attempt, measure_all, read_rows
 from soup_nlp.storage.versions import code_version
 
-pytestmark = pytest.mark.slow
 
-
-def test_a_row_is_plain_json():
+def test_a_row_is_plain_json(monkeypatch):
+    clock = iter([10.0, 12.5])
+    monkeypatch.setattr("time.process_time", lambda: next(clock))
     row = attempt(lambda: {"a": np.float64(np.nan), "b": [np.int64(3), float("inf")], "c": (1.5,)})
     assert (row["a"], row["b"], row["c"], row["ok"]) == (None, [3, None], [1.5], True)
+    assert row["cpu_seconds"] == 2.5
     json.dumps(row, allow_nan=False)
 
 
@@ -34,7 +35,7 @@ def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
 
     def counted(scene):
         seen.append(scene)
-        return fake_row(scene)
+        return fake_row(scene) | {"number": len(seen)}
 
     def jobs(seed=0):
         return fake_jobs(seed, counted)
@@ -59,6 +60,8 @@ def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
     assert seen[5:] == ["orbit"]
     measure_all([replace(jobs(1)[0], stale=True)], path)
     assert seen[6:] == ["orbit"]
+    # of several rows of a name the last one counts
+    assert [row["number"] for row in measure_all(jobs(1)[:1], path)] == [7]
 
 
 def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
@@ -82,6 +85,7 @@ def found_by_children(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(Path(square.__code__.co_filename).parent), os.pathsep)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("found_by_children")
 def test_rows_of_new_processes(tmp_path, monkeypatch):
     for name in ONE_THREAD:
@@ -98,6 +102,7 @@ def test_rows_of_new_processes(tmp_path, monkeypatch):
     assert "out of numbers" in failed["error"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("found_by_children")
 def test_parallel_processes_and_a_process_that_dies(tmp_path):
     path = tmp_path / "rows.jsonl"

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import write_text
+from soup_nlp.storage.files import read_json, write_text
 from soup_nlp.storage.h5_files import read_attrs, read_h5
 from soup_nlp.storage.store import parse_table, require, write_h5, write_json
-from soup_nlp.storage.versions import versions
+from soup_nlp.storage.versions import code_version, versions
 
 
 def tree():
@@ -131,7 +131,7 @@ def test_json(tmp_path):
     path = tmp_path / "a.json"
     obj = {
         "f": np.float32(0.5),
-        "i": np.int64(3),
+        "i": np.int64(2**63 - 1),
         "b": np.bool_(True),
         "nan": float("nan"),
         "inf": np.float64(-np.inf),
@@ -151,7 +151,7 @@ def test_json(tmp_path):
     back = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
     assert back == {
         "f": 0.5,
-        "i": 3,
+        "i": 2**63 - 1,
         "b": True,
         "nan": None,
         "inf": None,
@@ -163,6 +163,7 @@ def test_json(tmp_path):
         "text": "ä",
         "3": None,
     }
+    assert read_json(path, "file") == back
 
 
 def test_versions():
@@ -170,6 +171,17 @@ def test_versions():
     assert " ".join(out) == "soup_nlp python casadi numpy scipy opencv skimage h5py"
     assert out["numpy"] == np.__version__
     assert "unknown" not in out.values()
+
+
+def test_the_code_version_is_that_of_every_source(tmp_path, monkeypatch):
+    monkeypatch.setattr("soup_nlp.storage.versions.__file__", str(tmp_path / "room" / "a.py"))
+    seen = {code_version.__wrapped__()}
+    for name in ("a.py", "b.py", "room.py", "room/a.py"):
+        (tmp_path / "room").mkdir(exist_ok=True)
+        for text in ("1", "2"):
+            (tmp_path / name).write_text(text)
+            seen.add(code_version.__wrapped__())
+    assert len(seen) == 9
 
 
 def test_text_of_names_that_are_no_utf8_is_written(tmp_path):
