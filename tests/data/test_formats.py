@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers_files import put, raises, write_cam, write_dpt, write_kitti_flow
+from PIL import Image
 
 from soup_nlp.data.formats import camera_files
 from soup_nlp.data.formats import map_files as fmt
@@ -217,10 +218,10 @@ def test_pfm_golden_bytes(tmp_path: Path, scale: bytes, order: str, comment: byt
 
 
 def test_kitti_disparity_and_vkitti_depth(tmp_path: Path) -> None:
-    path = stored(tmp_path / "a.png", np.array([[0, 256, 384, 65535]], np.uint16))
+    path = stored(tmp_path / "a.png", np.array([[0, 256, 65534, 65535]], np.uint16))
     disparity = fmt.read_depth_png16(path, fmt.KITTI_DISPARITY)
-    np.testing.assert_array_equal(disparity, [[np.nan, 1.0, 1.5, 65535 / 256]])
-    np.testing.assert_array_equal(fmt.read_vkitti_depth(path), [[np.nan, 2.56, 3.84, np.nan]])
+    np.testing.assert_array_equal(disparity, [[np.nan, 1.0, 65534 / 256, 65535 / 256]])
+    np.testing.assert_array_equal(fmt.read_vkitti_depth(path), [[np.nan, 2.56, 655.34, np.nan]])
 
 
 # --- cameras ------------------------------------------------------------------------------------
@@ -234,6 +235,9 @@ def test_cameras(tmp_path: Path) -> None:
         np.testing.assert_array_equal(camera_files.read_intrinsics(path), K)
     path = put(tmp_path / "K.txt", b"80 80 47.5 31.5 0 0 0 0 0")
     assert camera_files.read_intrinsics(path)[0, 0] == 80
+    # coefficients of distortion that have no entry are 0
+    path = put(tmp_path / "K.yaml", b"fx: 80\nfy: 80\ncx: 47.5\ncy: 31.5\np1: 0.01")
+    assert camera_files.read_camera(path)[1].tolist() == [0, 0, 0.01]
 
 
 def test_kitti_projections(tmp_path: Path) -> None:
@@ -267,6 +271,9 @@ def test_image_kinds(tmp_path: Path) -> None:
     with_alpha = np.dstack([bgr, np.zeros((6, 5), np.uint8)])
     for content, image in ((bgr, rgb), (with_alpha, rgb), (rgb[:, :, 0], grey)):
         np.testing.assert_array_equal(read_image(stored(path, content)), image)
+    # a format that OpenCV does not read
+    Image.fromarray(rgb).save(tmp_path / "a.pcx")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.pcx"), rgb)
     out = read_image(stored(path, bgr.astype(np.uint16) * 257), white=65535)
     np.testing.assert_array_equal(out, rgb)
     assert out.dtype == np.uint8

@@ -6,6 +6,7 @@ import warnings
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -97,6 +98,11 @@ SENSOR = {"FocalPlaneXResolution": 4438.36, "FocalPlaneResolutionUnit": 2}
         ({"FocalLength": 18.0, **SENSOR, "ExifImageWidth": 640}, 1.2, "times the longer side"),
         # a picture of the whole sensor, 22.25 mm
         ({"FocalLength": 18.0, **SENSOR, "ExifImageWidth": 3888}, 18 / 22.25, "from EXIF"),
+        (
+            {"FocalLength": 18.0, **SENSOR, "ExifImageWidth": 3888, "ExifImageHeight": (1, 2)},
+            18 / 22.25,
+            "from EXIF",
+        ),
         # a cropped picture has other sides than EXIF
         (
             {"FocalLength": 18.0, **SENSOR, "ExifImageWidth": 3888, "ExifImageHeight": 1000},
@@ -121,7 +127,7 @@ SENSOR = {"FocalPlaneXResolution": 4438.36, "FocalPlaneResolutionUnit": 2}
     ],
 )
 def test_a_plausible_focal_length_of_exif_is_taken(
-    tags: dict[str, float], focal: float, word: str, tmp_path: Path
+    tags: dict[str, Any], focal: float, word: str, tmp_path: Path
 ) -> None:
     for name in "ab":
         photo(tmp_path / f"{name}.jpg", **tags)
