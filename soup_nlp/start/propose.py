@@ -130,19 +130,18 @@ def propose(flow: FlowFit) -> Start:
     surface = surfaces(flow)
     motions, bends = surface_motions(flow, surface)
     bends &= o.bending
-    choice = gather(flow, rigid_choice(flow, motions))
-    turn = None if bends.all() else turn_alone(flow, choice)
-    if turn is not None or bends.all():
+    # the flow of bending regions is no evidence of the motions of rigid ones
+    rigid = flow.without(bends)
+    choice = None if bends.all() else gather(rigid, rigid_choice(rigid, motions))
+    turn = None if choice is None else turn_alone(rigid, choice)
+    if choice is None or turn is not None:
         soup, error = constant_depth(flow.views, turn)
         every = np.ones(len(seg), bool)
         start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
+        shared = [] if choice is None else choice.motions
         at_rest = turn is not None
-        return replace(start, motions=choice.motions, surface=surface, bends=every, at_rest=at_rest)
-    rigid = flow.without(bends)
-    if bends.any():
-        # the flow of bending regions is no evidence of the motions of rigid ones
-        choice = gather(rigid, rigid_choice(rigid, motions))
-    else:
+        return replace(start, motions=shared, surface=surface, bends=every, at_rest=at_rest)
+    if not bends.any():
         surface = connected_labels(flow.jump < o.discontinuity_px, seg)
     choice, wrong = earned(rigid, choice)
     choice = settle(rigid, choice)
