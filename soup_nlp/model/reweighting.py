@@ -157,7 +157,7 @@ def with_prior(
 
 
 def with_order(
-    data: EnergyData, soup: Soup, order: Float, most: Float, weight: float
+    data: EnergyData, soup: Soup, order: Float, placed: Mask, weight: float
 ) -> EnergyData:
     """The same data with E_order where it is known which superpixel of a pair is in front.
 
@@ -167,13 +167,12 @@ def with_order(
         data: Data of the pair.
         soup: Start.
         order: (P,) probability of the order, signed as `EnergyData.order_weight`.
-        most: (N,) largest step of a superpixel that is asked for, 0 where none is.
+        placed: (N,) True where the steps of the start are asked for.
         weight: Of a sure order.
     """
     z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
     step = np.where(order > 0, z[0] / z[1], z[1] / z[0]) - 1
-    # the largest step decides, also where it is 0
-    step = np.clip(step, LEAST_STEP, most[data.pairs].max(axis=1))
+    step = np.where(placed[data.pairs].any(axis=1), np.maximum(step, LEAST_STEP), 0.0)
     return replace(data, order_weight=weight * order, order_step=step)
 
 

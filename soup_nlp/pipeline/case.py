@@ -53,9 +53,6 @@ from soup_nlp.storage.system import require_memory
 PRIOR_OVER_GROUND = 10.0
 """Factor of E_prior between two superpixels with borrowed depth over a known ground, where it holds
 the relief of the initialisation."""
-MOST_STEPS = 0.35, 3.0
-"""Largest step of inverse depth that E_order holds around what occlusion places, a guess, and
-around what contact would make too fast."""
 OCCLUSION_GAP = 0.1
 """Relative gap in depth, in the initialisation, from which one component occludes another."""
 
@@ -240,9 +237,8 @@ def build_energy(
     data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * prior_weight)
     parts = start.component
     if start.order is not None and e.weights.order > 0:
-        known = [start.tie == TIES.index("occlusion"), start.tie == TOO_FAST]
-        most = np.select(known, MOST_STEPS, 0.0)
-        data = with_order(data, start.soup, start.order, most, start.noise)
+        placed = np.isin(start.tie, [TIES.index("occlusion"), TOO_FAST])
+        data = with_order(data, start.soup, start.order, placed, start.noise)
     if given_depth is not None and given_depth.evidence.used:
         # the flow holds no slopes where the prior decides: E_orient does, as in bending regions
         stiffer = np.where(bends, 1.0, bending.orient / max(e.weights.orient, 1e-12))
