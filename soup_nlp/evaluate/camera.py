@@ -8,7 +8,8 @@ nearly any flow. See docs/confidence.md.
 import numpy as np
 
 from soup_nlp.arrays import Float
-from soup_nlp.start.epipolar import FOCAL_NOISE_PX, Matches, essential_motion, refine_near
+from soup_nlp.start.epipolar import Matches, essential_motion, refine_near
+from soup_nlp.start.focal_length import NOISE_PX
 
 KINDS = {
     "focal length": 0.3,
@@ -64,7 +65,7 @@ def camera_errors(matches: Matches) -> tuple[Float, str | None]:
             # the error in pixels of the corrected camera
             focal = matches.focal * np.exp(step * sigma * (kind == "focal length"))
             tried = Matches(*rays, matches.weight, focal)
-            near = refine_near(motion, tried, FOCAL_NOISE_PX)
+            near = refine_near(motion, tried, NOISE_PX)
             error[j] = np.median(np.abs(tried.distance(near)))
         rise = (error - error.min()) / max(RISE * error.min(), LEAST_RISE_PX)
         given = rise[len(STEPS) // 2]

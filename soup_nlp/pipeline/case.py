@@ -39,7 +39,7 @@ from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.components import TIES, TOO_FAST
-from soup_nlp.start.epipolar import focal_length
+from soup_nlp.start.focal_length import focal_length
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.ground import off_ground
 from soup_nlp.start.occlusion import in_order

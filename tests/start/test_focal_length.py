@@ -9,7 +9,8 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.geometry import rotation
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.start.epipolar import Matches, focal_length
+from soup_nlp.start.epipolar import Matches
+from soup_nlp.start.focal_length import focal_length
 
 FOCAL = 500.0
 
