@@ -1,15 +1,21 @@
 """What every test file shares."""
 
 import gc
-from functools import lru_cache
+import hashlib
+import pickle
+from collections.abc import Callable
+from functools import lru_cache, wraps
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
+from soup_nlp.data.flow import sources
 from soup_nlp.data.scenes import catalogue
+from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run
 from soup_nlp.pipeline.run import make_run, skipped
@@ -21,8 +27,24 @@ settings.load_profile("fixed")
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 
 
-# a scene that many tests want is rendered once: test files import this function later
-inputs.render_scene = catalogue.render_scene = lru_cache(maxsize=32)(catalogue.render_scene)
+def once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, computed once for the same arguments; every call gets a copy of the result."""
+    known: dict[bytes, bytes] = {}
+
+    @wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        key = hashlib.sha256(pickle.dumps((arguments, options))).digest()
+        if key not in known:
+            known[key] = pickle.dumps(function(*arguments, **options))
+        return pickle.loads(known[key])
+
+    return call
+
+
+# what many tests want is computed once: test files import these functions later. Tests of the
+# flow and of the start itself call the modules where they are defined
+inputs.render_scene = catalogue.render_scene = lru_cache(maxsize=64)(catalogue.render_scene)
+sources.dis_flow, pipeline_case.propose = once(sources.dis_flow), once(pipeline_case.propose)
 
 
 def pytest_collection_finish() -> None:
