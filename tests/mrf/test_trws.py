@@ -124,6 +124,9 @@ def test_levels_are_colours_and_hold_every_edge_twice(seed):
     assert (colour[edges[:, 0]] != colour[edges[:, 1]]).all()
     degree = np.bincount(edges.ravel(), minlength=n).max() if len(edges) else 0
     assert colour.max() <= degree
+    for v in range(n):
+        beside = edges[(edges == v).any(axis=1)].ravel()
+        assert {*range(colour[v])} <= {*colour[beside].tolist()}
     plan = plan_levels(colour, edges)
     assert sorted(np.concatenate([p.nodes for p in plan]).tolist()) == list(range(n))
     assert all((colour[p.nodes] == k).all() for k, p in enumerate(plan))
