@@ -239,8 +239,11 @@ def parse_yaml(
             return loader.construct_document(node)
         finally:
             loader.dispose()
-    except (yaml.YAMLError, RecursionError, TypeError) as problem:
+    except (yaml.YAMLError, RecursionError) as problem:
         raise ValueError(printable(problem)) from problem
+    except (TypeError, AttributeError, LookupError) as problem:
+        # PyYAML does not check what has a tag: `!!bool 5`, `!!timestamp x`, `!!int [1]`
+        raise ValueError(f"a value does not fit its tag: {printable(problem)}") from problem
 
 
 # --- writing ------------------------------------------------------------------------------------

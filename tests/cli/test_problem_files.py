@@ -46,6 +46,9 @@ def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path):
     assert (problem.seed, problem.name, problem.output.min_confidence) == (10, "no", 1e-3)
 
 
+OF_ANOTHER_TAG = ("!!bool 5", "!!timestamp x", "!!int [1]", "!!float [1]")
+
+
 @pytest.mark.parametrize(
     ("text", "parts"),
     [
@@ -72,6 +75,7 @@ def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path):
         (MOTORCYCLE + "seed: 1\nseed: 2\n", ["given twice", "line 3", "found: seed"]),
         ("- 1\n", ["must be a mapping", "found: list"]),
         ("a: [\n", ["not YAML", "line 2"]),
+        *((f"a: {value}\n", ["not YAML", "does not fit its tag"]) for value in OF_ANOTHER_TAG),
     ],
 )
 def test_an_error_says_where_it_is_and_what_was_expected(text, parts, tmp_path):
