@@ -1,7 +1,5 @@
 """The focal length of a guessed camera, from the flow."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from soup_nlp.start.epipolar import Matches, essential_motion, refine_near
