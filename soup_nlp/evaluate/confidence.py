@@ -125,6 +125,11 @@ def flow_misfit(rec: Reconstruction, flow: Flow, most: Float | float = MOST_MISF
     return np.asarray(np.bincount(flat, limited.ravel()) / np.bincount(flat))
 
 
+def _log(depth: Float) -> Float:
+    """Logarithm of depth; finite, since the answer of a foreign solver may have none."""
+    return np.log(np.clip(np.nan_to_num(depth), 1e-30, 1e30))
+
+
 def at_outlines(depth: Float) -> Float:
     """(H, W) standard deviation of log depth because outlines of surfaces may be misplaced.
 
@@ -134,8 +139,7 @@ def at_outlines(depth: Float) -> Float:
     Args:
         depth: (H, W) depth.
     """
-    # the answer of a foreign solver may have no depth
-    log_depth = np.log(np.clip(np.nan_to_num(depth), 1e-30, 1e30))
+    log_depth = _log(depth)
     reach = max(1, round(OUTLINE_REACH * max(depth.shape)))
 
     def extent(r: int) -> Float:
@@ -209,21 +213,16 @@ def with_prior(sigma: Float, prior: Float | float = SIGMA_PRIOR) -> Float:
 def by_start(rec: Reconstruction, start: Start, anchor_ray: Float) -> Float:
     """(N,) standard deviation of log depth because two estimates from the same flow differ.
 
-    The answer balances all terms, the initialisation triangulates with the motion of the component.
-    Their log ratio counts without its median in the component, 0 where regions bend: there the
-    initialisation is rough.
+    The answer balances all terms; the initialisation triangulates with motions of the flow alone.
+    The log ratio of their depths counts without its median in the component. It is 0 where regions
+    bend, since the initialisation is rough there.
 
     Args:
         rec: The answer.
         start: The initialisation.
         anchor_ray: (N, 3) rays through the anchors.
     """
-    answer, first = (
-        # the answer of a foreign solver may have no depth
-        np.log(np.clip(np.nan_to_num(soup.depth_at(anchor_ray)), 1e-30, 1e30))
-        for soup in (rec.soup, start.soup)
-    )
-    ratio = answer - first
+    ratio = _log(rec.soup.depth_at(anchor_ray)) - _log(start.soup.depth_at(anchor_ray))
     middle = ndimage.median(ratio, start.component, np.arange(int(start.component.max()) + 1))
     return np.where(start.bends, 0.0, np.abs(ratio - np.asarray(middle)[start.component]))
 
