@@ -4,6 +4,7 @@ import ast
 import re
 import runpy
 import shutil
+import textwrap
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -265,6 +266,15 @@ class WiderProblem(Problem):
 
     input: Annotated[Input | NpzInput, Field(discriminator="kind")]
     """What to solve, by its kind."""
+
+
+def test_the_recipe_of_a_term_shows_the_code():
+    recipe = (ROOT / "docs" / "adding.md").read_text().split("\n## ")[1]
+    source = "".join(path.read_text() for path in (ROOT / "soup_nlp" / "model").glob("*.py"))
+    shown = re.findall(r"```python\n(.*?)\n *```", recipe, re.DOTALL)
+    assert len(shown) == 4
+    for block in map(textwrap.dedent, shown):
+        assert block in source or textwrap.indent(block, "    ") in source
 
 
 def test_a_dataset_is_a_section_that_loads_itself(tmp_path):
