@@ -60,7 +60,7 @@ PresetName = Annotated[
     str | None, in_method(f"Options below the problem's own: {', '.join(PRESETS)}.")
 ]
 Out = Annotated[Path, in_output("Output folder.", "--out", "-o")]
-Quiet = Annotated[bool, in_output("Print no progress.", "--quiet", "-q")]
+Quiet = Annotated[bool, in_output("Print no progress, only warnings.", "--quiet", "-q")]
 OTHERS = "Also over files of others, or the result of another input."
 Overwrite = Annotated[bool, in_output(OTHERS, "--overwrite")]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
@@ -136,11 +136,23 @@ def sizes(
 
 
 def camera(text: str | None) -> list[float] | str | None:
-    """Value of the key `intrinsics`: numbers, or the name of a file; None without a text."""
+    """Value of the key `intrinsics`: numbers, or the name of a file; None without a text.
+
+    Raises:
+        ConfigError: there are not four numbers.
+    """
     try:
-        return text if text is None else [float(x) for x in text.split(",")]
+        numbers = [] if text is None else [float(x) for x in text.split(",")]
     except ValueError:
         return text
+    if numbers and len(numbers) != 4:
+        raise ConfigError(
+            "intrinsics are not four numbers",
+            where="--intrinsics",
+            found=text,
+            expected="fx,fy,cx,cy in pixels, or a file, which may hold distortion as well",
+        )
+    return numbers or None
 
 
 @contextmanager
@@ -270,17 +282,17 @@ class SolveLog(logging.Handler):
 
     def _warn(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         if issubclass(category, DataWarning):
-            self._announce_once(f"warning: {message}")
+            self._announce_once(f"warning: {message}", warning=True)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message of the logger of the package, unless it was printed before."""
         self._announce_once(record.getMessage())
 
-    def _announce_once(self, line: str) -> None:
+    def _announce_once(self, line: str, warning: bool = False) -> None:
         if line not in self._announced:
             self._announced.add(line)
             self.lines.append(line)
-            self._print(line)
+            self._print(line, even_if_quiet=warning)
 
     def interrupted(self, line: str) -> None:
         """Print a line from a signal handler, where Python's streams cannot be used."""
@@ -293,8 +305,8 @@ class SolveLog(logging.Handler):
         self._step, self._done = "", 0
         self._bars.reset(self._task, total=total, description=name, it="")
 
-    def _print(self, line: str) -> None:
-        if not self.quiet:
+    def _print(self, line: str, even_if_quiet: bool = False) -> None:
+        if even_if_quiet or not self.quiet:
             self.console.print(line, markup=False, soft_wrap=True)
 
 

@@ -4,6 +4,7 @@ import webbrowser
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import numpy as np
@@ -34,7 +35,7 @@ from soup_nlp.sequence.folder import (
 )
 from soup_nlp.sequence.frames import depth_files
 from soup_nlp.sequence.score import score, score_lines
-from soup_nlp.storage.files import is_folder
+from soup_nlp.storage.files import is_file, is_folder
 
 
 def check(
@@ -48,6 +49,12 @@ def check(
         claims = list(check_chain(folder))
         print("\n".join(f"{'ok  ' if ok else 'FAIL'} {text}" for text, ok in claims))
         good, claim = all(ok for _, ok in claims), "claim"
+    elif is_file(folder) and folder.suffix != ".sol":
+        raise DataError(
+            "nothing that can be checked",
+            where=folder,
+            expected="the folder of a result, an export's answer (.sol)",
+        )
     elif is_folder(folder) or folder.suffix != ".sol":
         report = check_folder(folder)
         print(report)
@@ -102,14 +109,14 @@ def import_(
             "the answer is no soup: its energy or residuals are not finite",
             where=sol,
             found=imported.sol.headline or None,
-            hint=f"soup-nlp check {sol} says what is wrong with it",
+            hint=f"soup-nlp check {quote(str(sol))} says what is wrong with it",
         )
     # answers of several solvers do not replace each other
     target = out or folder / ("result" if sol.stem == "soup" else f"result-{sol.stem}")
     prepare_folder(target, run.problem.input_paths(), overwrite, run.problem.subject)
     text = foreign_verdict(imported)
     write_folder(target, run, f"{imported.sol.message}\n{text}\n", text, overwrite=overwrite)
-    print(f"{text}\nfiles       {target}/\nnext        soup-nlp check {target}")
+    print(f"{text}\nfiles       {target}/\nnext        soup-nlp check {quote(str(target))}")
     return options.finish(s.converged, f"the answer is {'' if s.converged else 'not '}verified")
 
 

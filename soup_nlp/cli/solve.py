@@ -20,7 +20,7 @@ from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import exit_code, verdict
 from soup_nlp.sequence.folder import CHAIN, SINGLE
-from soup_nlp.sequence.frames import IMAGES, Frames
+from soup_nlp.sequence.frames import IMAGES, VIDEOS, Frames
 from soup_nlp.sequence.score import chain_lines
 from soup_nlp.sequence.solve import AUTO, named, solve_chain
 from soup_nlp.storage.files import as_path, is_file, read_json
@@ -89,7 +89,7 @@ def solve(
     }
     pair = {key: value for key, value in pair_options.items() if value is not None}
     words = source or []
-    if len(words) == 1 and words[0].suffix.lower() not in IMAGES:
+    if len(words) == 1 and words[0].suffix.lower() not in (*IMAGES, *VIDEOS):
         chosen = _from_file(words[0], pair, changes)
     else:
         chosen = _from_images(words, pair, changes)
@@ -115,12 +115,14 @@ def _from_file(problem: Path, pair: Mapping[str, Any], changes: Sequence[str]) -
 def _from_images(words: Sequence[Path], pair: Mapping[str, Any], changes: Sequence[str]) -> Problem:
     """The problem of two images."""
     if len(words) != 2 or not all(w.suffix.lower() in IMAGES or is_file(w) for w in words):
-        hint = "soup-nlp demo solves two pairs that come with the package"
+        sequence = len(words) > 2 or any(w.suffix.lower() in VIDEOS for w in words)
+        chain_hint = "soup-nlp chain solves videos and more than two images"
+        demo_hint = "soup-nlp demo solves two pairs that come with the package"
         raise ConfigError(
             "a pair is two images",
             found=", ".join(map(str, words)) or "no image and no problem",
             expected="soup-nlp solve REF NEXT, or soup-nlp solve PROBLEM",
-            hint="soup-nlp chain solves more than two frames" if len(words) > 2 else hint,
+            hint=chain_hint if sequence else demo_hint,
         )
     ref, following = words
     reference = as_path(ref, "reference image", home=True).absolute()
@@ -230,7 +232,7 @@ def chain(
         names = ", ".join(Path(file).name for file in sequence.names)
         spacing = f", far enough apart: {names}" if stride == AUTO else ""
         if not quiet:
-            print(f"{len(sequence)} frames{spacing}; {pairs} pairs to solve", file=sys.stderr)
+            print(f"{len(sequence)} frames{spacing}; pairs to solve: {pairs}", file=sys.stderr)
 
     short = options.sizes(superpixels, neighbours, max_size)
     kept = options.resumable("the pairs that were finished are kept", f"{out}/pairs")

@@ -25,7 +25,7 @@ from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
 from soup_nlp.schema.section import Keys, Positive, Samples, Section, Seed, Share, explain, nearest
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.start.start_options import StartOptions
-from soup_nlp.storage.files import MOST_YAML, as_path, is_file, read_text
+from soup_nlp.storage.files import MOST_YAML, as_path, is_file, is_folder, read_text
 
 LONGEST_NAME = 100
 """Characters of a problem's name."""
@@ -207,11 +207,18 @@ def _find(path: Path) -> tuple[Path, Path]:
     """A problem file, and the folder that its relative paths start from.
 
     Raises:
-        ConfigError: it is a bare name that no problem of the package has.
+        ConfigError: it is a folder, or a bare name that no problem of the package has.
     """
-    if is_file(path) or path.suffix or len(path.parts) != 1:
+    bare = len(path.parts) == 1 and not path.suffix and not is_file(path)
+    shipped = shipped_problems() if bare else {}
+    if is_folder(path) and path.name not in shipped:
+        raise ConfigError(
+            "a problem is a file, not a folder",
+            where=path,
+            hint="soup-nlp chain FOLDER solves its frames, soup-nlp solve REF NEXT two images",
+        )
+    if not bare:
         return path, Path(os.path.realpath(path)).parent
-    shipped = shipped_problems()
     if path.name not in shipped:
         raise ConfigError(
             "neither a problem file nor a problem that comes with the package",

@@ -36,8 +36,9 @@ class PriorOptions(Section):
     source: str | None = None
     """File of a depth (.npy .pfm .dpt, 16-bit .png) or of a network (.onnx); null for no prior."""
     kind: Literal["metric", "relative", "inverse", "ordinal"] | None = None
-    """Values: depth in the unit of length, depth up to scale, inverse depth up to scale and shift,
-    or numbers that only rise with depth; null to find out by the flow, else depth up to scale."""
+    """What the values are: metric (depth in the unit of length), relative (depth up to scale),
+    inverse (inverse depth up to scale and shift) or ordinal (numbers that only rise with depth);
+    null to find out by the flow, and relative where it does not tell."""
 
     def load(self, pair: Pair, path: Resolve) -> Pair:
         """The pair with the prior of the source, if there is one.
@@ -114,6 +115,13 @@ class FilesInput(FramesInput):
         def depth(name: str | None) -> Float | None:
             return None if name is None else read_depth(path(name), self.depth_scale)
 
+        if self.intrinsics is not None and self.fov is not None:
+            raise ConfigError(
+                "two cameras are given",
+                where="input",
+                found="intrinsics and fov",
+                expected="one of them",
+            )
         no_file = not isinstance(self.intrinsics, str)
         if self.undistort and (no_file or self.depth or self.depth_next):
             raise ConfigError(

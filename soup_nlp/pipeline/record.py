@@ -142,7 +142,7 @@ class Run(Case):
                 f"  {'good' if self.good else 'not good'}: {s.status}, E"
                 f" {s.energy_start['total']:.5g} -> {energy:.5g}, delivered by {source}",
                 f"  {self.reconstruction}",
-                f"  camera {parts.camera}; {len(parts) - 1} components beside the background",
+                f"  camera {parts.camera}; components beside the background: {len(parts) - 1}",
                 f"  {scores}",
             ]
         )

@@ -1,5 +1,6 @@
 """The printed verdict: findings, accuracy, energies, what concerns the solver, files."""
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -58,9 +59,11 @@ def verdict(
     details: bool = True,
 ) -> str:
     """Facts, files, next command and exit code; see `facts`."""
-    look = [f"look        soup-nlp view {folder}"] if PAGE in files else []
+    # the commands can be pasted into a shell
+    quoted = shlex.quote(str(folder))
+    look = [f"look        soup-nlp view {quoted}"] if PAGE in files else []
     lines = [f"files       {folder}/: {', '.join(files)}", *look]
-    lines.append(f"next        soup-nlp check {folder}")
+    lines.append(f"next        soup-nlp check {quoted}")
     code, why = exit_code(run, limit)
     return "\n".join([facts(run, limit, details), *lines, f"exit code   {code}: {why}"])
 

@@ -113,6 +113,7 @@ def find_images(source: Path) -> list[Path]:
             where=source,
             found=len(chosen),
             expected="a folder of images, a pattern in quotes, a video, or scene:NAME",
+            hint=None if chosen or source.exists() else "check the name; nothing matches it",
         )
     return sorted(chosen, key=lambda path: [_by_number(part) for part in path.parts])
 

@@ -89,7 +89,8 @@ def solve_chain(
         say: Called with (done, total, row) after every pair.
 
     Raises:
-        ConfigError: two cameras are given, the stride is wrong, or a scene has another stride.
+        ConfigError: two cameras are given, the stride or a key is wrong, a scene is unknown or has
+            another stride.
         DataError: the frames are no sequence, one is damaged, or the folder holds the result of
             another one.
         SolverError: a pair cannot be solved; the others are kept.
@@ -107,6 +108,8 @@ def solve_chain(
     # every solve gives the warnings of its images
     with warnings.catch_warnings(action="ignore", category=DataWarning):
         chosen = _frames(frames, folder, camera, step, most, depth_scale)
+    # a wrong key or scene is found before the first pair is solved
+    _problem(chosen, 0, overrides)
     count = len(chosen)
     claim(folder, chain_files(count), overwrite, subject)
     which = [(k, k + 1) for k in range(count - 1)]

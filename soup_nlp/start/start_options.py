@@ -18,7 +18,7 @@ class StartOptions(Section):
     smoothness: NonNegative = 0.5
     """Price of different motions of two neighbours with continuous flow, pixels."""
     bending: bool = True
-    """Whether surfaces may bend (`start.bending`); if false, everything is rigid."""
+    """Whether surfaces may bend; if false, everything is rigid."""
     discontinuity_px: NonNegative = 1.0
     """Jump of the flow between two neighbours at which a surface ends, pixels."""
     upright: bool = True

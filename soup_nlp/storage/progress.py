@@ -88,8 +88,9 @@ class interruptible:  # noqa: N801
             raise KeyboardInterrupt
         else:
             self._say(
-                "interrupt received: the best iterate will be kept and every file written;"
-                " without a start this ends after the stage; once more aborts"
+                "interrupt received: the best iterate so far will be written with every file; if"
+                " the initialisation is not complete, this ends after the current stage; a second"
+                " interrupt aborts at once"
             )
         self.event.set()
 

@@ -126,7 +126,7 @@ def solve_files(images: Path, out: Path, **changes: str) -> int:
         ({"intrinsics": "a.png,b.png"}, "existing file"),
         ({"intrinsics": "0,0,79.5,59.5"}, "focal"),
         ({"intrinsics": "nan,9,1,1"}, "finite"),
-        ({"intrinsics": "1,2,3"}, "a list of 4"),
+        ({"intrinsics": "1,2,3"}, "four numbers"),
         ({"flow": "cut.flo"}, "cut.flo"),
         ({"ref": "flat.png", "next": "flat.png"}, "too few pixels"),
         ({"sets": "segmentation.superpixels=10 segmentation.neighbours=15"}, "K"),
@@ -162,13 +162,25 @@ def test_one_superpixel_is_one_plane(images, tmp_path):
         ("solve a.png b.png c.png", "soup-nlp chain"),
         ("solve street b.png", "street, b.png"),
         ("solve", "solve REF NEXT"),
+        ("solve clip.mp4", "soup-nlp chain"),
+        ("solve .", "soup-nlp chain"),
         ("solve missing.yaml", "problem file is missing"),
+        ("solve a.png b.png --intrinsics 50,50", "fx,fy,cx,cy"),
+        ("solve a.png b.png --intrinsics 50,50,32,24 --fov 60", "two cameras"),
+        ("chain missing", "nothing matches it"),
+        ("chain scene:stret", "did you mean street"),
+        ("chain scene:street --set solver.maxiter=3", "did you mean max_iter"),
         ("check missing", "summary.json is missing"),
+        (f"check {__file__}", "nothing that can be checked"),
     ],
 )
-def test_arguments_that_are_no_pair_and_no_result_are_refused(words, part, capsys):
+def test_arguments_that_are_no_pair_and_no_result_are_refused(
+    words, part, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
     assert main(words.split()) == 2
     assert part in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("solves_once")

@@ -34,13 +34,15 @@ def test_options_of_a_pair_exclude_a_problem_file(option, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_flow_goes_with_a_problem_file(tmp_path, monkeypatch):
+def test_a_flow_goes_with_a_problem_file(tmp_path, monkeypatch, capsys):
     flow = render_scene("orbit", 0, 112, 84).truth.flow.astype(np.float32)
     write_flo(tmp_path / "own flow.flo", flow)
     monkeypatch.chdir(tmp_path)
-    args = ["solve", "orbit", "--out", "out", "-q", "--flow", "own flow.flo", *SMALL]
+    args = ["solve", "orbit", "--out", "my out", "-q", "--flow", "own flow.flo", *SMALL]
     assert main(args) in (0, 1)
-    assert "own flow.flo" in json.loads((tmp_path / "out" / "summary.json").read_text())["flow"]
+    assert "own flow.flo" in json.loads((tmp_path / "my out/summary.json").read_text())["flow"]
+    # the command can be pasted into a shell
+    assert "soup-nlp check 'my out'" in capsys.readouterr().out
 
 
 def foreign(folder: Path) -> list[str]:
@@ -130,7 +132,7 @@ def test_a_picture_of_12_bits_names_its_key(white, tmp_path, capsys):
         path = str(tmp_path / "pair" / name)
         cv2.imwrite(path, np.uint16(cv2.imread(path)) * 16)
     args += [] if white is None else ["--set", f"input.white={white}"]
-    args.remove("-q")
+    # `-q` hides the progress, but no warning
     assert main([*args, "--out", str(tmp_path / "out")]) in (0, 1)
     error = capsys.readouterr().err
     assert error.count("the key white") == (1 if white is None else 0)

@@ -213,6 +213,7 @@ def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
             assert (name in text) == (fov is None)
     with pytest.raises(ConfigError, match="0 to 180"):
         load(tmp_path, "wide.jpg", "tele.jpg", fov=180.0)
+    assert "radians" in said(tmp_path, "wide.jpg", "wide.jpg", fov=1.1)[1]
 
 
 # --- implausible intrinsics ----------------------------------------------------------------------

@@ -94,8 +94,8 @@ def read_camera(path: PathLike) -> tuple[Float, Float]:
     blanks or commas; lines that start with # are comments. The distortion follows if there is one.
     Instead, numbers may have names (fx: 500), or the file may be a YAML file of OpenCV or ROS.
     """
-    lines = [x for x in read_text(path, "intrinsics").splitlines() if not x.strip().startswith("#")]
-    text = "\n".join(lines)
+    lines = read_text(path, "intrinsics file").splitlines()
+    text = "\n".join(x for x in lines if not x.strip().startswith("#"))
     values = _named(text, path) or _numbers(text, path, "intrinsics file")
     matrix = len(values) in (13, 14, 17) or (len(values) == 9 and values[6:] == [0, 0, 1])
     count = 9 if matrix or (len(values) == 9 and not _is_distortion(values[4:])) else 4

@@ -49,8 +49,8 @@ def estimated_cameras(
         ConfigError: the field of view is not between 0 and 180 degrees.
 
     Warns:
-        DataWarning: `fov` is not given (the warning names the origin of the focal length), or a
-            focal length of EXIF is implausible.
+        DataWarning: `fov` is not given (the warning names the origin of the focal length), or it
+            or a focal length of EXIF is implausible.
     """
     exif_focals = [exif_focal(path, image) for path, image in zip(paths, images, strict=True)]
     first_exif = next((focal for focal in exif_focals if focal), None)
@@ -63,6 +63,13 @@ def estimated_cameras(
             )
         # the ratio of the two focal lengths is that in EXIF
         first = sizes[0][0] / (2 * math.tan(math.radians(fov) / 2)) / max(sizes[0])
+        if not NARROWEST <= _degrees(first) <= WIDEST:
+            warnings.warn(
+                f"a field of view of {fov:g} degrees is outside of the usual {NARROWEST:g} to"
+                f" {WIDEST:g}; it is in degrees, not in radians",
+                DataWarning,
+                stacklevel=2,
+            )
         relative = [first * focal / relative[0] for focal in relative]
     out: list[Float] = []
     for path, exif, focal, (width, height) in zip(paths, exif_focals, relative, sizes, strict=True):
