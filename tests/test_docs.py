@@ -1,6 +1,7 @@
 """The documents agree with the code: links, names, keys, rooms; the recipes of docs/adding.md."""
 
 import ast
+import json
 import re
 import runpy
 import shutil
@@ -17,7 +18,7 @@ import typer
 from constraint_mutants import MUTANTS
 from pydantic import BaseModel, Field
 
-from soup_nlp.cli.main import app
+from soup_nlp.cli.main import app, main
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.sources import resolve_flow
 from soup_nlp.data.inputs import Input, PairInput, PriorOptions, Resolve
@@ -275,6 +276,18 @@ def test_the_recipe_of_a_term_shows_the_code():
     assert len(shown) == 4
     for block in map(textwrap.dedent, shown):
         assert block in source or textwrap.indent(block, "    ") in source
+
+
+@pytest.mark.slow
+def test_the_excerpt_of_check_has_the_energies_of_the_export(tmp_path):
+    command = re.search(r"^soup-nlp (export orbit .*)$", (ROOT / "README.md").read_text(), re.M)
+    assert main(command[1].replace("out/orbit", str(tmp_path)).split()) == 0
+    energy = json.loads((tmp_path / "manifest.json").read_text())["exact_energy_at_start"]
+    shown = re.search(r"^ +of the solution: (.*)$", (ROOT / "docs" / "using.md").read_text(), re.M)
+    words = shown[1].split()
+    # a start at the presolve's answer is the solution up to the solver's tolerance
+    for name, value in zip(words[::2], map(float, words[1::2]), strict=True):
+        assert energy[name] == pytest.approx(value, rel=1e-3), name
 
 
 def test_a_dataset_is_a_section_that_loads_itself(tmp_path):

@@ -109,7 +109,7 @@ def pairs_found(plan: pd.DataFrame) -> list[str]:
 
 
 def _variants(section: str, method: str) -> Mapping[str, Overrides]:
-    """Changes of a method in a section."""
+    """Overrides of every variant of a method that a section of the page compares."""
     if section == "comparison":
         return {"": ()}
     if section == "departures":

@@ -52,7 +52,7 @@ class Item:
 
     @property
     def key(self) -> str:
-        """Unique among all suites."""
+        """Identifies the pair and its flow among all suites."""
         return f"{self.suite}/{self.name}/{self.flow}"
 
     def problem(self, overrides: Sequence[str] = ()) -> Problem:

@@ -223,7 +223,9 @@ def _version(asked: bool) -> None:
 app = _group(
     "Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.", COMMANDS
 )
-app.add_typer(_group("Measure over many runs; tables, plots and gates.", BENCH), name="bench")
+app.add_typer(
+    _group("Measure accuracy and speed over many runs: tables, plots.", BENCH), name="bench"
+)
 
 
 @app.callback()

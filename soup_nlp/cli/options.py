@@ -61,7 +61,7 @@ PresetName = Annotated[
 ]
 Out = Annotated[Path, in_output("Output folder.", "--out", "-o")]
 Quiet = Annotated[bool, in_output("Print no progress, only warnings.", "--quiet", "-q")]
-OTHERS = "Also over files of others, or the result of another input."
+OTHERS = "Also replace files of your own, and the result of another input."
 Overwrite = Annotated[bool, in_output(OTHERS, "--overwrite")]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
 Problem = Annotated[Path, typer.Argument(help=PROBLEM)]

@@ -211,7 +211,7 @@ def chain(
     fov: options.Fov = None,
     undistort: options.Undistort = False,
     stride: Annotated[str, option("Every n-th frame; auto: those with enough parallax.")] = "1",
-    frames: Annotated[int | None, option("At most so many; 10 of a scene.", min=2)] = None,
+    frames: Annotated[int | None, option("Most frames to use; of a scene 10.", min=2)] = None,
     two_frame: Annotated[bool, option("Solve frames k and k + 2, too.", "--two-frame")] = False,
     depth_scale: options.DepthScale = None,
     preset: options.PresetName = None,

@@ -35,7 +35,7 @@ class SegmentationOptions(Section):
     """Superpixels and graphs."""
 
     superpixels: Annotated[int, Field(ge=1, le=MAX_SUPERPIXELS)] = 1000
-    """Wanted number; the answer differs by about 3 % at most."""
+    """Number that is asked for; the actual number differs by about 3 % at most."""
     method: Literal["slic", "grid"] = "slic"
     """slic, or grid (the paper's worst case)."""
     follow_flow_px: Positive | None = 1.0

@@ -115,7 +115,7 @@ class Template:
     Attributes:
         defined: Node and text of every defined variable, dependencies first.
         roots: Text of every output; None for a number.
-        constants: Scalar or (E,) number of every output, 0 if it is no number.
+        constants: Value of every output that is a number, scalar or (E,); 0 for the others.
         numbers: Scalar or (E,) values by node.
     """
 

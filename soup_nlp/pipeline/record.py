@@ -68,7 +68,7 @@ class Case:
         return len(self.segmentation)
 
     def formulation(self, **changes: object) -> Formulation:
-        """The problem's formulation with its smoothing, changed."""
+        """The formulation and smoothing of the problem, with some fields changed."""
         options, eps = dict(self.problem.formulation), self.options.eps
         return Formulation.make({**options, "eps": eps, "eps_pixel": eps, **changes})
 

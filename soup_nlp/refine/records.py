@@ -27,8 +27,8 @@ class RefineOptions(Section):
     stagnation: NonNegative = 1e-2
     """Stop after a round that lowers the objective by less than this share; 0: never."""
     photo: NonNegative = 10.0
-    """Factor of E_photo, which measures how far the images contradict a superpixel's homography
-    (`refine.photometric`); 0 leaves the images out."""
+    """Factor of E_photo, which measures how far the images contradict a superpixel's homography;
+    0 leaves the images out."""
     max_seconds: Tolerance = 300.0
     """Time limit of the rounds together."""
 

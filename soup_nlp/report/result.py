@@ -162,7 +162,7 @@ class Result:
 
     @property
     def bends(self) -> Mask:
-        """(N,) True in regions that bend, which are not rigid."""
+        """(N,) True for the superpixels of regions that bend."""
         return np.asarray(self.tree["start"]["bends"], bool)
 
     @property

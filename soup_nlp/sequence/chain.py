@@ -326,7 +326,7 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
 
 
 def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:
-    """Number of the track by label of the component, for every pair; 0 is the background.
+    """Numbers of the tracks: for every pair, a dict from component to track; 0 is the background.
 
     Args:
         matches: Results of `follow` for consecutive pairs.

@@ -67,7 +67,7 @@ class Matches(NamedTuple):
     focal: float
 
     def at(self, which: Int | Mask | slice) -> Matches:
-        """Some of the correspondences."""
+        """The correspondences with these indices."""
         return Matches(self.ray[which], self.target[which], self.weight[which], self.focal)
 
     def confident(self, most: int) -> Matches:

@@ -89,8 +89,10 @@ def cauchy(x: Float, scale: float) -> Float:
 
 
 def relief(motion: Motion, r: Float, q: Float, expected: Float | float = 0.0) -> Float:
-    """(M,) log depth of correspondences under a motion less the expected one, relative to the
-    median, limited."""
+    """(M,) log depth of correspondences under a motion, relative to the expected log depth.
+
+    The median is 0, and values are limited to `MOST_RELIEF`.
+    """
     z, _ = triangulate(motion, r, q)
     inverse = np.exp(expected) / np.where(np.abs(z) < 1e-12, 1e-12, z)
     middle = np.median(inverse)

@@ -33,7 +33,7 @@ DIED = "the process died (out of memory, or a crash of native code)"
 
 
 def one_thread() -> AbstractContextManager[Any]:
-    """Give one thread to processes that begin and libraries that are loaded in the block.
+    """Context in which new processes, and libraries that are loaded, use one thread.
 
     Libraries read their number of threads when they are loaded.
     """

@@ -49,8 +49,8 @@ def estimated_cameras(
         ConfigError: the field of view is not between 0 and 180 degrees.
 
     Warns:
-        DataWarning: `fov` is not given (the warning names the origin of the focal length), or it
-            or a focal length of EXIF is implausible.
+        DataWarning: `fov` is missing (the warning names the origin of the focal length) or
+            implausible, or a focal length of EXIF is implausible.
     """
     exif_focals = [exif_focal(path, image) for path, image in zip(paths, images, strict=True)]
     first_exif = next((focal for focal in exif_focals if focal), None)

@@ -104,7 +104,7 @@ def _array(content: bytes, path: PathLike, what: str) -> NDArray[Any]:
 
 
 def read_npz(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
-    """The arrays of real numbers of a .npz file by name."""
+    """The real-valued arrays of a .npz file, by name."""
     content, most = io.BytesIO(read_bytes(path, what)), 32 * MAX_PIXELS
     try:
         with zipfile.ZipFile(content) as archive:

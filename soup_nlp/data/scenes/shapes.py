@@ -88,7 +88,7 @@ class Box(Shape):
         return out
 
     def chart(self, material: Float) -> Float:
-        """See `Shape`; y runs along y on the four sides."""
+        """See `Shape`; on the four upright faces the second coordinate is y."""
         face = self._face(material)
         across = np.where(face == 0, material[:, 2], material[:, 0])
         down = np.where(face == 1, material[:, 2], material[:, 1])

@@ -140,7 +140,7 @@ class SceneBuilder:
         return Texture(colours, cell, self.contrast * contrast, seed, panels)
 
     def paint(self, cell: float, panels: Panels | None = None) -> Texture:
-        """A texture of the next colour of the palette."""
+        """A texture in the next colour of the palette."""
         self.paints.append(self.paints.pop(0))
         return self.plain(self.paints[-1], cell, panels, contrast=0.5)
 
