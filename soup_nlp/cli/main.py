@@ -86,9 +86,9 @@ COMMANDS: Mapping[str, str] = {
     "evaluate": "results:evaluate",
     "show": "problems:show",
     "list": "problems:list_",
-    "export": "problems:export",
+    "export": "exports:export",
     "import": "results:import_",
-    "family": "problems:family",
+    "family": "exports:family",
     "compare": "compare:compare",
 }
 """Module and function under `soup_nlp.cli`, by command; in this order the help lists them."""

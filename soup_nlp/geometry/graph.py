@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import Float, Image, Int, Mask
 from soup_nlp.errors import DataError
@@ -71,7 +71,7 @@ class Segmentation:
     def nearest(self, mask: Mask) -> Int:
         """(N,) the nearest superpixel of a mask (N,), which is not empty; in the mask itself."""
         members = np.flatnonzero(mask)
-        nearest = members[cKDTree(self.anchors[members]).query(self.anchors)[1]]
+        nearest = members[scipy.spatial.cKDTree(self.anchors[members]).query(self.anchors)[1]]
         return np.where(mask, np.arange(len(mask)), nearest)
 
 
@@ -132,7 +132,7 @@ def _nearest(anchors: Float, k: int) -> Int:
     n = len(anchors)
     if n == 1:
         return np.zeros((1, 0), np.int64)
-    _, index = cKDTree(anchors).query(anchors, k=k + 1)
+    _, index = scipy.spatial.cKDTree(anchors).query(anchors, k=k + 1)
     index = index.reshape(n, k + 1)
     # coincident anchors can displace the point itself from the first place
     is_self = index == np.arange(n)[:, None]

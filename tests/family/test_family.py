@@ -257,7 +257,7 @@ def test_an_answer_off_the_constraints_is_told(folder, tmp_path, capsys):
     ],
 )
 def test_other_files_are_not_overwritten(name, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("soup_nlp.cli.problems.write_family", None)  # nothing is computed first
+    monkeypatch.setattr("soup_nlp.cli.exports.write_family", None)  # nothing is computed first
     (tmp_path / name).write_text("mine")
     assert main(["family", str(tmp_path), "--sizes", "100"]) == 2
     assert said in capsys.readouterr().err

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from skimage.measure import label
+import skimage
 
 from soup_nlp.arrays import Float
 from soup_nlp.data.datasets.layout import Folder, FramesInput, PairInput, Resolve, make_pair
@@ -79,13 +79,15 @@ class FolderInput(FramesInput):
             for stems in ("depth depth_0 depth_ref", "depth_next depth_1")
         )
         moving = folder.read(read_mask, *_names("moving", _IMAGES))
+        if moving is not None:
+            # connected regions
+            moving = skimage.measure.label(moving, connectivity=2).astype(np.int32)
         truth = Truth(
             depth_ref=depth,
             depth_next=depth_next,
             flow=folder.read(read_flow, *_names("flow", ".flo .npy .png")),
             occluded=folder.read(read_mask, *_names("occluded", _IMAGES)),
-            # connected regions of the pixels that move
-            components=None if moving is None else label(moving, connectivity=2).astype(np.int32),
+            components=moving,
             points=folder.read(_read_points, "points.npz", unit=self.unit),
             unit=self.unit,
         )

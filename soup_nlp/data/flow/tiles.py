@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from soup_nlp.arrays import FloatMap, Image
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error, sampled
@@ -139,7 +139,8 @@ def _surfaces(matches: NDArray[np.int_]) -> list[NDArray[np.int_]]:
     """Groups of overlapping or touching tiles with similar displacements (`AGREE`)."""
     if len(matches) < GROUP:
         return []
-    links = cKDTree(matches[:, :2]).query_pairs(TILE // 2, p=np.inf, output_type="ndarray")
+    tree = scipy.spatial.cKDTree(matches[:, :2])
+    links = tree.query_pairs(TILE // 2, p=np.inf, output_type="ndarray")
     gap = np.linalg.norm(np.diff(matches[links, 2:], axis=1)[:, 0], axis=1)
     label = connected(links[gap <= AGREE], len(matches))
     groups = [matches[label == i] for i in range(label.max() + 1)]
