@@ -227,16 +227,19 @@ class View:
             across = depth[on] / self.K[0, 0]
             footprint = np.maximum(across, across / cosine / TAPS)
             several = (cosine < TILTED) & (taps > 1)
+            # direction of foreshortening within the surface
+            along = (ray - towards[:, None] * n)[several]
+            along *= ((across / cosine)[several] / np.linalg.norm(along, axis=1))[:, None]
+            step, start = along @ R, local[several]
+            offsets = (np.arange(taps) + 0.5) / taps - 0.5
+            # one call for all: it costs more than its points in small images
+            points = np.concatenate([local[~several], *(start + o * step for o in offsets)])
+            sizes = np.concatenate([footprint[~several], np.tile(footprint[several], taps)])
+            seen = item.colour(shape, points, sizes)
+            one = len(on) - len(start)
             shown = np.empty((len(on), 3), np.float32)
-            shown[~several] = item.colour(shape, local[~several], footprint[~several])
-            if several.any():
-                # direction of foreshortening within the surface
-                along = (ray - towards[:, None] * n)[several]
-                along *= ((across / cosine)[several] / np.linalg.norm(along, axis=1))[:, None]
-                step, start = along @ R, local[several]
-                offsets = (np.arange(taps) + 0.5) / taps - 0.5
-                tap = [item.colour(shape, start + o * step, footprint[several]) for o in offsets]
-                shown[several] = np.mean(tap, axis=0)
+            shown[~several] = seen[:one]
+            shown[several] = np.mean(seen[one:].reshape(taps, -1, 3), axis=0)
             colour[on] = shown
         return colour, normals
 

@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from soup_nlp.arrays import Float, FloatMap
+from soup_nlp.arrays import Float, FloatMap, Int
 
 Colour = tuple[float, float, float]
 
@@ -52,16 +52,27 @@ def value_noise(points: Float, seed: int) -> FloatMap:
         (N,) values in [-1, 1], twice continuously differentiable, period `PERIOD` in each axis.
     """
     cell = np.floor(points)
-    f = (points - cell).astype(np.float32)
+    f = (points - cell).T.astype(np.float32, order="C")
     f = f * f * f * (f * (f * 6 - 15) + 10)
-    # (2, N) lower and upper neighbour along each axis
-    x, y, z = np.bitwise_and(cell.astype(np.int64).T[:, None] + [[0], [1]], PERIOD - 1)
-    node = (z[:, None, None] * PERIOD + y[:, None]) * PERIOD + x
-    values = _lattice(seed)[node]
-    for share in f.T:
-        low, high = values[..., 0, :], values[..., 1, :]
-        values = low + share * (high - low)
-    return values
+    x, y, z = low = np.bitwise_and(cell.T.astype(np.int64, order="C"), PERIOD - 1)
+    node = (z * PERIOD + y) * PERIOD + x
+    # from the lower to the upper node along each axis, in the flat lattice
+    steps = np.bitwise_and(low + 1, PERIOD - 1) - low
+    steps *= np.array([[1], [PERIOD], [PERIOD**2]])
+    return _interpolated(_lattice(seed), node, steps, f)
+
+
+def _interpolated(lattice: FloatMap, node: Int, steps: Int, shares: FloatMap) -> FloatMap:
+    """Values (N,) between nodes (N,) and those after steps (A, N), by shares (A, N) of each."""
+    if not len(steps):
+        return lattice.take(node)
+    low = _interpolated(lattice, node, steps[:-1], shares[:-1])
+    high = _interpolated(lattice, node + steps[-1], steps[:-1], shares[:-1])
+    # in place: temporary arrays cost more than the arithmetic
+    high -= low
+    high *= shares[-1]
+    high += low
+    return high
 
 
 def fractal_noise(
