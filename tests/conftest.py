@@ -15,6 +15,7 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
 from soup_nlp.data.flow import sources
 from soup_nlp.data.scenes import catalogue
+from soup_nlp.evaluate import camera, confidence, evidence
 from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run
@@ -42,15 +43,22 @@ def once(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 # what many tests want is computed once: test files import these functions later. Tests of the
-# flow and of the start itself call the modules where they are defined
-inputs.render_scene = catalogue.render_scene = lru_cache(maxsize=64)(catalogue.render_scene)
+# flow, of the start and of the evidence itself call the modules where they are defined
+inputs.render_scene = catalogue.render_scene = lru_cache(maxsize=128)(catalogue.render_scene)
 sources.dis_flow, pipeline_case.propose = once(sources.dis_flow), once(pipeline_case.propose)
+pipeline_case.segment = once(pipeline_case.segment)
+pipeline_case.follow_flow = once(pipeline_case.follow_flow)
+confidence.evidence, evidence.camera_errors = map(once, (evidence.evidence, camera.camera_errors))
 
 
 def pytest_collection_finish() -> None:
-    """Modules and test items live to the end: the collector need not visit them again."""
+    """Modules and test items live to the end: the collector need not visit them again.
+
+    It runs less often than by default, since kernels' instructions are many tuples without cycles.
+    """
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000, 10, 5)
 
 
 @pytest.fixture(scope="session")

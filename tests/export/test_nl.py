@@ -120,7 +120,7 @@ def test_variables_and_rows_are_ordered_by_class(tmp_path):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    form = Formulation(gauge="unit-translation", norm="epigraph")
+    form = Formulation(gauge="unit-translation", norm="epigraph", compiled=False)
     nlp, layout = Tiny().nlp(TRUNCATED, form)
     folder = tmp_path_factory.mktemp("foreign")
     lam_g = np.full(nlp.ng, -1.0)
