@@ -147,6 +147,17 @@ def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
     return rotation.exp(x[:3]), views.distance(views.ray @ turned(x).T)
 
 
+def moving_pieces(flow: FlowFit) -> Int:
+    """(N,) piece of every superpixel before a camera at rest, or one that only turns.
+
+    0 is everything that the turn explains, the others are connected pieces of what moves.
+    """
+    jump = flow.options.discontinuity_px
+    still = fit_turn(flow.views)[1] < jump
+    continuous = ~flow.seg.across(still) & (flow.jump < jump)
+    return np.where(still, 0, 1 + connected_labels(continuous, flow.seg))
+
+
 ABOVE_NOISE, LEAST_JUMP = 10.0, 0.25
 """Least jump of a flow discontinuity: multiple of the median jump between neighbours (which noise
 and bending cause), and share of `discontinuity_px`."""

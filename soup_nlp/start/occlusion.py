@@ -16,11 +16,10 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import fit_turn
+from soup_nlp.start.bending import moving_pieces
 from soup_nlp.start.components import (
     FIXED,
     TIES,
-    connected_labels,
     depth_from_inside,
     numbered,
     outlines,
@@ -187,9 +186,12 @@ def in_order(start: Start, pair: Pair, flow: FlowFit) -> Start:
         order = np.where(order == 0, start.order, order)
     soup = replace(start.soup, lam=start.soup.lam * factor).normalised()
     tie = np.where(moved, TIES.index("occlusion"), start.tie)
-    grouped = np.where(moved & start.bends, len(seg) + region, start.component)
-    component = numbered(grouped)
-    part = np.where(start.bends.all(), component, start.part)
+
+    def with_regions(group: Int) -> Int:
+        return numbered(np.where(moved & start.bends, len(seg) + region, group))
+
+    part = with_regions(start.part) if start.bends.all() else start.part
+    component = with_regions(start.component)
     return replace(start, soup=soup, tie=tie, component=component, part=part, order=order)
 
 
@@ -199,12 +201,9 @@ def regions(start: Start, flow: FlowFit) -> Int:
     Before a camera at rest everything that does not move is one region; the others are connected
     pieces of moving superpixels.
     """
-    seg, jump = flow.seg, flow.options.discontinuity_px
-    if not start.at_rest:
-        return np.where(start.bends, len(seg) + start.surface, start.component)
-    still = fit_turn(flow.views)[1] < jump
-    continuous = ~seg.across(still) & (flow.jump < jump)
-    return np.where(still, 0, 1 + connected_labels(continuous, seg))
+    if start.at_rest:
+        return moving_pieces(flow)
+    return np.where(start.bends, len(flow.seg) + start.surface, start.component)
 
 
 def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Float:

@@ -7,7 +7,13 @@ import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import constant_depth, surface_motions, surfaces, turn_alone
+from soup_nlp.start.bending import (
+    constant_depth,
+    moving_pieces,
+    surface_motions,
+    surfaces,
+    turn_alone,
+)
 from soup_nlp.start.choice import CLIP, LEAST_NOISE, Choice, limited_noise, rigid_choice
 from soup_nlp.start.components import (
     SCENE,
@@ -20,7 +26,7 @@ from soup_nlp.start.components import (
 from soup_nlp.start.epipolar import Motion, stacked
 from soup_nlp.start.ground import on_ground
 from soup_nlp.start.homographies import unorganised
-from soup_nlp.start.merge import earned, gather, unmoved
+from soup_nlp.start.merge import SMALL, earned, gather, unmoved
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
 from soup_nlp.start.pace import nearer_where_fast, order_in_front
 from soup_nlp.start.scene import scene_first
@@ -41,8 +47,8 @@ class Start:
         component: (N,) index of the rigid component, which shares one scale: the superpixels of a
             dominant motion, or a connected piece of superpixels with their own motions. The first
             one is the scene (`SCENE`).
-        part: (N,) group that moves as one, an index of `component`: its own, or the scene where
-            its flow is not usable, so that its motion is not known.
+        part: (N,) group that moves as one: its component, or the scene where its flow is not
+            usable, so that its motion is not known; before a camera at rest each piece that moves.
         motions: The dominant motions.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
             where a region bends, discontinuities make up most of its outline.
@@ -139,8 +145,8 @@ def propose(flow: FlowFit) -> Start:
         every = np.ones(len(seg), bool)
         start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
         shared = [] if choice is None else choice.motions
-        at_rest = turn is not None
-        return replace(start, motions=shared, surface=surface, bends=every, at_rest=at_rest)
+        start = replace(start, motions=shared, surface=surface, bends=every)
+        return start if turn is None else replace(start, at_rest=True, part=parts_at_rest(flow))
     if not bends.any():
         surface = connected_labels(flow.jump < o.discontinuity_px, seg)
     choice, wrong = earned(rigid, choice)
@@ -207,6 +213,18 @@ def _with_depth(flow: FlowFit, choice: Choice, wrong: Mask) -> tuple[Soup, Mask]
         mu, slope = borrow(mu, slope, choice.label, weak, flow.seg)
     R, t = stacked(choice.motions)
     return views.soup(mu, slope, R[choice.label], t[choice.label] * length[:, None]), weak
+
+
+def parts_at_rest(flow: FlowFit) -> Int:
+    """(N,) part of every superpixel before a camera at rest: pieces that move, with usable flow.
+
+    Small pieces, whose flow may be a mixture of those around them, count as the scene.
+    """
+    piece = moving_pieces(flow)
+    size = np.bincount(piece)
+    weight = np.bincount(piece, flow.views.weight.mean(axis=1)) / np.maximum(size, 1)
+    moves = (size > SMALL * len(piece)) & (weight >= USABLE)
+    return numbered(np.where(moves[piece], piece, SCENE))
 
 
 def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
