@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
+import scipy  # its modules are loaded on use: commands that need none start sooner
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image, Int, Mask

@@ -221,10 +221,14 @@ def parts_at_rest(flow: FlowFit) -> Int:
     Small pieces, whose flow may be a mixture of those around them, count as the scene.
     """
     piece = moving_pieces(flow)
-    size = np.bincount(piece)
-    weight = np.bincount(piece, flow.views.weight.mean(axis=1)) / np.maximum(size, 1)
-    moves = (size > SMALL * len(piece)) & (weight >= USABLE)
-    return numbered(np.where(moves[piece], piece, SCENE))
+    large = np.bincount(piece)[piece] > SMALL * len(piece)
+    return numbered(np.where(large & _usable(flow, piece), piece, SCENE))
+
+
+def _usable(flow: FlowFit, piece: Int) -> Mask:
+    """(N,) True in pieces (N,) whose flow has a mean confidence of at least `USABLE`."""
+    total = np.bincount(piece, flow.views.weight.mean(axis=1))
+    return (total / np.maximum(np.bincount(piece), 1) >= USABLE)[piece]
 
 
 def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
@@ -241,8 +245,7 @@ def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
     """
     across = flow.seg.across(component)
     piece = connected_labels(~across, flow.seg)
-    weight = np.bincount(piece, flow.views.weight.mean(axis=1)) / np.bincount(piece)
-    moves = kept | ((component != SCENE) & (weight >= USABLE)[piece])
+    moves = kept | ((component != SCENE) & _usable(flow, piece))
     ends = flow.seg.pairs[across]
     beside = np.isin(piece, piece[ends[moves[ends[:, ::-1]]]])
     return np.where(moves | beside, component, SCENE)
