@@ -46,8 +46,8 @@ GUESSES = ("rest", "fixed", "unseen", "flat", "scale", "weak")
 """Shares that are a guess."""
 USABLE = 0.8
 """Share of usable flow below which the flow counts as a limit."""
-SHARE = 0.05
-"""Share of the image above which a limit is mentioned."""
+LEAST, SHARE = 0.005, 0.05
+"""Shares of the image from which a share of the certainty is named, and a limit mentioned."""
 FAST = 0.05
 """Median length of the flow, relative to the image's width, above which motion is fast."""
 UNSURE_FOCAL = 0.2
@@ -65,18 +65,21 @@ WAYS = (("to the right", "to the left"), ("down", "up"), ("ahead", "back"))
 def certainty_lines(shares: Mapping[str, float]) -> list[str]:
     """The shares of `certainty` as sentences on the determined part and on the guess."""
     lines = []
-    if shares["determined"] >= 0.005:
+    if shares["determined"] >= LEAST:
         lines.append(
             f"{shares['determined']:.0%} of the image is determined, half of it to"
             f" {shares['median_sigma']:.1%} (1 sigma):"
             f" {_parts(shares, DETERMINED)}"
         )
-    return lines + ([guess_words(shares)] if shares["guess"] >= 0.005 else [])
+    return lines + ([guess_words(shares)] if shares["guess"] >= LEAST else [])
 
 
-def guess_reason(shares: Mapping[str, float]) -> str:
-    """The reason of the largest part of the guess."""
-    return SHARES[max(GUESSES, key=lambda name: shares.get(name, 0.0))]
+def guess_line(shares: Mapping[str, float]) -> str:
+    """The share that is a guess, with the reason of its largest part; "" for next to none."""
+    if shares["guess"] < LEAST:
+        return ""
+    reason = SHARES[max(GUESSES, key=lambda name: shares.get(name, 0.0))]
+    return f"{shares['guess']:.0%} of the image is a guess: {reason}"
 
 
 def guess_words(shares: Mapping[str, float], of: str = "") -> str:
@@ -86,7 +89,7 @@ def guess_words(shares: Mapping[str, float], of: str = "") -> str:
 
 
 def _parts(shares: Mapping[str, float], names: tuple[str, ...]) -> str:
-    return ", ".join(f"{shares[k]:.0%} {SHARES[k]}" for k in names if shares.get(k, 0.0) >= 0.005)
+    return ", ".join(f"{shares[k]:.0%} {SHARES[k]}" for k in names if shares.get(k, 0.0) >= LEAST)
 
 
 def found_words(run: Run) -> list[str]:

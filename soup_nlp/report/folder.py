@@ -20,11 +20,12 @@ from soup_nlp.errors import DataError
 from soup_nlp.pipeline import run as pipeline
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture, write_png
+from soup_nlp.report.findings import guess_line
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import record_of, recorded_files, rows_in_file
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import pictures
-from soup_nlp.report.result import PAGE, load, result_of
+from soup_nlp.report.result import PAGE, Result, load, result_of
 from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.files import as_path, write_text
@@ -141,7 +142,7 @@ def write_folder(
         for name, file in PICTURES.items():
             if name in drawn:
                 write_picture(new / file, drawn[name])
-        write_png(new / "overview.png", overview(drawn, run.problem.name))
+        write_png(new / "overview.png", overview(drawn, _title(result)))
         write_formats(new, result, ("motions", "ply", *formats))
         if run.problem.output.page:
             write_text(new / PAGE, page(result, drawn))
@@ -156,6 +157,11 @@ def write_folder(
         tree = {**result.tree, RECORD: record}
         write_h5(new / "result.h5", tree, attributes, rows_in_file(unit))
     return files
+
+
+def _title(result: Result) -> str:
+    """The name of a result, and the share that is a guess."""
+    return ": ".join(filter(None, [result.name, guess_line(result.summary["certainty"])]))
 
 
 def _attributes(run: Run, config: str) -> dict[str, Any]:
@@ -292,8 +298,8 @@ class WritableRun(Run):
 
     def plot(self) -> Image:
         """The overview as a picture: notebooks show it, `.save` writes it."""
-        drawn = pictures(result_of(self, summary(self)))
-        return fromarray(overview(drawn, self.problem.name))
+        result = result_of(self, summary(self))
+        return fromarray(overview(pictures(result), _title(result)))
 
     def _repr_html_(self) -> str:
         """Text and overview, for notebooks."""

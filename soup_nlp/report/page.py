@@ -20,7 +20,7 @@ from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, triangles
 from soup_nlp.report.colour import component_colours
-from soup_nlp.report.findings import ORIGINS, limits
+from soup_nlp.report.findings import ORIGINS, guess_line, limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.result import Result
 from soup_nlp.start.components import TIES
@@ -169,7 +169,10 @@ def _summary(result: Result) -> str:
     whole = sum(v for k, v in s["seconds"].items() if not k.startswith("nlp_"))
     if whole:
         words.append(f"{whole:.1f} s")
-    return " &middot; ".join(escape(word) for word in words)
+    figures = [escape(word) for word in words]
+    if guess := guess_line(s["certainty"]):
+        figures.insert(0, f"<strong>{escape(guess)}</strong>")
+    return " &middot; ".join(figures)
 
 
 def _components(result: Result) -> str:
@@ -216,7 +219,7 @@ def make_scene(result: Result) -> dict[str, Any]:
         "motion": (N, 9) motion of every superpixel relative to the background: rotation vector w,
             pivot p and shift s; at time t a point X is at exp(t w) (X - p) + p + t s.
         "motionCamera": (N, 9) the same relative to the camera.
-        "guess": (N,) the depth comes from neighbours.
+        "borrowed": (N,) the depth comes from neighbours.
         "component": (N,) what moves as one. "tie": (N,) index in "origins", words on its scale.
         "seen": (h, w) pixels that are visible in the next frame.
         "sigma": (h, w) standard deviation of log depth, 0 to 254 for 0 to 0.5; 255 where unknown.
@@ -244,7 +247,7 @@ def make_scene(result: Result) -> dict[str, Any]:
         "planes": _single(inverse_depth(n, scale * lam * result.soup("d"))),
         "motion": _single(_motion(camera.R @ R, camera(T), pivot)),
         "motionCamera": _single(_motion(R, T, pivot)),
-        "guess": (np.asarray(start["borrowed"], bool) & ~result.bends).astype(np.uint8),
+        "borrowed": (np.asarray(start["borrowed"], bool) & ~result.bends).astype(np.uint8),
         "seen": (~hidden(rec)[every, every]).astype(np.uint8),
         "sigma": _sigma(result)[every, every],
         "component": result.components.of_superpixel.astype(np.uint16),

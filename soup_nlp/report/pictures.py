@@ -20,6 +20,7 @@ from soup_nlp.report.colour import (
     flow_limit,
     wheel_key,
 )
+from soup_nlp.report.findings import LEAST
 from soup_nlp.report.result import Result
 
 DENSE = 0.5
@@ -163,6 +164,7 @@ def _depths(result: Result) -> list[Picture]:
     truth, stored = result.true_depth, result.tree["depth"]
     near, far = depth_range(stored["ref"] * result.scale if truth is None else truth)
     bar, out = depth_bar(near, far, f" {result.length}"), []
+    guess = result.summary["certainty"]["guess"]
     for array, name, title, scored, more in DEPTHS:
         score = result.summary["metrics"].get(scored, {})
         # the next frame has the scale of the solution
@@ -170,6 +172,8 @@ def _depths(result: Result) -> list[Picture]:
         colours = colourise_depth(stored[array] * float(scaled.get("scale") or 1.0), near, far)
         mre = score.get("mre")
         said = "" if mre is None else f", MRE {mre:.3f}"
+        if name == "depth_ref" and guess >= LEAST:
+            said += f"; {guess:.0%} is a guess"
         out.append(Picture(name, f"{title}{said}{more}", colours, bar))
     if truth is not None:
         true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)

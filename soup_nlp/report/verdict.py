@@ -13,7 +13,7 @@ from soup_nlp.report.findings import (
     certainty_lines,
     flow_words,
     found_words,
-    guess_reason,
+    guess_line,
     hints,
 )
 from soup_nlp.report.result import PAGE
@@ -76,8 +76,7 @@ def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
     if not run.solved:
         return 1, f"the NLP did not converge ({run.solution.status}); the best iterate is written"
     if not run.good:
-        why = guess_reason(certainty(run))
-        return 1, f"{run.confidence.guessed:.0%} of the image is a guess: {why}"
+        return 1, guess_line(certainty(run))
     if mre_at_most is not None and missed(run):
         return 1, f"the MRE is above the expected {mre_at_most:g}"
     return 0, "solved, and at most half of the image is a guess"

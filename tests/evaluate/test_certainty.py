@@ -11,8 +11,9 @@ from soup_nlp.report.findings import (
     DETERMINED,
     GUESSES,
     ORIGINS,
+    SHARES,
     certainty_lines,
-    guess_reason,
+    guess_line,
 )
 from soup_nlp.report.summary import certainty
 from soup_nlp.start.components import FIXED, TIES
@@ -99,7 +100,7 @@ def test_a_camera_at_rest_is_the_reason_of_every_guess(small_run):
     at_rest = replace(small_run, start=replace(small_run.start, at_rest=True))
     shares = certainty(unsure(at_rest))
     assert shares["rest"] == 1.0
-    assert "turns or stands still" in guess_reason(shares)
+    assert guess_line(shares) == f"100% of the image is a guess: {SHARES['rest']}"
 
 
 def test_what_is_fixed_in_the_image_is_named(small_run):

@@ -15,8 +15,8 @@ from soup_nlp.cli.main import main
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report import page as page_module
-from soup_nlp.report.findings import limits
-from soup_nlp.report.folder import write_folder
+from soup_nlp.report.findings import SHARES, limits
+from soup_nlp.report.folder import _title, write_folder
 from soup_nlp.report.page import MODES, make_scene, page, surface_cells
 from soup_nlp.report.pictures import _enlarged, pictures
 from soup_nlp.report.result import result_of
@@ -189,6 +189,18 @@ def test_a_component_whose_depth_is_a_guess_is_striped(shown):
     white, title = stripes(sigma)
     assert "striped: most of its depth is a guess" in title
     assert 0.3 < white[shown.components.of_superpixel[shown.labels] == 0].mean() < 0.45
+
+
+@pytest.mark.parametrize(("guess", "said"), [(0.004, None), (0.3, "30%"), (1.0, "100%")])
+def test_page_pictures_and_overview_begin_with_the_guess(guess, said, shown):
+    shares = {**shown.summary["certainty"], "guess": guess, "flat": guess}
+    one = replace(shown, summary={**shown.summary, "certainty": shares})
+    drawn = pictures(one)
+    depth, header = drawn["depth_ref"].title, page(one, drawn).partition("</header>")[0]
+    sentence = f"{said} of the image is a guess: {SHARES['flat']}"
+    assert depth.endswith(f"; {said} is a guess") == bool(said)
+    assert (f"<p><strong>{sentence}</strong> &middot; " in header) == bool(said)
+    assert _title(one) == (f"{one.name}: {sentence}" if said else one.name)
 
 
 def test_limits_name_what_is_wrong(shown):

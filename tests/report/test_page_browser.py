@@ -176,6 +176,14 @@ def test_the_least_confidence_hides_points(browser, small_run):
     browser.value("soupView.setLeast(0.98)")
     assert browser.value(size) < whole
     assert drawn(canvas(browser)) < drawn(before)
+    # without guesses means from a confidence of a half
+    click = "document.getElementById('guesses').click()"
+    browser.value(f"soupView.setLeast(0.5); {click}")
+    assert browser.value(size) == whole
+    browser.value(click)
+    half = browser.value(size)
+    browser.value("soupView.setLeast(0.5)")
+    assert half == browser.value(size) < whole
     browser.value("document.querySelectorAll('#modes button')[1].click()")
     browser.wait("location.hash.startsWith('#mode=')")
 

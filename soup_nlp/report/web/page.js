@@ -33,10 +33,10 @@ async function unpack(text, Kind) {
   return new Kind(await new Response(stream).arrayBuffer());
 }
 
-const [labels, planes, motion, motionCamera, guess, seen, surface, sigma, component, tie] = await Promise.all([
+const [labels, planes, motion, motionCamera, borrowed, seen, surface, sigma, component, tie] = await Promise.all([
   unpack(scene.labels, Uint16Array), unpack(scene.planes, Float32Array),
   unpack(scene.motion, Float32Array), unpack(scene.motionCamera, Float32Array),
-  unpack(scene.guess, Uint8Array), unpack(scene.seen, Uint8Array), unpack(scene.surface, Uint8Array),
+  unpack(scene.borrowed, Uint8Array), unpack(scene.seen, Uint8Array), unpack(scene.surface, Uint8Array),
   unpack(scene.sigma, Uint8Array), unpack(scene.component, Uint16Array), unpack(scene.tie, Uint8Array),
 ]);
 const [w, h] = scene.grid;
@@ -80,7 +80,7 @@ const VERTEX = `
   uniform float time, pixel, focal, size;
   uniform vec2 grid;
   out vec2 place;
-  out float depth, guess, hidden, unsure;
+  out float depth, hidden, unsure;
   vec3 turned(vec3 w, vec3 x) {
     float angle = length(w);
     if (angle < 1e-9) return x + cross(w, x);
@@ -101,7 +101,6 @@ const VERTEX = `
   void main() {
     int p = gl_VertexID, w = int(grid.x);
     vec3 x = position;
-    guess = texelFetch(motion, ivec2(0, int(label + 0.5)), 0).w;
     depth = x.z;
     unsure = sigma;
     hidden = 0.0;
@@ -120,24 +119,22 @@ const VERTEX = `
 const FRAGMENT = `
   precision highp float;
   in vec2 place;
-  in float depth, guess, hidden, unsure;
+  in float depth, hidden, unsure;
   uniform sampler2D colours;
   uniform float far, most;
-  uniform bool guesses;
   out vec4 colour;
   void main() {
-    if (!(depth < far) || unsure > most || (!guesses && guess > 0.5)) discard;
+    if (!(depth < far) || unsure > most) discard;
     vec2 inside = step(vec2(0.0), place) * step(place, vec2(1.0));
     colour = inside.x * inside.y > 0.5 && hidden < 0.5 ? texture(colours, place) : vec4(0.35, 0.35, 0.38, 1.0);
   }`;
 
-/* one row of three texels per superpixel: rotation and guess, pivot, shift */
+/* one row of three texels per superpixel: rotation, pivot, shift */
 function motionTexture(values) {
   const texels = new Float32Array(12 * scene.count);
   for (let i = 0; i < scene.count; i++) {
     for (let part = 0; part < 3; part++)
       texels.set(values.subarray(9 * i + 3 * part, 9 * i + 3 * part + 3), 12 * i + 4 * part);
-    texels[12 * i + 3] = guess[i];
   }
   const out = new THREE.DataTexture(texels, 3, scene.count, THREE.RGBAFormat, THREE.FloatType);
   out.needsUpdate = true;
@@ -177,7 +174,7 @@ const uniforms = {
   focal: { value: 1 },
   cameraNext: { value: new THREE.Matrix3().set(...K[0], ...K[1], ...K[2]) },
   sizeNext: { value: new THREE.Vector2(...scene.sizeNext) }, fromNext: { value: false },
-  size: { value: 1 }, most: { value: 1 }, colours: { value: null }, far: { value: scene.far }, guesses: { value: true },
+  size: { value: 1 }, most: { value: 1 }, colours: { value: null }, far: { value: scene.far },
 };
 const material = new THREE.ShaderMaterial({
   uniforms, vertexShader: VERTEX, fragmentShader: FRAGMENT, glslVersion: THREE.GLSL3,
@@ -343,10 +340,11 @@ buttons("views", Object.keys(VIEWS).map((name) => [name, name]),
   (view) => { setView(view); remember({ view }); });
 $("time").onchange = () => remember({});
 $("size").oninput = () => { uniforms.size.value = Number($("size").value); draw(); };
-/* confidence is 1 - sigma / 0.5; bytes hold sigma up to 0.5 */
+/* confidence is 1 - sigma / 0.5, of a guess below 0.5; bytes hold sigma up to 0.5 */
 function setLeast(value) {
   $("least").value = value;
   $("least-text").textContent = Number(value).toFixed(2);
+  $("guesses").checked = value < 0.5;
   uniforms.most.value = 1 - Number(value);
   draw();
 }
@@ -361,8 +359,7 @@ function moved(p, t) {
   if (angle > 1e-9) x.applyAxisAngle(turn.divideScalar(angle), t * angle);
   return x.add(pivot).addScaledVector(new THREE.Vector3(table[k + 6], table[k + 7], table[k + 8]), t);
 }
-const drawn = (p) => position.getZ(p) < uniforms.far.value && sigma[p] / 255 <= uniforms.most.value
-  && (uniforms.guesses.value || !guess[labels[p]]);
+const drawn = (p) => position.getZ(p) < uniforms.far.value && sigma[p] / 255 <= uniforms.most.value;
 
 /* the nearest point to the eye within a few pixels of a place of the canvas; -1 for none */
 function pick(x, y) {
@@ -385,7 +382,8 @@ function tell(p) {
   if (p < 0) { $("picked").textContent = "No point is shown there."; return; }
   const i = labels[p], spread = sigma[p] < 255 ? `${(sigma[p] / 5.1).toFixed(sigma[p] < 26 ? 1 : 0)} %` : "50 % or unknown";
   const part = component[i] ? `component ${component[i]}, ${scene.origins[tie[i]]}` : "the static scene";
-  const source = guess[i] ? "depth taken from neighbours" : sigma[p] > 127 ? "a guess: little information" : "flow and parallax";
+  const guess = sigma[p] > 127, known = guess ? "little information" : "flow and parallax";
+  const source = (guess ? "a guess: " : "") + (borrowed[i] ? "depth taken from neighbours" : known);
   $("picked").textContent = `pixel (${(p % w) * scene.step}, ${Math.floor(p / w) * scene.step}): depth`
     + ` ${position.getZ(p).toPrecision(4)} ${scene.unit}, sigma ${spread}; superpixel ${i}, ${part}; ${source}`;
 }
@@ -463,7 +461,7 @@ for (const [kind, make] of Object.entries({ ply, glb }))
 
 $("time").oninput = () => setTime($("time").value);
 $("points").onchange = () => { cloud.visible = $("points").checked; mesh.visible = fringe.visible = !cloud.visible; draw(); };
-$("guesses").onchange = () => { uniforms.guesses.value = $("guesses").checked; draw(); };
+$("guesses").onchange = () => setLeast($("guesses").checked ? 0 : 0.5);
 $("cameras").onchange = () => { cameras.visible = $("cameras").checked; draw(); };
 $("paths").onchange = () => { paths.visible = $("paths").checked; draw(); };
 /* held: both cameras stand in one place, and everything moves as they see it */
