@@ -104,9 +104,10 @@ def certainty(run: Run) -> dict[str, float]:
         components their scales, and with a depth prior "given" (depth or scale are the prior's).
         "guess": the rest; the sum of "rest" (the camera is at rest or only turns), "fixed" (stands
         still in the image though the camera moves, such as the bonnet of its car), "unseen" (no
-        usable flow, or hidden in the next frame), "flat" (of a component without evidence of depth,
-        see `Evidence.guess`), "scale" (of a component whose scale alone is as uncertain as that)
-        and "weak" (anything else). "median_sigma": median of the determined pixels.
+        usable flow, or hidden in the next frame), "torn" (bends although its flow jumps), "flat"
+        (of a component without evidence of depth, see `Evidence.guess`), "scale" (of a component
+        whose scale alone is as uncertain as that) and "weak" (anything else). "median_sigma":
+        median of the determined pixels.
     """
     sigma = run.confidence.sigma
     labels, start = run.segmentation.labels, run.start
@@ -118,7 +119,14 @@ def certainty(run: Run) -> dict[str, float]:
     flat = run.confidence.evidence.guess[start.component][labels]
     loose = run.confidence.scale[labels] > MOST_SIGMA
     guess, left = {}, ~sure
-    reasons = {"rest": rest, "fixed": fixed, "unseen": unseen, "flat": flat, "scale": loose}
+    reasons = {
+        "rest": rest,
+        "fixed": fixed,
+        "unseen": unseen,
+        "torn": start.torn[labels],
+        "flat": flat,
+        "scale": loose,
+    }
     for name, mask in reasons.items():
         guess[name] = left & mask
         left = left & ~mask

@@ -244,6 +244,26 @@ def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float
     return Soup(np.ones(len(R)), n, np.ones(len(R)), R, T).normalised(), error
 
 
+TORN = 8.0
+"""Ratio of the 95 % quantile of the flow's jumps inside surfaces to their median above which parts
+move differently: surfaces that bend have at most 6.4, vehicles that seem to bend at least 9.2."""
+
+
+def torn(flow: FlowFit, surface: Int, bends: Mask) -> Mask:
+    """(N,) True in connected regions that bend (N,) although the flow jumps inside.
+
+    The flow of a bending surface is continuous. Between parts that move differently it jumps.
+    """
+    region, pairs = connected_pieces(bends, flow.seg), flow.seg.pairs
+    inside = (bends & flow.views.usable)[pairs].all(axis=1) & ~flow.seg.across(surface)
+    out = np.zeros(len(bends), bool)
+    for c in np.unique(region[bends]):
+        jump = flow.jump[inside & (region[pairs] == c).all(axis=1)]
+        if len(jump) and np.quantile(jump, 0.95) > TORN * np.median(jump):
+            out |= region == c
+    return out
+
+
 NOISES = 0.4
 """Median excess of the error up to which a surface is rigid, beside the systematic error, in units
 of the noise."""

@@ -12,6 +12,7 @@ from soup_nlp.start.bending import (
     moving_pieces,
     surface_motions,
     surfaces,
+    torn,
     turn_alone,
 )
 from soup_nlp.start.choice import CLIP, LEAST_NOISE, Choice, limited_noise, rigid_choice
@@ -58,6 +59,7 @@ class Start:
             components that start at a constant depth, each superpixel with a motion of its own. If
             the rigid part is small or has no parallax, or the camera is at rest, the whole image is
             one such component.
+        torn: (N,) True where a region bends although the flow jumps inside; its depth is a guess.
         wrong: (N,) True where no accepted motion (`earned`) explains the flow, which then counts as
             wrong.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
@@ -81,6 +83,7 @@ class Start:
     tie: Int
     grounded: Mask
     bends: Mask
+    torn: Mask
     wrong: Mask
     at_rest: bool = False
     noise: float = LEAST_NOISE
@@ -113,6 +116,7 @@ class Start:
             tie=zero,
             grounded=none,
             bends=none,
+            torn=none,
             wrong=none,
             noise=noise,
         )
@@ -136,6 +140,7 @@ def propose(flow: FlowFit) -> Start:
     surface = surfaces(flow)
     motions, bends = surface_motions(flow, surface)
     bends &= o.bending
+    jumping = torn(flow, surface, bends)
     # the flow of bending regions is no evidence of the motions of rigid ones
     rigid = flow.without(bends)
     choice = None if bends.all() else gather(rigid, rigid_choice(rigid, motions))
@@ -145,7 +150,7 @@ def propose(flow: FlowFit) -> Start:
         every = np.ones(len(seg), bool)
         start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
         shared = [] if choice is None else choice.motions
-        start = replace(start, motions=shared, surface=surface, bends=every)
+        start = replace(start, motions=shared, surface=surface, bends=every, torn=jumping)
         return start if turn is None else replace(start, at_rest=True, part=parts_at_rest(flow))
     if not bends.any():
         surface = connected_labels(flow.jump < o.discontinuity_px, seg)
@@ -183,6 +188,7 @@ def propose(flow: FlowFit) -> Start:
         tie=tie,
         grounded=weak & (floor > 0),
         bends=bends,
+        torn=jumping,
         wrong=(wrong | fixed & (shift > STILL_PX)) & ~bends,
         noise=limited_noise(error[~bends]),
         order=order_in_front(flow, soup, component, tie),

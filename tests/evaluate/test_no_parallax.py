@@ -48,18 +48,20 @@ def test_a_start_without_parallax_borrows_depth_but_fits_flow(tiles, angle):
 
 
 @pytest.mark.parametrize(
-    ("scene", "width", "said"),
+    ("scene", "seed", "width", "said"),
     [
-        ("still", 256, True),
-        ("orbit", 256, False),
-        ("sheet", 768, False),
+        ("still", 0, 256, True),
+        ("orbit", 0, 256, False),
+        # vehicles that are taken to bend, although the flow jumps between them
+        ("jam", 25, 320, True),
+        ("sheet", 0, 768, False),
         # smaller ones are called a guess: a constant depth explains them to half a pixel
     ],
 )
-def test_the_verdict_warns_where_depth_is_a_guess(scene, width, said, tmp_path):
+def test_the_verdict_warns_where_depth_is_a_guess(scene, seed, width, said, tmp_path):
     height = width * 109 // 256
     raw = {
-        "input": {"kind": "scene", "scene": scene, "seed": 0, "width": width, "height": height},
+        "input": {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height},
         "flow": {"source": "truth"},
         "segmentation": {"superpixels": 60, "neighbours": 6},
     }

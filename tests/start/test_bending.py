@@ -9,6 +9,7 @@ import pytest
 from helpers_start import fitted, flow_of, squares
 from helpers_truth import majority
 
+from soup_nlp.arrays import Mask
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.pair import Pair
@@ -27,6 +28,7 @@ from soup_nlp.start.bending import (
     fit_turn,
     joined,
     surfaces,
+    torn,
     turn_alone,
 )
 from soup_nlp.start.choice import LEAST_NOISE, dominant, rigid_choice
@@ -116,6 +118,25 @@ def test_a_rigid_room_does_not_bend_with_its_banner(seed, least):
     banner = problem("banner", f"input.seed={seed}")
     start = prepare(banner, pair=banner.load_pair()).start
     assert least < start.bends.mean() < 0.4
+
+
+def test_a_bending_region_whose_flow_jumps_is_torn():
+    seg = squares(6, 20)
+    column = seg.anchors[:, 0] // 8
+    left, cut = column < 10, seg.across(column == 5)
+    one = np.zeros(len(seg), int)
+    jump = np.where(cut, 1.0, 0.05)
+
+    def found(surface: np.ndarray, bends: np.ndarray, usable: np.ndarray | None = None) -> Mask:
+        return torn(flow_of(seg, jump, usable), surface, bends)
+
+    # one column moves by itself inside the left half, nothing does inside the right one
+    np.testing.assert_array_equal(found(one, left), left)
+    assert not found(one, ~left).any()
+    np.testing.assert_array_equal(found(one, left | (column > 12)), left)
+    # neither an outline nor an unusable flow tears a surface
+    assert not found((column == 5).astype(int), left).any()
+    assert not found(one, left, column != 5).any()
 
 
 def test_small_surfaces_join_the_neighbour_with_the_longest_outline():
