@@ -66,8 +66,8 @@ results: $(VENV)/.optional
 		--flow dis --trials 8 --seeds 0 --width 512 --set segmentation.superpixels=300 \
 		--set refine.enabled=false --overwrite
 	$(SOUP) bench chain -o results/accuracy $(if $(DATA),--data $(DATA)) --overwrite
-	$(SOUP) bench paper -o results/paper $(if $(DATA),--data $(DATA)) --limit 2 --superpixels 500 \
-		--analysis 250 --overwrite
+	$(SOUP) bench paper -o results/paper $(if $(DATA),--data $(DATA)) --limit 1 --superpixels 1000 \
+		--analysis 100 --overwrite
 	$(SOUP) bench speed -o results/speed --scenes street,room,orbit,motorcycle --superpixels 1000,2000 \
 		--neighbours 15 --seeds 0 --overwrite
 	$(SOUP) bench speed -o results/speed --name cost --scenes street --widths 512,1024,1792 \
