@@ -33,7 +33,7 @@ class ProcessResult:
 
     Attributes:
         how: "returned", "raised", "killed: time", "killed: memory" or "crashed: SIGNAL".
-        value: Return value of the function, or its exception in one line.
+        value: Return value of the function, its exception in one line, or what killed it.
         seconds: Wall time of the process.
         cpu_seconds: CPU time of the process and its children.
         peak_bytes: Largest resident size of the process or of a child; 0 if it is unknown.
@@ -95,12 +95,27 @@ def isolated(
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     code = process.exitcode or 0
     process.close()
-    if answer is None:
-        word = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-        late = late or word in ("SIGXCPU", "SIGKILL" if cpu >= (cpu_seconds or cpu + 1) else "")
-        answer = "killed: time" if late else f"crashed: {word}", None, 0
-    how, value, peak = answer
+    if answer is None and late:
+        answer = "killed: time", f"wall time limit of {seconds:g} s reached", 0
+    how, value, peak = answer or (*without_answer(code, cpu, cpu_seconds), 0)
     return ProcessResult(how, value, spent, cpu, peak)
+
+
+def without_answer(code: int, cpu: float, limit: float | None) -> tuple[str, str | None]:
+    """How a process without an answer ended, and what killed it, in words.
+
+    Args:
+        code: Exit code, the negative number of the signal that ended it.
+        cpu: CPU seconds of the process and its children.
+        limit: Their limit, at which the system sends SIGXCPU, and SIGKILL if that is ignored.
+    """
+    if code >= 0:
+        return f"crashed: exit code {code}", None
+    name = next((s.name for s in signal.Signals if s == -code), f"signal {-code}")
+    if limit is not None and cpu >= limit and name in ("SIGXCPU", "SIGKILL"):
+        return "killed: time", f"CPU limit of {limit:g} s reached"
+    perhaps = ", perhaps out of memory" if name == "SIGKILL" else ""
+    return f"crashed: {name}", f"killed by {name}{perhaps}"
 
 
 def _child(

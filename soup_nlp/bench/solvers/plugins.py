@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from soup_nlp.arrays import Float
+from soup_nlp.bench.processes import without_answer
 from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
@@ -274,6 +275,9 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
         except subprocess.TimeoutExpired:
             return Answer(None, None, "Time_Limit", False)
     if not path.is_file():
+        _, killed_by = without_answer(code, clock() - begin, task.limits.seconds)
+        if killed_by:
+            return Answer(None, None, killed_by, False)
         raise SolverError("solver wrote no .sol", where=Path(command).name, found=f"exit {code}")
     sol = read_sol(path, file.variables, file.rows)
     status = sol.message.splitlines()[-1] if sol.message else sol.status

@@ -210,9 +210,10 @@ def _verified(task: Task, answer: Answer, seconds: float, energy_limit: float) -
     """
     # a claim after the time limit does not count
     x, late = answer.x, not seconds <= task.limits.seconds
+    found = x is not None
     row: Row = {
-        "status": f"over the time limit: {answer.status}" if late else answer.status,
-        "claimed": answer.claimed and x is not None and not late,
+        "status": f"over the time limit: {answer.status}" if late and found else answer.status,
+        "claimed": answer.claimed and found and not late,
         "iterations": answer.iterations,
         "seconds": seconds,
     }
