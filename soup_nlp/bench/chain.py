@@ -7,8 +7,9 @@ import pandas as pd
 
 from soup_nlp.bench.study import Cell, Item, page_text, provenance, titled
 from soup_nlp.errors import DataError
+from soup_nlp.sequence.folder import ROWS
 from soup_nlp.sequence.score import score
-from soup_nlp.sequence.solve import ROWS, SCENE, solve_chain
+from soup_nlp.sequence.solve import SCENE, solve_chain
 from soup_nlp.storage.rows import Row, read_rows
 from soup_nlp.storage.system import scratch
 

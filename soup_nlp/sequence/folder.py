@@ -5,6 +5,7 @@ It holds depth and clouds in one scale, trajectories, a table, a page and a vide
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import cv2
@@ -22,11 +23,14 @@ from soup_nlp.sequence.page import RATE, chain_page, depth_pictures, write_anima
 from soup_nlp.sequence.score import score
 from soup_nlp.storage.files import as_path, is_file, read_json, write_bytes, write_text
 from soup_nlp.storage.folders import staged
+from soup_nlp.storage.rows import failed, read_rows
 from soup_nlp.storage.store import write_json
 from soup_nlp.storage.system import scratch
 
 CHAIN = "chain.json"
 """File that makes a folder that of a chain."""
+ROWS = "pairs.jsonl"
+"""File with a row for each pair of a sequence."""
 SAME = 1e-6
 """Largest relative difference of stored scales and poses from recomputed ones."""
 COLMAP_POINTS = 60_000
@@ -36,8 +40,33 @@ VISIBLE = 0.03
 
 
 def is_chain(folder: Path) -> bool:
-    """Whether a folder is that of a chain."""
-    return is_file(folder / CHAIN)
+    """Whether a folder is that of a chain.
+
+    Raises:
+        DataError: it is, but the chain is not finished.
+    """
+    if is_file(folder / CHAIN) or not is_file(folder / ROWS):
+        return is_file(folder / CHAIN)
+    rows = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
+    broken = sorted(key for key, row in rows.items() if failed(row))
+    stored = sorted(key for key in rows if is_file(folder / "pairs" / key / "result.h5"))
+    solved = [key for key in stored if key not in broken]
+    hint = "the same soup-nlp chain command goes on where it stopped"
+    if solved:
+        hint += f"; soup-nlp view {quote(str(folder / 'pairs' / solved[0]))} shows a single pair"
+    raise DataError(
+        "chain is not finished",
+        where=folder,
+        found=f"pairs solved: {_some(solved)}; failed: {_some(broken)}",
+        expected=f"{CHAIN}, written when every pair is solved",
+        hint=hint,
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    """The number of some names, and the first ones."""
+    more = " ..." if len(names) > 6 else ""
+    return f"{len(names)} ({', '.join(names[:6])}{more})" if names else "none"
 
 
 def read_chain(folder: Path) -> tuple[Chain, dict[str, Any]]:

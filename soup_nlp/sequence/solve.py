@@ -18,7 +18,7 @@ from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.report.figures import write_png
 from soup_nlp.report.folder import run
 from soup_nlp.sequence.chain import Chain, SolvedPair, make_chain, read_pair
-from soup_nlp.sequence.folder import SINGLE, chain_files, write_chain
+from soup_nlp.sequence.folder import ROWS, SINGLE, chain_files, write_chain
 from soup_nlp.sequence.frames import (
     MAX_STEP,
     PROBED,
@@ -38,8 +38,6 @@ from soup_nlp.storage.rows import Job, Row, Say, attempt, failed, measure_all, r
 
 SCENE = "scene:"
 """Prefix of the name of a rendered scene."""
-ROWS = "pairs.jsonl"
-"""File with a row for each pair of a sequence."""
 OF_PAIRS = "output.page=false", "refine.rounds=1"
 """Overrides of every pair: the sequence has its own page, and one round of the refinement does most
 of its work."""

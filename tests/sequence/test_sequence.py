@@ -17,7 +17,7 @@ from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, SolverError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.figures import write_png
@@ -318,10 +318,12 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert main([*call, "--overwrite"]) == 0
 
 
-def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch):
+def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch, capsys):
     seen = []
 
     def solve(raw, overrides, place):
+        if place.name == "001_002":
+            raise DataError("no flow")
         seen.append(overrides)
         place.mkdir(parents=True, exist_ok=True)
         (place / "result.h5").touch()
@@ -332,6 +334,14 @@ def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch)
     for own in (["a"], ["a"], ["b"], ["a"]):
         assert solving.solve_pairs(scene_frames("street", 3), [(0, 1)], tmp_path, own) == [(0, 1)]
     assert seen == [(*solving.OF_PAIRS, own) for own in "aba"]
+    with pytest.raises(SolverError, match="1 of 1 pairs"):
+        solving.solve_pairs(scene_frames("street", 3), [(1, 2)], tmp_path)
+    for command in ("view", "check"):
+        assert main([command, str(tmp_path)]) == 2
+        error = capsys.readouterr().err
+        assert "found: pairs solved: 1 (000_001); failed: 1 (001_002)" in error
+        assert "the same soup-nlp chain command goes on" in error
+        assert f"soup-nlp view {tmp_path}/pairs/000_001 shows" in error
 
 
 @pytest.mark.filterwarnings("default:.*the key white")
