@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import lru_cache
@@ -13,7 +12,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import Image as Picture
 from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Image
@@ -147,24 +145,37 @@ def depth_files(folder: Path) -> list[Path]:
     return sorted(depths, key=lambda path: _by_number(path.name))
 
 
+def check_sizes(images: Sequence[Path], turn: bool) -> None:
+    """Read all pictures of a sequence, which must have one size.
+
+    Args:
+        images: Their files.
+        turn: See `read_images`.
+
+    Raises:
+        DataError: one is damaged, or they differ in size.
+    """
+    sizes: dict[tuple[int, int], Path] = {}
+    for path in images:
+        height, width = read_image(path, turn=turn).shape[:2]
+        sizes.setdefault((width, height), path)
+        if len(sizes) > 1:
+            raise DataError(
+                "pictures differ in size: are they one sequence?",
+                where=path,
+                found=", ".join(f"{p.name} {w}x{h}" for (w, h), p in sizes.items()),
+                expected="frames of one camera, all of one size",
+                hint="name the frames by a pattern such as 'clip/frame_*.png', or crop them to one"
+                " size; soup-nlp solve REF NEXT takes two images of different size",
+            )
+
+
 def check_sequence(images: list[Path]) -> None:
     """Check that the pictures of a folder are frames of one sequence.
 
     Raises:
-        DataError: they differ in size, or no picture continues the one before it.
+        DataError: no picture continues the one before it.
     """
-    sizes: dict[tuple[int, int], Path] = {}
-    for path in images:
-        with suppress(OSError), Picture.open(require_file(path, "image")) as image:
-            sizes.setdefault(image.size, path)
-    if len(sizes) > 1:
-        raise DataError(
-            "pictures of the folder differ in size: are they one sequence?",
-            where=images[0].parent,
-            found=", ".join(f"{p.name} {w}x{h}" for (w, h), p in list(sizes.items())[:4]),
-            expected="frames of one camera",
-            hint="name the frames by a pattern such as 'clip/frame_*.png'",
-        )
     first = images[: PROBED + 1]
     if not any(continues(a, b) for a, b in pairwise(first)):
         raise DataError(

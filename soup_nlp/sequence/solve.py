@@ -12,7 +12,7 @@ import numpy as np
 
 from soup_nlp.config.problem import Problem, make_problem, title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
-from soup_nlp.data.formats.images import DataWarning, read_image
+from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
 from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.report.figures import write_png
@@ -26,6 +26,7 @@ from soup_nlp.sequence.frames import (
     Frames,
     Raw,
     check_sequence,
+    check_sizes,
     find_depths,
     find_images,
     key_frames,
@@ -283,7 +284,7 @@ def _frames(
         if step != 1 or camera:
             raise ConfigError("a rendered scene has its own camera and steps", found=source)
         return scene_frames(source.removeprefix(SCENE), most or 10)
-    depths: list[Path] = []
+    depths, in_folder = list[Path](), False
     # with AUTO the limit applies to the chosen frames
     end = most if step else None
     if not isinstance(source, str | Path):
@@ -292,9 +293,7 @@ def _frames(
         read = None if most is None or step else most * MAX_STEP
         images = video_frames(path, out / "frames", step or 1, end or read)
     else:
-        images = find_images(path)[:: step or 1][:end]
-        if len(images) > 1:
-            check_sequence(images)
+        images, in_folder = find_images(path)[:: step or 1][:end], True
         depths = [] if "undistort" in camera else find_depths(images)
     if len(images) < 2:
         raise ConfigError(
@@ -308,8 +307,9 @@ def _frames(
     if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
         camera = {"intrinsics": str(beside), **camera}
     frames = Frames(tuple(map(str, images)), camera, depths, depth_scale)
-    for image in images:
-        read_image(image, turn="intrinsics" not in camera)
+    check_sizes(images, turn="intrinsics" not in camera)
+    if in_folder:
+        check_sequence(images)
     if step:
         return frames
     first = make_problem({"input": frames.pair(0, 1)}, where="sequence").load_pair()

@@ -32,7 +32,15 @@ def test_pictures_of_no_sequence_are_refused(tmp_path, capsys):
         write_png(tmp_path / f"{k}.png", rng.integers(0, 256, (*size, 3)).astype(np.uint8))
     assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
     assert "differ in size: are they one sequence?" in capsys.readouterr().err
-    (tmp_path / "2.png").unlink()
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.fromarray(IMAGE).save(tmp_path / "2.jpg", exif=exif)
+    # files that are named, too; the size is that of the picture as it is shown
+    for name, size in (("2.png", "64x40"), ("2.jpg", "48x64")):
+        images = [str(tmp_path / x) for x in ("0.png", "1.png", name)]
+        assert main(["chain", *images, "-o", str(tmp_path / "out")]) == 2
+        assert f"found: 0.png 64x48, {name} {size}" in capsys.readouterr().err
+        (tmp_path / name).unlink()
     assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
     assert "continues the one before it" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
