@@ -142,9 +142,10 @@ class Problem(Section):
         """The frame pair, without its flow.
 
         Raises:
-            ConfigError: the pair was in memory only.
+            ConfigError: the pair was in memory only, or a depth prior has a kind but no source.
             DataError: a file is missing, damaged, or does not fit.
         """
+        self.depth_prior.require_prior()
         return replace(self.input.load(self.path), name=self.name)
 
     def input_paths(self) -> list[Path]:

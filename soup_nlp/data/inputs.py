@@ -40,6 +40,16 @@ class PriorOptions(Section):
     inverse (inverse depth up to scale and shift) or ordinal (numbers that only rise with depth);
     null to find out by the flow, and relative where it does not tell."""
 
+    def require_prior(self, in_memory: bool = False) -> None:
+        """Raise ConfigError for a kind without a prior, in a file or `in_memory`."""
+        if self.kind is not None and self.source is None and not in_memory:
+            raise ConfigError(
+                "a depth prior has a kind, but no source",
+                where="depth_prior",
+                found=f"kind {self.kind}",
+                expected="a source beside the kind, such as --depth-prior FILE, or neither",
+            )
+
     def load(self, pair: Pair, path: Resolve) -> Pair:
         """The pair with the prior of the source, if there is one.
 
@@ -48,8 +58,10 @@ class PriorOptions(Section):
             path: Resolves the name of a file.
 
         Raises:
+            ConfigError: see `require_prior`.
             DataError: the file is damaged, or its map has another shape than the image.
         """
+        self.require_prior(pair.depth_prior is not None)
         if self.source is None:
             return pair
         name = str(path(self.source))

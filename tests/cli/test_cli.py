@@ -167,6 +167,7 @@ def test_one_superpixel_is_one_plane(images, tmp_path):
         ("solve missing.yaml", "problem file is missing"),
         ("solve a.png b.png --intrinsics 50,50", "fx,fy,cx,cy"),
         ("solve a.png b.png --intrinsics 50,50,32,24 --fov 60", "two cameras"),
+        ("solve a.png b.png --depth-prior-kind inverse", "a depth prior has a kind, but no source"),
         ("chain missing", "nothing matches it"),
         ("chain scene:stret", "did you mean street"),
         ("chain scene:street --set solver.maxiter=3", "did you mean max_iter"),

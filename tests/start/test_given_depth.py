@@ -11,7 +11,7 @@ import soup_nlp
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.inputs import PriorOptions, resized_prior
 from soup_nlp.data.pair import Pair
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.geometry.superpixels import Labels, segment
@@ -282,6 +282,8 @@ def test_a_prior_that_cannot_be_one_is_refused(swing):
         resized_prior(swing.depth[:, :100], swing.pair, "a file")
     with pytest.raises(DataError, match="unknown everywhere"):
         resized_prior(np.full((24, 32), np.nan), swing.pair, "a file")
+    with pytest.raises(ConfigError, match="no source"):
+        soup_nlp.solve_pair(swing.pair, depth_prior={"kind": "inverse"})
     with pytest.raises(DataError, match="wrong shape"):
         Pair(swing.pair.image_ref, swing.pair.image_next, fov=60, depth_prior=np.zeros((2, 2, 2)))
 
