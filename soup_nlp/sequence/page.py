@@ -24,7 +24,7 @@ from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
 from soup_nlp.report.pictures import depth_bar
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.fused import Cloud, every_kth, fuse, movers, shown_tracks
-from soup_nlp.sequence.score import LINK_HEADS, link_rows, score_text
+from soup_nlp.sequence.score import link_table, score_text
 from soup_nlp.storage.files import PathLike, write_bytes
 from soup_nlp.storage.store import plain
 
@@ -61,7 +61,7 @@ def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
         "names": [Path(x).name for x in contents["sources"]],
         "scene": scene,
     }
-    links = table(LINK_HEADS, link_rows(contents))
+    links = table(*link_table(contents))
     if contents["score"]:
         links += f"<p>{score_text(contents['score'])}.</p>"
     return Template(web_file("chain.html")).substitute(

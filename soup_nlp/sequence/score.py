@@ -10,10 +10,8 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import MEDIAN, UNSCALED, depth_metrics
 from soup_nlp.sequence.chain import Chain
 
-LINK_HEADS = ["pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", ""]
-"""Heads of the columns of `link_rows`."""
-WIDTHS = (16, 13, 11, 9, 8)
-"""Characters of these columns in the terminal, after the first one, which has ten."""
+WIDTHS = {"ratio of scales": 16, "spread (log)": 13, "true ratio": 11, "pixels": 9, "": 8}
+"""Columns of `link_table` after the first one, and their characters in the terminal."""
 
 
 def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any] | None:
@@ -78,17 +76,21 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     }
 
 
-def link_rows(contents: Mapping[str, Any]) -> list[list[str]]:
-    """The links of a chain.json as rows of a table."""
+def link_table(contents: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """The links of a chain.json as heads and rows; without the true ratio if none is known."""
     true = {tuple(k["pairs"]): k["true"] for k in (contents["score"] or {}).get("links", ())}
-    rows = []
+    heads, rows = ["pairs", *WIDTHS], []
     for k in contents["links"]:
         a, b = k["pairs"]
         true_ratio = f"{true[a, b]:.3f}" if (a, b) in true else ""
         note = "bridge" if k["bridge"] else "a guess" if k["flagged"] else ""
         numbers = [f"{k['ratio']:.3f}", f"{k['spread']:.3f}", true_ratio, str(k["pixels"])]
         rows.append([f"{a}, {b}", *numbers, note])
-    return rows
+    column = heads.index("true ratio")
+    if not any(row[column] for row in rows):
+        for row in (heads, *rows):
+            del row[column]
+    return heads, rows
 
 
 def score_text(scores: Mapping[str, Any]) -> str:
@@ -105,8 +107,9 @@ def score_text(scores: Mapping[str, Any]) -> str:
 def chain_lines(chain: Chain, contents: Mapping[str, Any]) -> list[str]:
     """Scales, links and, with a truth, errors of a chain for the terminal."""
     lines = [str(chain)]
-    for pairs, *cells in [LINK_HEADS, *link_rows(contents)]:
-        padded = [f"{cell:>{width}}" for cell, width in zip(cells, WIDTHS, strict=True)]
+    heads, rows = link_table(contents)
+    for pairs, *cells in (heads, *rows):
+        padded = [f"{cell:>{WIDTHS[head]}}" for head, cell in zip(heads[1:], cells, strict=True)]
         lines.append(f"{pairs:<10}{''.join(padded)}".rstrip())
     long = [track for track in contents["tracks"] if len(track["path"]) > 2]
     lines.append(f"tracks      {len(long)} components followed over two pairs or more")

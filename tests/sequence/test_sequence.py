@@ -35,7 +35,7 @@ from soup_nlp.sequence.chain import (
 from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
 from soup_nlp.sequence.frames import Frames, scene_frames
 from soup_nlp.sequence.fused import fuse, movers
-from soup_nlp.sequence.score import aligned
+from soup_nlp.sequence.score import aligned, chain_lines, link_table
 from soup_nlp.sequence.solve import one_camera
 
 pytestmark = pytest.mark.slow
@@ -155,6 +155,12 @@ def test_a_chain_is_written(tmp_path):
     told = json.loads((tmp_path / "chain.json").read_text())
     assert told["sources"] == ["a.png", "b.png", "</script>"]
     assert told["score"] is None
+    # without a truth, no column for it
+    heads, (row,) = link_table(told)
+    assert heads == ["pairs", "ratio of scales", "spread (log)", "pixels", ""]
+    assert row[:2] == ["0, 1", "2.000"]
+    assert chain_lines(chain, told)[1].split() == " ".join(heads).split()
+    assert "true ratio" not in (tmp_path / "chain.html").read_text()
     np.testing.assert_allclose([s["scale"] for s in told["scales"]], [1, 2], rtol=1e-9)
     for k in range(3):
         path = str(tmp_path / "depth" / f"{k:04d}.png")
@@ -268,6 +274,9 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert told["score"]["cost"] < 0.02
     assert told["score"]["path"]["share"] < 0.01
     assert "with one for the sequence" in printed
+    line = next(line for line in printed.splitlines() if line.startswith("0, 1"))
+    columns = printed.split("true ratio")[0].splitlines()[-1] + "true ratio"
+    assert float(line[: len(columns)].split()[-1]) == round(told["score"]["links"][0]["true"], 3)
     # the folder is a result
     out = tmp_path / "out"
     assert main(["check", str(out)]) == 0
