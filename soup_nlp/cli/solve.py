@@ -150,14 +150,24 @@ def solve_problem(
     """
     folder = prepare_folder(out, chosen.input_paths(), overwrite, chosen.subject)
     interrupt = interruptible(log.interrupted)
+    interrupt.at_once = True
+
+    def on_stage(stage: str) -> None:
+        log.stage(stage)
+        # then the start follows, which is kept
+        interrupt.at_once = stage in ("load", "flow")
+
     with interrupt as stop, log.warnings(), log, scratch() as temporary:
         ipopt_log = temporary / "ipopt.log"
         try:
-            run = run_problem(chosen, stop=stop, ipopt_log=str(ipopt_log), **log.listeners)
+            listeners = {**log.listeners, "on_stage": on_stage}
+            run = run_problem(chosen, stop=stop, ipopt_log=str(ipopt_log), **listeners)
             if interrupt.aborted:
                 raise KeyboardInterrupt
         except BaseException as error:
-            log.lines.append(f"failed: {str(error) or type(error).__name__}")
+            interrupted = isinstance(error, KeyboardInterrupt)
+            words = "interrupted" if interrupted else str(error) or type(error).__name__
+            log.lines.append(f"failed: {words}")
             # for input that cannot be used the message is enough
             if not isinstance(error, ConfigError | DataError):
                 with suppress(SoupError):

@@ -59,9 +59,10 @@ class Watch:
 class interruptible:  # noqa: N801
     """Context in which Ctrl-C sets an event instead of raising (main thread only).
 
-    SIGTERM does the same. The second signal raises KeyboardInterrupt, except while `deferred` is
-    set, as during the writing of files. CasADi discards a KeyboardInterrupt from its callbacks;
-    `aborted` records it.
+    SIGTERM does the same. The second signal raises KeyboardInterrupt, and the first one while
+    `at_once` is set, as long as there is nothing to keep; neither does while `deferred` is set, as
+    during the writing of files. CasADi discards a KeyboardInterrupt from its callbacks; `aborted`
+    records it.
 
     Args:
         say: Called in a signal handler, with the effect of this Ctrl-C.
@@ -73,7 +74,7 @@ class interruptible:  # noqa: N801
     ) -> None:
         self._handling = handling(self._set, numbers)
         self.event = threading.Event()
-        self.deferred = self.aborted = False
+        self.at_once = self.deferred = self.aborted = False
         self._say = say or (lambda line: None)
 
     def __enter__(self) -> threading.Event:
@@ -83,14 +84,16 @@ class interruptible:  # noqa: N801
     def _set(self, number: int, frame: FrameType | None) -> None:
         if self.deferred:
             self._say("interrupt received: the files are being written, this ends then")
-        elif self.event.is_set():
+        elif self.at_once or self.event.is_set():
+            if not self.event.is_set():
+                self._say("interrupt received before there was a start: this ends at once")
+            self.event.set()
             self.aborted = True
             raise KeyboardInterrupt
         else:
             self._say(
-                "interrupt received: the best iterate so far will be written with every file; if"
-                " the initialisation is not complete, this ends after the current stage; a second"
-                " interrupt aborts at once"
+                "interrupt received: the best iterate so far will be written with every file; a"
+                " second interrupt aborts at once"
             )
         self.event.set()
 
