@@ -21,7 +21,7 @@ from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import exit_code, verdict
 from soup_nlp.sequence.folder import CHAIN, SINGLE
 from soup_nlp.sequence.frames import IMAGES, VIDEOS, Frames
-from soup_nlp.sequence.score import chain_lines
+from soup_nlp.sequence.score import chain_exit_code, chain_lines
 from soup_nlp.sequence.solve import AUTO, named, solve_chain
 from soup_nlp.storage.files import as_path, is_file, read_json
 from soup_nlp.storage.folders import default_folder
@@ -232,7 +232,7 @@ def chain(
     workers: options.Workers = 1,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
-) -> None:
+) -> int:
     """Solve the consecutive pairs of a sequence and put them on one scale."""
     frames_of = source[0] if len(source) == 1 else source
     name, subject = named(frames_of)
@@ -265,3 +265,6 @@ def chain(
         )
     print("\n".join(chain_lines(done, read_json(out / CHAIN, CHAIN))))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "points/", "pairs/"]))
+    code, why = chain_exit_code(done)
+    print(f"exit code   {code}: {why}")
+    return code

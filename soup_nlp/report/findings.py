@@ -75,12 +75,12 @@ def certainty_lines(shares: Mapping[str, float]) -> list[str]:
     return lines + ([guess_words(shares)] if shares["guess"] >= LEAST else [])
 
 
-def guess_line(shares: Mapping[str, float]) -> str:
+def guess_line(shares: Mapping[str, float], of: str = "the image") -> str:
     """The share that is a guess, with the reason of its largest part; "" for next to none."""
     if shares["guess"] < LEAST:
         return ""
     reason = SHARES[max(GUESSES, key=lambda name: shares.get(name, 0.0))]
-    return f"{shares['guess']:.0%} of the image is a guess: {reason}"
+    return f"{shares['guess']:.0%} of {of} is a guess: {reason}"
 
 
 def guess_words(shares: Mapping[str, float], of: str = "") -> str:

@@ -207,7 +207,11 @@ class Chain:
     def __str__(self) -> str:
         low, high = self.scales.min(), self.scales.max()
         flagged = sum(k.flagged for k in self.links)
-        return f"Chain({len(self)} frames, scales {low:.3g}..{high:.3g}, {flagged} flagged links)"
+        guess = np.mean([pair.result.summary["certainty"]["guess"] for pair in self.pairs])
+        return (
+            f"Chain({len(self)} frames, scales {low:.3g}..{high:.3g}, {flagged} flagged links,"
+            f" {guess:.0%} a guess)"
+        )
 
     __repr__ = __str__
 

@@ -16,15 +16,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Image
+from soup_nlp.arrays import Image, Mask
+from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.colour import colourise_depth, depth_range
+from soup_nlp.report.findings import guess_line
 from soup_nlp.report.models import GLTF
 from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
 from soup_nlp.report.pictures import depth_bar
-from soup_nlp.sequence.chain import Chain
+from soup_nlp.sequence.chain import Chain, carried
 from soup_nlp.sequence.fused import Cloud, every_kth, fuse, movers, shown_tracks
-from soup_nlp.sequence.score import link_table, score_text
+from soup_nlp.sequence.score import certainty, link_table, score_text
 from soup_nlp.storage.files import PathLike, write_bytes
 from soup_nlp.storage.store import plain
 
@@ -34,16 +36,32 @@ MANY = 24
 """Frames above which the images have half the width."""
 STILL, MOVING = 120_000, 60_000
 """Largest numbers of points of the static scene, and of moving components in all frames."""
+PALE = 0.4
+"""Share of its colour that the depth of a guess keeps; the rest is white."""
 QUALITY = 80
 """JPEG quality of the images."""
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf")
 
 
 def depth_pictures(chain: Chain) -> tuple[list[Image], tuple[float, float]]:
-    """Depth of every frame in colour, and the range of the colours (near, far), one for all."""
+    """Depth of every frame in colour, pale where it is a guess; the range of the colours (near,
+    far), one for all."""
     depths = [chain.depth(k) for k in range(len(chain))]
     span = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
-    return [colourise_depth(z, *span) for z in depths], span
+    out = []
+    for k, z in enumerate(depths):
+        colours, guess = colourise_depth(z, *span), guess_of(chain, k)
+        colours[guess] = 255 - PALE * (255 - colours[guess])
+        out.append(colours)
+    return out, span
+
+
+def guess_of(chain: Chain, frame: int) -> Mask:
+    """(H, W) True where the depth of a frame is a guess; False where nothing is known."""
+    pair, side = chain.seen(frame)
+    result = chain.pairs[pair].result
+    sure = result.sigma <= MOST_SIGMA
+    return np.asarray(carried(sure, result.reconstruction) == 0 if side else ~sure)
 
 
 def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
@@ -58,6 +76,7 @@ def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
             [encoded(image, "jpeg", quality, width) for image in (chain.image(k), picture)]
             for k, picture in enumerate(pictures)
         ],
+        "guess": [float(guess_of(chain, k).mean()) for k in range(len(chain))],
         "names": [Path(x).name for x in contents["sources"]],
         "scene": scene,
     }
@@ -66,6 +85,7 @@ def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
         links += f"<p>{score_text(contents['score'])}.</p>"
     return Template(web_file("chain.html")).substitute(
         title=html.escape(str(contents["name"])),
+        certainty=html.escape(guess_line(certainty(chain), "all images")),
         last=len(chain) - 1,
         # "<" could end the script element
         data=json.dumps(plain(data)).replace("<", "\\u003c"),

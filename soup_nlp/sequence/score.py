@@ -8,7 +8,9 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import MEDIAN, UNSCALED, depth_metrics
-from soup_nlp.sequence.chain import Chain
+from soup_nlp.report.findings import certainty_lines, guess_line
+from soup_nlp.report.verdict import sectioned
+from soup_nlp.sequence.chain import MAX_GUESSED, Chain
 
 WIDTHS = {"ratio of scales": 16, "spread (log)": 13, "true ratio": 11, "pixels": 9, "": 8}
 """Columns of `link_table` after the first one, and their characters in the terminal."""
@@ -113,9 +115,25 @@ def chain_lines(chain: Chain, contents: Mapping[str, Any]) -> list[str]:
         lines.append(f"{pairs:<10}{''.join(padded)}".rstrip())
     long = [track for track in contents["tracks"] if len(track["path"]) > 2]
     lines.append(f"tracks      {len(long)} components followed over two pairs or more")
+    lines.append(sectioned({"certainty": certainty_lines(certainty(chain))}))
     if contents["score"]:
         lines.append(f"accuracy    {score_text(contents['score'])}")
     return lines
+
+
+def certainty(chain: Chain) -> dict[str, float]:
+    """Means over the pairs of a chain of the shares in `report.summary.certainty`."""
+    rows = [pair.result.summary["certainty"] for pair in chain.pairs]
+    known = {k: [row[k] for row in rows if row.get(k) is not None] for k in rows[0]}
+    return {k: float(np.mean(values)) if values else np.nan for k, values in known.items()}
+
+
+def chain_exit_code(chain: Chain) -> tuple[int, str]:
+    """Exit code of `soup-nlp chain`, and its reason."""
+    shares = certainty(chain)
+    if shares["guess"] > MAX_GUESSED:
+        return 1, guess_line(shares, "all images")
+    return 0, "solved, and at most half of all images is a guess"
 
 
 def score_lines(scores: Mapping[str, Any] | None) -> list[str]:

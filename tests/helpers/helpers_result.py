@@ -12,12 +12,15 @@ from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.report.result import Result
+from soup_nlp.sequence.chain import SolvedPair
 
 K = intrinsics(100.0, 100.0, 39.5, 29.5)
 CAMERA = RigidMotion(exp([0.0, 0.01, 0.0]), np.array([0.05, 0.02, -0.1]))
 BOARD = RigidMotion(exp([0.0, 0.0, 0.05]), np.array([-0.1, 0.0, -0.1]))
 """next_from_ref."""
 WALL_Z, BOARD_Z = 4.0, 2.0
+CERTAINTY = {"determined": 1.0, "flow": 1.0, "guess": 0.0, "flat": 0.0, "median_sigma": 0.07}
+"""Some of the shares of `report.summary.certainty`."""
 
 
 def board() -> np.ndarray:
@@ -40,8 +43,32 @@ def small_result() -> Result:
     pair = {"image_ref": image, "image_next": image[::-1].copy(), "K_ref": K, "K_next": K}
     return Result(
         tree={"input": {**pair, "confidence": (u / 100).astype(np.float32)}},
-        summary={"name": "board"},
+        summary={"name": "board", "certainty": CERTAINTY},
         reconstruction=replace(reconstruct(soup, labels, K, K), sigma_ref=0.001 * (u + v)),
         components=find_components(soup, seg, mine.astype(int), K, K),
         metrics={"solution": depth_metrics(1.0, 10.0)},
     )
+
+
+def scaled(result: Result, factor: float) -> Result:
+    """The same result in another unit of length."""
+    rec = result.reconstruction
+    changes = {k: factor * getattr(rec, k) for k in ("depth_ref", "depth_next")}
+    changes |= {k: factor * getattr(rec, k) for k in ("points_ref", "points_next")}
+    parts = tuple(
+        replace(c, motion=replace(c.motion, t=factor * c.motion.t), centre=factor * c.centre)
+        for c in result.components
+    )
+    components = replace(result.components, members=parts)
+    return replace(result, reconstruction=replace(rec, **changes), components=components)
+
+
+def toy_pairs() -> list[SolvedPair]:
+    """Two pairs of frames 0, 1, 2; the wall comes nearer by CAMERA, and units differ by 2."""
+    first = small_result()
+    # seen from frame 1 the scene is the next frame of the first pair
+    depth = first.reconstruction.depth_next
+    second = scaled(first, 0.5)
+    rec = replace(second.reconstruction, depth_ref=0.5 * depth)
+    second = replace(second, reconstruction=rec)
+    return [SolvedPair(k, k + 1, r, {}, 5.0) for k, r in enumerate((first, second))]

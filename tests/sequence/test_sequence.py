@@ -1,4 +1,4 @@
-"""Common scale of the pairs of a sequence."""
+"""The folder, page and commands of a sequence."""
 
 import json
 from contextlib import nullcontext
@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from helpers_chromium import Chromium, find_chromium
 from helpers_files import sets
-from helpers_result import CAMERA, small_result
+from helpers_result import CAMERA, CERTAINTY, toy_pairs
 
 from soup_nlp.bench import chain as chain_study
 from soup_nlp.bench.study import Cell, frame_of
@@ -18,133 +18,18 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError, SolverError
-from soup_nlp.geometry.rotation import exp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import solve as solving
-from soup_nlp.sequence.chain import (
-    Link,
-    SolvedPair,
-    carried,
-    follow,
-    link,
-    make_chain,
-    number,
-    solve_scales,
-)
+from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
 from soup_nlp.sequence.frames import Frames, scene_frames
-from soup_nlp.sequence.fused import fuse, movers
-from soup_nlp.sequence.score import aligned, chain_lines, link_table
+from soup_nlp.sequence.fused import fuse
+from soup_nlp.sequence.page import depth_pictures, guess_of
+from soup_nlp.sequence.score import chain_exit_code, chain_lines, link_table
 from soup_nlp.sequence.solve import one_camera
 
 pytestmark = pytest.mark.slow
-
-
-def test_the_link_of_two_maps_is_their_median_ratio():
-    rng = np.random.default_rng(0)
-    one = rng.uniform(1, 5, (30, 40))
-    other = one / 1.3 * np.exp(rng.normal(0, 0.02, one.shape))
-    # a fifth is far off, some is unknown
-    other[:6] *= 3
-    other[6:8] = np.nan
-    found = link((2, 3), one, other, np.ones(one.shape, bool))
-    assert (found.first, found.second, found.pixels) == (2, 3, 28 * 40)
-    # the median of noise of 0.02, moved by the fifth on one side: less than one of its deviations
-    assert found.log_ratio == pytest.approx(np.log(1.3), abs=0.02)
-    assert 0.02 < found.spread < 0.04
-    assert not found.flagged
-    assert link((0, 1), one, other, np.zeros(one.shape, bool)) is None
-    few = np.zeros(one.shape, bool)
-    few[10, :20] = True
-    assert link((0, 1), one, other, few).flagged
-
-
-def test_scales_follow_their_links():
-    true = np.array([1.0, 1.2, 0.7, 0.9])
-
-    def between(a, b, error=0.0, **marks):
-        return Link(a, b, float(np.log(true[b] / true[a]) + error), 0.02, 5000, **marks)
-
-    chain = [between(0, 1), between(1, 2), between(2, 3)]
-    np.testing.assert_allclose(solve_scales(4, chain), true, rtol=1e-9)
-    assert solve_scales(1, []) == [1.0]
-    # one of several that contradict each other gives way, a guess even more
-    more = [*chain, between(0, 2), between(1, 3), between(0, 3, error=0.5)]
-    np.testing.assert_allclose(solve_scales(4, more), true, rtol=0.02)
-    guess = [*chain[:2], between(2, 3, error=0.5, flagged=True), between(1, 3, bridge=True)]
-    np.testing.assert_allclose(solve_scales(4, guess), true, rtol=0.01)
-    with pytest.raises(DataError, match="pair 3"):
-        solve_scales(4, chain[:2])
-
-
-def test_components_are_followed_by_overlap():
-    before = np.zeros((10, 20), int)
-    before[2:6, 2:8], before[2:6, 12:16] = 1, 2
-    before[0] = -1
-    after = np.zeros((10, 20), int)
-    after[3:7, 2:8], after[7:9, 10:19] = 2, 1
-    assert follow(before, after) == {1: 2}
-    assert follow(before, np.zeros((10, 20), int)) == {}
-    tracks = number([{1: 2}, {2: 1}], [3, 3, 2])
-    assert tracks == [{0: 0, 1: 1, 2: 2}, {0: 0, 1: 3, 2: 1}, {0: 0, 1: 1}]
-
-
-def scaled(result, factor):
-    """The same result in another unit of length."""
-    rec = result.reconstruction
-    changes = {k: factor * getattr(rec, k) for k in ("depth_ref", "depth_next")}
-    changes |= {k: factor * getattr(rec, k) for k in ("points_ref", "points_next")}
-    parts = tuple(
-        replace(c, motion=replace(c.motion, t=factor * c.motion.t), centre=factor * c.centre)
-        for c in result.components
-    )
-    components = replace(result.components, members=parts)
-    return replace(result, reconstruction=replace(rec, **changes), components=components)
-
-
-def toy_pairs():
-    """Two pairs of frames 0, 1, 2; the wall comes nearer by CAMERA, and units differ by 2."""
-    first = small_result()
-    # seen from frame 1 the scene is the next frame of the first pair
-    depth = first.reconstruction.depth_next
-    second = scaled(first, 0.5)
-    rec = replace(second.reconstruction, depth_ref=0.5 * depth)
-    second = replace(second, reconstruction=rec)
-    return [SolvedPair(k, k + 1, r, {}, 5.0) for k, r in enumerate((first, second))]
-
-
-def test_a_chain_has_one_scale_and_one_frame_of_reference():
-    chain = make_chain(toy_pairs())
-    np.testing.assert_allclose(chain.scales, [1, 2], rtol=1e-9)
-    np.testing.assert_allclose(chain.depth(1), 2 * chain.pairs[1].result.depths[0])
-    np.testing.assert_allclose(
-        chain.world_from_camera[1].matrix, np.linalg.inv(CAMERA.matrix), atol=1e-9
-    )
-    np.testing.assert_allclose(
-        chain.world_from_camera[2].matrix, np.linalg.inv(CAMERA.matrix @ CAMERA.matrix), atol=1e-9
-    )
-    # the static scene stands still in the world
-    np.testing.assert_allclose(chain.motion(1, 0).matrix, np.eye(4), atol=1e-9)
-    with pytest.raises(DataError, match="consecutive"):
-        make_chain(toy_pairs()[1:])
-
-
-def test_the_static_scene_becomes_one_cloud():
-    chain = make_chain(toy_pairs())
-    cloud = fuse(chain)
-    both = sum(
-        int((p.result.sure & (p.result.components.of_pixel == 0)).sum()) for p in chain.pairs
-    )
-    # both pairs see the same wall: far fewer points than pixels, from either frame
-    assert 0 < len(cloud) <= both
-    assert set(cloud["label"]) <= {0, 1}
-    # points of the second pair lie on the surface of the first
-    wall = chain.points(0)[chain.pairs[0].result.sure]
-    for point in cloud["points"][cloud["label"] == 1][::50]:
-        assert np.linalg.norm(wall - point, axis=1).min() < 0.05 * np.linalg.norm(point)
-    # short tracks are not shown
-    assert len(movers(chain, 0)) == 0 or len(chain.path(1)) >= 3
 
 
 def test_a_chain_is_written(tmp_path):
@@ -178,6 +63,35 @@ def test_a_chain_is_written(tmp_path):
     np.testing.assert_allclose(poses[1, 1:4], CAMERA.centre, atol=1e-8)
 
 
+def test_a_chain_says_which_depth_is_a_guess(tmp_path):
+    shares = CERTAINTY | {"determined": 0.0, "guess": 1.0, "flat": 1.0, "median_sigma": None}
+    sure = toy_pairs()
+
+    def unsure(pair):
+        rec = replace(pair.result.reconstruction, sigma_ref=np.full((60, 80), 1.2))
+        summary = {**pair.result.summary, "certainty": shares}
+        return replace(pair, result=replace(pair.result, reconstruction=rec, summary=summary))
+
+    half, none = make_chain([sure[0], unsure(sure[1])]), make_chain([*map(unsure, sure)])
+    for chain, share, code in ((make_chain(sure), 0, 0), (half, 50, 0), (none, 100, 1)):
+        write_chain(tmp_path, chain, "toy", ["a.png", "b.png", "c.png"])
+        said = f"{share}% of all images is a guess: a turn alone or a constant depth"
+        text = (tmp_path / "chain.html").read_text()
+        assert (f"<b>{said}" in text) == bool(share)
+        assert f", {share}% a guess)" in str(chain)
+        lines = "\n".join(chain_lines(chain, json.loads((tmp_path / "chain.json").read_text())))
+        assert (f"{share}% is a guess" in lines) == bool(share)
+        assert ("half of it to 7.0%" in lines) == (share < 100)
+        assert chain_exit_code(chain)[0] == code
+    assert chain_exit_code(none)[1].startswith(said)
+    # of the last frame, the next one of an unsure pair, what no other frame shows is unknown
+    assert [guess_of(half, k).mean() for k in range(2)] == [0, 1]
+    np.testing.assert_array_equal(guess_of(half, 2), np.isfinite(half.depth(2)))
+    (first, second, _), _ = depth_pictures(half)
+    assert second.min() >= 153 > first.min()
+    assert fuse(none).size == 0
+
+
 def test_the_page_of_a_chain_opens(tmp_path):
     chromium = find_chromium()
     if chromium is None:
@@ -191,48 +105,13 @@ def test_the_page_of_a_chain_opens(tmp_path):
         browser.value("time.value = 2; time.dispatchEvent(new Event('input'))")
         browser.wait("document.getElementById('depth').naturalWidth == 80")
         second = browser.screenshot()
-        assert browser.value("document.getElementById('now').textContent") == "frame 2: <b>c.png"
+        now = browser.value("document.getElementById('now').textContent")
+        assert now == "frame 2: <b>c.png, 0% a guess"
         assert (first != second).mean() > 0.01
         assert browser.log == []
         assert [r for r in browser.requests if not r.startswith("file:")] == []
     finally:
         browser.close()
-
-
-def test_a_pair_without_parallax_is_bridged():
-    first, second = toy_pairs()
-    # in between nothing moves, and its depth is nonsense
-    still = small_result()
-    rest = tuple(replace(c, borrowed=1.0) for c in still.components)
-    identity = np.arange(60 * 80).reshape(60, 80)
-    rec = replace(
-        still.reconstruction,
-        depth_ref=np.full((60, 80), 7.0),
-        depth_next=np.full((60, 80), 7.0),
-        source_next=identity,
-    )
-    middle = replace(still, reconstruction=rec, components=replace(still.components, members=rest))
-    still_between = [first, SolvedPair(1, 2, middle, {}, 0.0), replace(second, first=2, second=3)]
-    chain = make_chain(still_between)
-    assert [k.flagged for k in chain.links] == [True, True, False]
-    assert chain.links[-1].bridge
-    assert chain.scales[2] == pytest.approx(2, rel=0.01)
-
-
-def test_labels_are_carried_to_the_next_frame():
-    result = small_result()
-    there = carried(result.components.of_pixel, result.reconstruction)
-    seen = result.reconstruction.source_next >= 0
-    assert (there[~seen] == -1).all()
-    assert set(np.unique(there[seen])) == {0, 1}
-
-
-def test_similarities_are_found_exactly():
-    rng = np.random.default_rng(3)
-    points = rng.normal(size=(6, 3))
-    target = 2.5 * points @ exp([0.3, -0.2, 0.5]).T + [1, 2, 3]
-    np.testing.assert_allclose(aligned(points, target), target, atol=1e-12)
-    assert not np.allclose(aligned(points * [1, 1, -1], target), target)
 
 
 START_ALONE = sets("refine.enabled=false solver.presolve=false solver.max_iter=1")
@@ -245,7 +124,8 @@ def test_duplicate_frames_are_bridged(order, tmp_path):
         write_png(tmp_path / f"{k}.png", render_scene("orbit", 0, 128, 86, frame).image_ref)
     np.savetxt(tmp_path / "K.txt", render_scene("orbit", 0, 128, 86).K_ref)
     fast = ["--superpixels", "16", "--neighbours", "5", "-q", *START_ALONE]
-    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out"), *fast]) == 0
+    # most of it is a guess
+    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out"), *fast]) == 1
     told = json.loads((tmp_path / "out" / "chain.json").read_text())
     links = {tuple(link["pairs"]): link for link in told["links"]}
     for k in range(len(order) - 2):

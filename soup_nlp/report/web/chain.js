@@ -18,7 +18,7 @@ function show() {
   $("depth").src = frames[k][1];
   $("image").alt = "frame " + k;
   $("depth").alt = "depth of frame " + k;
-  $("now").textContent = "frame " + k + ": " + data.names[k];
+  $("now").textContent = `frame ${k}: ${data.names[k]}, ${Math.round(100 * data.guess[k])}% a guess`;
   showFrame(k);
 }
 $("time").addEventListener("input", show);
@@ -139,7 +139,8 @@ if (renderer) {
   addEventListener("resize", resize);
   VIEWS.aside();
   resize();
-  $("message").remove();
+  if (still.geometry.attributes.position.count) $("message").remove();
+  else $("message").textContent = "All depth of the static scene is a guess: nothing of it is drawn.";
 }
 show();
 document.body.dataset.ready = "yes";

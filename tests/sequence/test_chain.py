@@ -1,0 +1,142 @@
+"""Common scale, poses, tracks and cloud of the pairs of a sequence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_result import CAMERA, small_result, toy_pairs
+
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.rotation import exp
+from soup_nlp.sequence.chain import (
+    Link,
+    SolvedPair,
+    carried,
+    follow,
+    link,
+    make_chain,
+    number,
+    solve_scales,
+)
+from soup_nlp.sequence.fused import fuse, movers
+from soup_nlp.sequence.score import aligned
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_link_of_two_maps_is_their_median_ratio():
+    rng = np.random.default_rng(0)
+    one = rng.uniform(1, 5, (30, 40))
+    other = one / 1.3 * np.exp(rng.normal(0, 0.02, one.shape))
+    # a fifth is far off, some is unknown
+    other[:6] *= 3
+    other[6:8] = np.nan
+    found = link((2, 3), one, other, np.ones(one.shape, bool))
+    assert (found.first, found.second, found.pixels) == (2, 3, 28 * 40)
+    # the median of noise of 0.02, moved by the fifth on one side: less than one of its deviations
+    assert found.log_ratio == pytest.approx(np.log(1.3), abs=0.02)
+    assert 0.02 < found.spread < 0.04
+    assert not found.flagged
+    assert link((0, 1), one, other, np.zeros(one.shape, bool)) is None
+    few = np.zeros(one.shape, bool)
+    few[10, :20] = True
+    assert link((0, 1), one, other, few).flagged
+
+
+def test_scales_follow_their_links():
+    true = np.array([1.0, 1.2, 0.7, 0.9])
+
+    def between(a, b, error=0.0, **marks):
+        return Link(a, b, float(np.log(true[b] / true[a]) + error), 0.02, 5000, **marks)
+
+    chain = [between(0, 1), between(1, 2), between(2, 3)]
+    np.testing.assert_allclose(solve_scales(4, chain), true, rtol=1e-9)
+    assert solve_scales(1, []) == [1.0]
+    # one of several that contradict each other gives way, a guess even more
+    more = [*chain, between(0, 2), between(1, 3), between(0, 3, error=0.5)]
+    np.testing.assert_allclose(solve_scales(4, more), true, rtol=0.02)
+    guess = [*chain[:2], between(2, 3, error=0.5, flagged=True), between(1, 3, bridge=True)]
+    np.testing.assert_allclose(solve_scales(4, guess), true, rtol=0.01)
+    with pytest.raises(DataError, match="pair 3"):
+        solve_scales(4, chain[:2])
+
+
+def test_components_are_followed_by_overlap():
+    before = np.zeros((10, 20), int)
+    before[2:6, 2:8], before[2:6, 12:16] = 1, 2
+    before[0] = -1
+    after = np.zeros((10, 20), int)
+    after[3:7, 2:8], after[7:9, 10:19] = 2, 1
+    assert follow(before, after) == {1: 2}
+    assert follow(before, np.zeros((10, 20), int)) == {}
+    tracks = number([{1: 2}, {2: 1}], [3, 3, 2])
+    assert tracks == [{0: 0, 1: 1, 2: 2}, {0: 0, 1: 3, 2: 1}, {0: 0, 1: 1}]
+
+
+def test_a_chain_has_one_scale_and_one_frame_of_reference():
+    chain = make_chain(toy_pairs())
+    np.testing.assert_allclose(chain.scales, [1, 2], rtol=1e-9)
+    np.testing.assert_allclose(chain.depth(1), 2 * chain.pairs[1].result.depths[0])
+    np.testing.assert_allclose(
+        chain.world_from_camera[1].matrix, np.linalg.inv(CAMERA.matrix), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        chain.world_from_camera[2].matrix, np.linalg.inv(CAMERA.matrix @ CAMERA.matrix), atol=1e-9
+    )
+    # the static scene stands still in the world
+    np.testing.assert_allclose(chain.motion(1, 0).matrix, np.eye(4), atol=1e-9)
+    with pytest.raises(DataError, match="consecutive"):
+        make_chain(toy_pairs()[1:])
+
+
+def test_the_static_scene_becomes_one_cloud():
+    chain = make_chain(toy_pairs())
+    cloud = fuse(chain)
+    both = sum(
+        int((p.result.sure & (p.result.components.of_pixel == 0)).sum()) for p in chain.pairs
+    )
+    # both pairs see the same wall: far fewer points than pixels, from either frame
+    assert 0 < len(cloud) <= both
+    assert set(cloud["label"]) <= {0, 1}
+    # points of the second pair lie on the surface of the first
+    wall = chain.points(0)[chain.pairs[0].result.sure]
+    for point in cloud["points"][cloud["label"] == 1][::50]:
+        assert np.linalg.norm(wall - point, axis=1).min() < 0.05 * np.linalg.norm(point)
+    # short tracks are not shown
+    assert len(movers(chain, 0)) == 0 or len(chain.path(1)) >= 3
+
+
+def test_a_pair_without_parallax_is_bridged():
+    first, second = toy_pairs()
+    # in between nothing moves, and its depth is nonsense
+    still = small_result()
+    rest = tuple(replace(c, borrowed=1.0) for c in still.components)
+    identity = np.arange(60 * 80).reshape(60, 80)
+    rec = replace(
+        still.reconstruction,
+        depth_ref=np.full((60, 80), 7.0),
+        depth_next=np.full((60, 80), 7.0),
+        source_next=identity,
+    )
+    middle = replace(still, reconstruction=rec, components=replace(still.components, members=rest))
+    still_between = [first, SolvedPair(1, 2, middle, {}, 0.0), replace(second, first=2, second=3)]
+    chain = make_chain(still_between)
+    assert [k.flagged for k in chain.links] == [True, True, False]
+    assert chain.links[-1].bridge
+    assert chain.scales[2] == pytest.approx(2, rel=0.01)
+
+
+def test_labels_are_carried_to_the_next_frame():
+    result = small_result()
+    there = carried(result.components.of_pixel, result.reconstruction)
+    seen = result.reconstruction.source_next >= 0
+    assert (there[~seen] == -1).all()
+    assert set(np.unique(there[seen])) == {0, 1}
+
+
+def test_similarities_are_found_exactly():
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(6, 3))
+    target = 2.5 * points @ exp([0.3, -0.2, 0.5]).T + [1, 2, 3]
+    np.testing.assert_allclose(aligned(points, target), target, atol=1e-12)
+    assert not np.allclose(aligned(points * [1, 1, -1], target), target)
