@@ -97,8 +97,6 @@ def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
             which, nonzero = inputs
             values = table.data[:, nonzero] if which == 1 else np.asarray(theta[nonzero])
             work[target] = graph.constant((which, nonzero), values)
-        elif op == ca.OP_ASSIGN:
-            work[target] = work[inputs[0]]
         elif op in OPERATIONS and OPERATIONS[op].nl:
             work[target] = graph.apply(op, tuple(work[a] for a in inputs))
         else:

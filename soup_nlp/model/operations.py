@@ -38,7 +38,6 @@ def _if_else_zero(a: Any, b: Any, out: Any = None) -> Any:
 
 _ONE = np.array(1.0)
 OPERATIONS: Mapping[int, Operation] = {
-    ca.OP_ASSIGN: Operation("{0}", np.positive),
     ca.OP_ADD: Operation("{0} + {1}", np.add, "o0 {0} {1}"),
     ca.OP_SUB: Operation("{0} - {1}", np.subtract, "o1 {0} {1}"),
     ca.OP_MUL: Operation("{0} * {1}", np.multiply, "o2 {0} {1}"),
