@@ -30,8 +30,6 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.kkt import WARM
 from soup_nlp.solve.stages import solve_soup
 
-pytestmark = pytest.mark.slow
-
 ENDS = {"variables": ".col", "rows": ".row"}
 TINY = sets(
     "input.width=96 input.height=64 flow.source=truth segmentation.neighbours=4"
@@ -60,6 +58,7 @@ def problem_of(folder: Path):
     return case, nlp, layout, file_orders(nlp), manifest
 
 
+@pytest.mark.slow
 def test_several_sizes_and_formulations_are_exported_and_read_back(tmp_path):
     forms = ["unit-translation/smooth", "unit-offset/epigraph"]
     words = [w for f in forms for w in ("--formulation", f)]
@@ -130,6 +129,7 @@ def optimum(exported):
     return found.stages[-1].x, found.stages[-1].lam_g
 
 
+@pytest.mark.slow
 def test_a_foreign_solution_becomes_a_result_folder(exported, optimum, tmp_path, capsys):
     _, _, _, (v, r), _ = problem_of(exported)
     sol = exported / "good.sol"
@@ -146,6 +146,7 @@ def test_a_foreign_solution_becomes_a_result_folder(exported, optimum, tmp_path,
     assert "every claim holds" in said
 
 
+@pytest.mark.slow
 def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
     _, nlp, _, (v, r), _ = problem_of(exported)
     x, lam = optimum
@@ -166,6 +167,7 @@ def test_verified_means_optimal(exported, optimum, tmp_path, capsys):
         import_sol(exported, exported / "x.sol")
 
 
+@pytest.mark.slow
 def test_a_point_with_nan_is_not_verified(exported, optimum):
     _, nlp, _, _, _ = problem_of(exported)
     x, lam = optimum
@@ -180,6 +182,7 @@ def test_a_point_with_nan_is_not_verified(exported, optimum):
     assert not found.within(Limits())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e20, 1e300])
 def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, capsys):
     _, nlp, _, (v, r), _ = problem_of(exported)
@@ -197,6 +200,7 @@ def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, c
     assert (exported / "manifest.json").read_text() == before
 
 
+@pytest.mark.slow
 def test_a_false_claim_of_success_is_not_verified(exported, tmp_path, capsys):
     sol = answer(exported, "false.sol", move=1e-3)
     run = import_sol(exported, sol).run
@@ -304,6 +308,7 @@ def test_suffixes_say_kind_and_superpixel(tmp_path):
     assert min(factors) > 0
 
 
+@pytest.mark.slow
 def test_pounce_takes_the_multipliers(tmp_path):
     command = find_program("pounce")
     if command is None:

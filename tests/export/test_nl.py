@@ -20,8 +20,6 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 
-pytestmark = pytest.mark.slow
-
 FORMS = [Formulation(gauge=g, norm=n, compiled=False) for g in GAUGES for n in NORMS]
 
 
@@ -52,6 +50,7 @@ def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> 
 # --- the soup ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS, ids=form_id)
 def test_casadi_reads_back_every_formulation(form, tmp_path):
     tiny = Tiny()
@@ -87,8 +86,8 @@ def test_shared_expressions_are_written_once(tmp_path):
     assert len(set(texts)) == len(texts)
     scales = {int(np.flatnonzero(file.variables == v)[0]) for v in layout.of(np.arange(12))[:, 0]}
     depths = [t for t in texts if t.startswith("o3\nv") and int(t.split("\n")[1][1:]) in scales]
-    # every anchor once, and at most one more for each end of each boundary point
-    assert len(depths) <= 12 + 2 * 2 * 17
+    # every anchor once, and one more for each end of each boundary point
+    assert len(depths) == 12 + 2 * 2 * 17
     epigraph, _ = Tiny().nlp(TRUNCATED, Formulation(norm="epigraph", compiled=False))
     both, *others = defined_variables(write_nl(tmp_path / "e.nl", epigraph))
     assert both == 0
@@ -252,6 +251,7 @@ def swinging(tmp_path_factory) -> Case:
     return prepare(make_problem(raw))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("norm", NORMS)
 def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, norm, tmp_path):
     data, eps = swinging.data, 2e-5

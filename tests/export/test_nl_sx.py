@@ -149,6 +149,22 @@ def test_random_programs_read_back(program, tmp_path_factory):
     same_as_sx(problem, file, at)
 
 
+def test_pounce_reads_every_function(tmp_path):
+    """CasADi's reader knows neither min and max nor the inverses of hyperbolic functions."""
+    pounce = pytest.importorskip("pounce", reason="pounce-solver is not installed")
+    x = ca.SX.sym("x", 2)
+    a, b = ca.vertsplit(x)
+    of_a = [ca.exp, ca.sin, ca.cos, ca.tan, ca.asin, ca.acos, ca.atan, ca.fabs, ca.sqrt]
+    of_a += [ca.sinh, ca.cosh, ca.tanh, ca.asinh, ca.atanh, ca.log]
+    f = sum(k * function(a) for k, function in enumerate(of_a, 1)) + ca.acosh(b) + ca.atan2(a, b)
+    f += ca.fmax(a, b) - ca.fmin(a, b**2) + a**b + b**1.5
+    file, at = write_sx_nl(tmp_path / "p.nl", {"x": x, "f": f}), np.array([0.6, 1.7])
+    back = pounce.read_nl(str(file.path))
+    value, gradient = ca.Function("f", [x], [f, ca.gradient(f, x)])(at)
+    close(back.objective(at), value)
+    close(back.gradient(at), gradient)
+
+
 def test_without_constraints(tmp_path):
     x = ca.SX.sym("x", 3)
     file = write_sx_nl(tmp_path / "linear.nl", {"x": x, "f": x[0] - 2 * x[2] + 1})

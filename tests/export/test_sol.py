@@ -65,6 +65,9 @@ def test_a_file_is_read_into_the_order_of_the_problem(tmp_path):
     sol = read_sol(path, ORDER, ROWS)
     assert sol.x.tolist() == [2, 3, 1]
     assert (sol.lam_g, sol.status, sol.solved) == (None, "limit", False)
+    path.write_text(TEXT.partition("objno")[0])
+    sol = read_sol(path, ORDER, ROWS)
+    assert (sol.code, sol.status, sol.solved) == (-1, "unknown", False)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +166,8 @@ NEAR, BEYOND = 0.5 * verify.ACTIVE, 2 * verify.ACTIVE
 def test_only_active_bounds_give_multipliers_of_their_sign(gradient, g, lower, upper, expected):
     """Rows have a lower and an upper bound in turn."""
     sides = {"lbg": [lower, -np.inf] * 2, "ubg": [np.inf, upper] * 2}
-    nlp = program(np.array(gradient, float), np.eye(4), g, **sides)
+    # a row whose multiplier would have the wrong sign leaves the others' values alone
+    nlp = program(np.array(gradient, float), np.eye(4) + np.eye(4, k=-2), g, **sides)
     lam = verify.least_squares_multipliers(nlp, np.zeros(4))
     np.testing.assert_allclose(lam, expected, atol=1e-9)
 

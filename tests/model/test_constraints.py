@@ -228,13 +228,21 @@ def test_the_start_is_feasible(gauge, norm):
     assert max(found.values()) <= 1e-9, found
 
 
-def test_the_start_of_the_presolve_is_feasible():
+@pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
+def test_the_start_of_the_presolve_is_feasible(chart):
     problem = tiny("pixels")
-    nlp, _ = build_tangent_nlp(problem.soup, problem.data, weights_for("pixels"), form())
+    own = problem.data, weights_for("pixels"), form()
+    nlp, base = build_tangent_nlp(problem.soup, *own, chart)
     g = value(nlp, nlp.x0)[1]
     assert g[nlp.g_names().index("simplex")] == pytest.approx(1.0, abs=1e-12)
     assert np.maximum(nlp.lbg - g, g - nlp.ubg).max() <= 1e-9
     assert ((nlp.lbx <= nlp.x0) & (nlp.x0 <= nlp.ubx)).all()
+    # too steep a soup at other depths starts about as steep as the rows of visibility admit
+    steep = np.random.default_rng(0).uniform([0.5, 2, 2, *[0] * 6], [2, 4, 4, *[0] * 6], (12, 9))
+    nlp, _ = build_tangent_nlp(base.unpack(steep), *own, layout=base)
+    rho = nlp.x0[::9] if chart == "inverse-depth" else np.ones(12)
+    least = value(nlp, nlp.x0)[1][rows(nlp, "visible")].reshape(12, -1).min(axis=1) / rho
+    assert 0 <= least.min() <= least.max() <= 0.1
 
 
 @pytest.mark.parametrize("ratio", [2.0, 5.0])

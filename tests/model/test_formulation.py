@@ -16,11 +16,13 @@ from helpers_model import (
     tiny,
     value,
     weights_for,
+    world,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from soup_nlp.errors import ConfigError, ModelError
+from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import TERMS
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
@@ -28,7 +30,7 @@ from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.pattern import Entries, Pattern
 from soup_nlp.model.symbolic import Graph
-from soup_nlp.model.tangent_nlp import build_tangent_nlp
+from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 
 # --- layouts -------------------------------------------------------------------------------------
 
@@ -74,6 +76,20 @@ def test_a_superpixel_at_rest_gets_a_tiny_translation():
     np.testing.assert_allclose(np.delete(moved, 2), 0, atol=1e-12)
     layout = MatrixLayout(np.full(6, 1 / 6), "unit-offset")
     np.testing.assert_array_equal(layout.unpack(layout.pack(soup)).translation[2], 0)
+
+
+def test_superpixels_of_one_plane_stay_on_one_while_it_turns():
+    """On the straight line between two planes, in the chart that the exact Hessian has."""
+    soup, data = world("slanted", "pixels", False)
+    other = replace(soup, n=np.tile(np.array([0.6, 0.0, -0.8]), (12, 1)))
+    gap = {}
+    for chart in ("depth", "inverse-depth"):
+        layout = TangentLayout.about(soup, data, chart)
+        half = layout.unpack((layout.pack(soup) + layout.pack(other)) / 2)
+        gap[chart] = oracle.energy(half, data, PAPER)["cont"]
+    assert gap.pop(exact_chart(data)) < 1e-9 < 1.0 < min(gap.values())
+    # in the paper's units the length unit has to be linear in the scales
+    assert exact_chart(tiny("paper").data) == "depth"
 
 
 # --- names, sizes, print -------------------------------------------------------------------------
@@ -140,8 +156,8 @@ def test_the_print_shows_sizes_and_sparsity():
     nlp, _ = tiny().nlp(PAPER, form(norm="epigraph"))
     text = str(nlp)
     assert text.startswith(f"NLP soup: {nlp.nx} variables, {nlp.ng} constraints")
-    assert f"{nlp.nnzj} nonzeros" in text
-    assert f"{nlp.nnzh} nonzeros" in text
+    for nonzeros, cells in ((nlp.nnzj, nlp.nx * nlp.ng), (nlp.nnzh, sum(range(nlp.nx + 1)))):
+        assert f"{nonzeros} nonzeros, {nonzeros / cells:.3%} of {cells}\n" in text
     assert "Hessian kind: exact" in text
     for name in (*TERMS, "so3", "normal", "visible", "simplex"):
         assert re.search(rf"^  {name} +\d+ x ", text, re.M), name

@@ -86,6 +86,9 @@ def test_the_smooth_norm_tends_to_the_exact_energy(units):
     assert (np.array(gap) > 0).all()
     assert (np.diff(gap, axis=0) < 0).all()
     assert max(gap[-1]) < 1e-5
+    # re-projection errors have a smoothing of their own
+    one, two = (by_term(nlp, nlp.x0, eps_pixel=eps) for eps in (0.1, 0.2))
+    assert [term for term in TERMS if one[term] != two[term]] == ["proj"]
 
 
 @pytest.mark.parametrize("units", UNITS)
