@@ -49,18 +49,25 @@ def depth_range(depth: AnyFloat) -> tuple[float, float]:
     return near, far
 
 
-def colourise_depth(depth: AnyFloat, near: float, far: float) -> Image:
-    """Depth in colour by even steps of 1/z: near is red, far is blue.
+PALE = 0.35
+"""Share of its colour that the depth of a guess keeps; the rest is white."""
+
+
+def colourise_depth(depth: AnyFloat, near: float, far: float, guess: Mask | bool = False) -> Image:
+    """Depth in colour by even steps of 1/z: near is red, far is blue; pale where it is a guess.
 
     Args:
         depth: (H, W) z; grey where not finite or not positive.
         near: Depth of the near end.
         far: Depth of the far end.
+        guess: (H, W) True where the depth is a guess.
     """
     z = np.asarray(depth, np.float64)
     known = np.isfinite(z) & (z > 0)
     safe = np.clip(np.where(known, z, near), near, far)
-    return _paint((1 / safe - 1 / far) / (1 / near - 1 / far), known, "turbo")
+    colours = _paint((1 / safe - 1 / far) / (1 / near - 1 / far), known, "turbo")
+    colours[known & guess] = 255 - PALE * (255 - colours[known & guess])
+    return colours
 
 
 def component_colours(count: int) -> Image:

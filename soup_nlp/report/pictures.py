@@ -29,13 +29,7 @@ ERROR_TICKS, SIGMA_TICKS = (0.0, 0.05, 0.1, 0.15, 0.2), (0.0, 0.1, 0.2, 0.3)
 """Values below the legends of error and sigma; the last one has the brightest colour."""
 DEPTHS = (
     ("ref", "depth_ref", "depth of the reference frame", "solution", ""),
-    (
-        "next",
-        "depth_next",
-        "depth of the next frame",
-        "solution_next",
-        "; grey = nothing lands there",
-    ),
+    ("next", "depth_next", "depth of the next frame", "solution_next", "; grey = unseen"),
     ("start_ref", "depth_start", "depth of the start", "start", ""),
 )
 """Array, name, title, scores and remark of the pictures of depth."""
@@ -164,16 +158,18 @@ def _depths(result: Result) -> list[Picture]:
     truth, stored = result.true_depth, result.tree["depth"]
     near, far = depth_range(stored["ref"] * result.scale if truth is None else truth)
     bar, out = depth_bar(near, far, f" {result.length}"), []
-    guess = result.summary["certainty"]["guess"]
+    guesses = dict(zip(("depth_ref", "depth_next"), result.guesses, strict=True))
     for array, name, title, scored, more in DEPTHS:
         score = result.summary["metrics"].get(scored, {})
         # the next frame has the scale of the solution
         scaled = score if name == "depth_start" else result.summary["metrics"].get("solution", {})
-        colours = colourise_depth(stored[array] * float(scaled.get("scale") or 1.0), near, far)
+        z = stored[array] * float(scaled.get("scale") or 1.0)
+        guess = guesses.get(name, np.zeros(z.shape, bool))
+        colours = colourise_depth(z, near, far, guess)
         mre = score.get("mre")
         said = "" if mre is None else f", MRE {mre:.3f}"
-        if name == "depth_ref" and guess >= LEAST:
-            said += f"; {guess:.0%} is a guess"
+        if guess.mean() >= LEAST:
+            more += "; pale = a guess" + f" ({guess.mean():.0%})" * (name == "depth_ref")
         out.append(Picture(name, f"{title}{said}{more}", colours, bar))
     if truth is not None:
         true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError, printable
-from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, NO_CONFIDENCE
+from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, MOST_SIGMA, NO_CONFIDENCE
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.geometry.components import Components, find_components
@@ -138,6 +138,12 @@ class Result:
     def confidence(self) -> Float:
         """(H, W) confidence of the depth from 0 (unknown) to 1 (certain)."""
         return np.maximum(1.0 - self.sigma / NO_CONFIDENCE, 0.0)
+
+    @cached_property
+    def guesses(self) -> tuple[Mask, Mask]:
+        """(H, W) True where the depth of each frame is a guess; False where it is unknown."""
+        guess, source = ~(self.sigma <= MOST_SIGMA), self.reconstruction.source_next
+        return guess, (source >= 0) & guess.ravel()[source]
 
     @property
     def metre(self) -> float | None:

@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Image, Mask
-from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.findings import guess_line
 from soup_nlp.report.models import GLTF
 from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
 from soup_nlp.report.pictures import depth_bar
-from soup_nlp.sequence.chain import Chain, carried
+from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.fused import Cloud, every_kth, fuse, movers, shown_tracks
 from soup_nlp.sequence.score import certainty, link_table, score_text
 from soup_nlp.storage.files import PathLike, write_bytes
@@ -36,8 +35,6 @@ MANY = 24
 """Frames above which the images have half the width."""
 STILL, MOVING = 120_000, 60_000
 """Largest numbers of points of the static scene, and of moving components in all frames."""
-PALE = 0.4
-"""Share of its colour that the depth of a guess keeps; the rest is white."""
 QUALITY = 80
 """JPEG quality of the images."""
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#17becf")
@@ -48,20 +45,13 @@ def depth_pictures(chain: Chain) -> tuple[list[Image], tuple[float, float]]:
     far), one for all."""
     depths = [chain.depth(k) for k in range(len(chain))]
     span = depth_range(np.concatenate([z.ravel()[::7] for z in depths]))
-    out = []
-    for k, z in enumerate(depths):
-        colours, guess = colourise_depth(z, *span), guess_of(chain, k)
-        colours[guess] = 255 - PALE * (255 - colours[guess])
-        out.append(colours)
-    return out, span
+    return [colourise_depth(z, *span, guess_of(chain, k)) for k, z in enumerate(depths)], span
 
 
 def guess_of(chain: Chain, frame: int) -> Mask:
-    """(H, W) True where the depth of a frame is a guess; False where nothing is known."""
+    """(H, W) True where the depth of a frame is a guess; False where it is unknown."""
     pair, side = chain.seen(frame)
-    result = chain.pairs[pair].result
-    sure = result.sigma <= MOST_SIGMA
-    return np.asarray(carried(sure, result.reconstruction) == 0 if side else ~sure)
+    return chain.pairs[pair].result.guesses[side]
 
 
 def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:

@@ -194,11 +194,19 @@ def test_a_component_whose_depth_is_a_guess_is_striped(shown):
 @pytest.mark.parametrize(("guess", "said"), [(0.004, None), (0.3, "30%"), (1.0, "100%")])
 def test_page_pictures_and_overview_begin_with_the_guess(guess, said, shown):
     shares = {**shown.summary["certainty"], "guess": guess, "flat": guess}
-    one = replace(shown, summary={**shown.summary, "certainty": shares})
+    sigma = np.full(shown.labels.size, 0.02)
+    sigma[: round(guess * sigma.size)] = 0.4
+    rec = replace(shown.reconstruction, sigma_ref=sigma.reshape(shown.labels.shape))
+    one = replace(shown, summary={**shown.summary, "certainty": shares}, reconstruction=rec)
     drawn = pictures(one)
     depth, header = drawn["depth_ref"].title, page(one, drawn).partition("</header>")[0]
     sentence = f"{said} of the image is a guess: {SHARES['flat']}"
-    assert depth.endswith(f"; {said} is a guess") == bool(said)
+    assert depth.endswith(f"; pale = a guess ({said})") == bool(said)
+    # two frames show the same guess, where both see it
+    pale = [drawn[name].image.min(axis=2) >= 165 for name in ("depth_ref", "depth_next")]
+    for mask, known in zip(pale, one.guesses, strict=True):
+        assert mask[known].all()
+    assert pale[0].mean() == pytest.approx(guess, abs=0.05)
     assert (f"<p><strong>{sentence}</strong> &middot; " in header) == bool(said)
     assert _title(one) == (f"{one.name}: {sentence}" if said else one.name)
 
