@@ -328,7 +328,7 @@ def confidence(
     scale = scale_by_contact(with_flow, start, sizes, far, given_depth)
     by_motion = np.hypot(scale, flow_evidence.sigma)
     added = np.where(start.bends, np.maximum(scale, BENDING_SIGMA), by_motion)
-    guess = flow_evidence.guess[start.component] | start.torn | start.at_rest
+    guess = flow_evidence.guess[start.component] | start.unexplained | start.at_rest
     guess |= start.tie == FIXED
     added = np.hypot(added, np.where(guess, GUESSED, 0.0))
     added = np.hypot(added, by_start(rec, start, data.anchor_ray))

@@ -172,7 +172,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
         surface=record.surface,
         tie=none,
         bends=np.full(len(seg), record.bending),
-        torn=none.astype(bool),
+        unexplained=none.astype(bool),
         wrong=none.astype(bool),
         # records of bending surfaces have their prior in pixels
         noise=1.0 if record.bending else limited_noise(record.error),

@@ -21,7 +21,7 @@ SHARES = {
     "rest": "the camera only turns or stands still",
     "fixed": "stands still in the image while the camera moves",
     "unseen": "no usable flow",
-    "torn": "seems to bend, but its flow jumps, as between parts that move differently",
+    "unexplained": "no motion that was found explains its flow",
     "flat": "a turn alone or a constant depth explains the flow nearly as well",
     "scale": "with a scale that contact hardly determines",
     "weak": "little information",
@@ -43,7 +43,7 @@ ORIGINS = {
 `certainty`, and words for the component."""
 DETERMINED = tuple(dict.fromkeys(name for name, _ in ORIGINS.values()))
 """Shares that are determined."""
-GUESSES = ("rest", "fixed", "unseen", "torn", "flat", "scale", "weak")
+GUESSES = ("rest", "fixed", "unseen", "unexplained", "flat", "scale", "weak")
 """Shares that are a guess."""
 USABLE = 0.8
 """Share of usable flow below which the flow counts as a limit."""
@@ -218,7 +218,7 @@ def hints(
         )
     if focal_sigma > UNSURE_FOCAL and shares["weak"] >= SHARE:
         out.append("the focal length of the camera (--fov or --intrinsics)")
-    if shares["scale"] + shares.get("torn", 0.0) >= SHARE:
+    if shares["scale"] + shares.get("unexplained", 0.0) >= SHARE:
         out.append("a depth from elsewhere (--depth-prior) for what moves")
     return ["; ".join(out)] if out else []
 

@@ -82,7 +82,7 @@ start/tie                 1     N       what gives its component a scale: 0 larg
 1 contact below, 2 outline, 3 cut off below, 4 nothing, 5 ground, 6 fixed in image, \
 7 given depth, 8 occlusion, 9 too fast
 start/bends               1     N       in a region with the energy for surfaces that bend
-start/torn                1     N       in a region that bends although the flow jumps inside
+start/unexplained         1     N       no motion explains the flow, or it bends although it jumps
 start/bending             1     -       a region bends
 start/at_rest             1     -       the camera is taken to be at rest, or to turn only
 start/noise               px    -       median error of the flow; if all bends, of affine flows

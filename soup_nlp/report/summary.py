@@ -104,7 +104,7 @@ def certainty(run: Run) -> dict[str, float]:
         components their scales, and with a depth prior "given" (depth or scale are the prior's).
         "guess": the rest; the sum of "rest" (the camera is at rest or only turns), "fixed" (stands
         still in the image though the camera moves, such as the bonnet of its car), "unseen" (no
-        usable flow, or hidden in the next frame), "torn" (bends although its flow jumps), "flat"
+        usable flow, or hidden in the next frame), "unexplained" (`Start`), "flat"
         (of a component without evidence of depth, see `Evidence.guess`), "scale" (of a component
         whose scale alone is as uncertain as that) and "weak" (anything else). "median_sigma":
         median of the determined pixels.
@@ -123,7 +123,7 @@ def certainty(run: Run) -> dict[str, float]:
         "rest": rest,
         "fixed": fixed,
         "unseen": unseen,
-        "torn": start.torn[labels],
+        "unexplained": start.unexplained[labels],
         "flat": flat,
         "scale": loose,
     }

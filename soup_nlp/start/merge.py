@@ -7,7 +7,7 @@ region falls apart. Flow discontinuities show the outlines of regions more relia
 
 import numpy as np
 
-from soup_nlp.arrays import Int, Mask
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.start.choice import (
     CLIP,
     PIECE_SIZE,
@@ -34,6 +34,9 @@ PIXELS = 1500
 """Largest number of pixels of a component to which a motion is fitted."""
 AGREE = 0.7
 """Least share of a component's superpixels that its motion explains."""
+UNEXPLAINED, LEAST_CONFIDENCE = 5.0, 0.3
+"""Error, in units of the flow's noise, above which a motion does not explain the flow of a
+superpixel, and the mean confidence above which the flow is not to blame."""
 DISCONTINUITIES = (1.0, 0.5, 0.25)
 """Jumps of the flow that separate two regions, relative to `discontinuity_px`. A smaller
 jump is tried where no single motion explains a region that a larger one separates."""
@@ -120,6 +123,24 @@ def earned(flow: FlowFit, choice: Choice) -> tuple[Choice, Mask]:
     left = moves & ((total < least * count)[region])
     kept = Choice.of(flow.views, choice.motions, np.where(left, 0, choice.label), choice.noise)
     return kept, left & (gain > 3 * choice.noise)
+
+
+def unexplained(flow: FlowFit, error: Float, component: Int, noise: float) -> Mask:
+    """(N,) True in pieces of components (N,) whose confident flow the motion does not explain.
+
+    They may move by themselves, along the epipolar lines: then the depth that fits best is wrong.
+
+    Args:
+        flow: The flow of every superpixel.
+        error: (N,) error under the motion of the component, pixels.
+        component: (N,) rigid component of every superpixel.
+        noise: Noise of the flow, pixels.
+    """
+    bad = error > UNEXPLAINED * noise
+    bad &= flow.views.weight.mean(axis=1) > LEAST_CONFIDENCE
+    piece = connected_pieces(bad, flow.seg, ~flow.seg.across(component))
+    size = np.bincount(piece[bad], minlength=1)
+    return bad & (size[piece] >= PIECE_SIZE)
 
 
 def unmoved(flow: FlowFit, choice: Choice, component: Int) -> Mask:

@@ -27,7 +27,7 @@ from soup_nlp.start.components import (
 from soup_nlp.start.epipolar import Motion, stacked
 from soup_nlp.start.ground import on_ground
 from soup_nlp.start.homographies import unorganised
-from soup_nlp.start.merge import SMALL, earned, gather, unmoved
+from soup_nlp.start.merge import SMALL, earned, gather, unexplained, unmoved
 from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
 from soup_nlp.start.pace import nearer_where_fast, order_in_front
 from soup_nlp.start.scene import scene_first
@@ -59,7 +59,8 @@ class Start:
             components that start at a constant depth, each superpixel with a motion of its own. If
             the rigid part is small or has no parallax, or the camera is at rest, the whole image is
             one such component.
-        torn: (N,) True where a region bends although the flow jumps inside; its depth is a guess.
+        unexplained: (N,) True where the depth is a guess because the motion leaves a large error,
+            see `merge.unexplained`, or because a region bends although its flow jumps, see `torn`.
         wrong: (N,) True where no accepted motion (`earned`) explains the flow, which then counts as
             wrong.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
@@ -83,7 +84,7 @@ class Start:
     tie: Int
     grounded: Mask
     bends: Mask
-    torn: Mask
+    unexplained: Mask
     wrong: Mask
     at_rest: bool = False
     noise: float = LEAST_NOISE
@@ -116,7 +117,7 @@ class Start:
             tie=zero,
             grounded=none,
             bends=none,
-            torn=none,
+            unexplained=none,
             wrong=none,
             noise=noise,
         )
@@ -150,7 +151,7 @@ def propose(flow: FlowFit) -> Start:
         every = np.ones(len(seg), bool)
         start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
         shared = [] if choice is None else choice.motions
-        start = replace(start, motions=shared, surface=surface, bends=every, torn=jumping)
+        start = replace(start, motions=shared, surface=surface, bends=every, unexplained=jumping)
         return start if turn is None else replace(start, at_rest=True, part=parts_at_rest(flow))
     if not bends.any():
         surface = connected_labels(flow.jump < o.discontinuity_px, seg)
@@ -174,6 +175,7 @@ def propose(flow: FlowFit) -> Start:
     soup = replace(soup, lam=soup.lam * scale)
     soup, tie = nearer_where_fast(flow, soup, component, tie)
     soup, component, tie, floor = on_ground(flow, soup, reliable, component, tie)
+    noise = limited_noise(error[~bends])
     mixed = unmoved(flow, choice, component) & ~(fixed | bends)
     return Start(
         soup=soup.normalised(),
@@ -188,9 +190,9 @@ def propose(flow: FlowFit) -> Start:
         tie=tie,
         grounded=weak & (floor > 0),
         bends=bends,
-        torn=jumping,
+        unexplained=jumping | unexplained(rigid, error, component, noise),
         wrong=(wrong | fixed & (shift > STILL_PX)) & ~bends,
-        noise=limited_noise(error[~bends]),
+        noise=noise,
         order=order_in_front(flow, soup, component, tie),
     )
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR, scale_by_contact
+from soup_nlp.geometry.surface import hidden
 from soup_nlp.report.findings import (
     DETERMINED,
     GUESSES,
@@ -101,6 +102,17 @@ def test_a_camera_at_rest_is_the_reason_of_every_guess(small_run):
     shares = certainty(unsure(at_rest))
     assert shares["rest"] == 1.0
     assert guess_line(shares) == f"100% of the image is a guess: {SHARES['rest']}"
+
+
+def test_what_no_motion_explains_is_named(small_run):
+    half = np.arange(len(small_run.start.soup)) % 2 == 0
+    doubtful = replace(small_run, start=replace(small_run.start, unexplained=half))
+    shares = certainty(unsure(doubtful))
+    # but for what has no flow, or is hidden in the next frame
+    known = (small_run.pair.flow.confidence > 0) & ~hidden(small_run.reconstruction)
+    expected = np.mean(half[small_run.segmentation.labels] & known)
+    assert shares["unexplained"] == pytest.approx(expected)
+    assert "no motion that was found explains its flow" in certainty_lines(shares)[0]
 
 
 def test_what_is_fixed_in_the_image_is_named(small_run):

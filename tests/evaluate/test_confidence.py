@@ -393,6 +393,15 @@ def test_a_camera_at_rest_leaves_a_guess_in_its_order(small_room, sure):
     assert np.unique(resting).size > 1000
 
 
+def test_what_no_motion_explains_is_a_guess(small_room, sure):
+    part = np.arange(len(small_room.soup)) < 5
+    doubtful = replace(small_room, start=replace(small_room.start, unexplained=part))
+    inside = part[small_room.segmentation.labels]
+    sigma = sure_of(doubtful).sigma
+    assert sigma[inside].min() >= GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)
+    np.testing.assert_array_equal(sigma[~inside], sure.sigma[~inside])
+
+
 def test_where_surfaces_bend_nothing_is_surer_than_relief_without_parallax(small_room):
     all_bend = np.ones(len(small_room.soup), bool)
     bends = replace(small_room, start=replace(small_room.start, bends=all_bend))

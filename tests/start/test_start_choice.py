@@ -8,6 +8,7 @@ import pytest
 from helpers_model import plane_pose, plane_world
 from helpers_start import CAMERA, facing, fitted, flow_of, squares
 
+from soup_nlp.arrays import Mask
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
@@ -320,6 +321,25 @@ def test_only_a_piece_with_usable_flow_moves():
     part = proposing.moving_parts(flow_of_turns(views, seg), component, component == 4)
     expected = np.where(np.isin(np.arange(32), (16, 17, 22, 23)), 0, component)
     np.testing.assert_array_equal(part, expected)
+
+
+def test_pieces_that_no_motion_explains_have_four_superpixels_and_confident_flow():
+    seg = squares(2, 12)
+    column = (seg.anchors[:, 0] // 8).astype(int)
+    usable = np.ones(len(seg), bool)
+
+    def found(columns: list[int], error: float, component: np.ndarray = 0 * column) -> Mask:
+        bad = np.isin(column, columns)
+        errors = np.where(bad, error, 0.05)
+        return gathering.unexplained(flow_of(seg, usable=usable), errors, component, 0.1)
+
+    np.testing.assert_array_equal(found([3, 4], 0.51), np.isin(column, [3, 4]))
+    assert not found([3, 4], 0.49).any()
+    # single columns have two superpixels, and outlines of components separate pieces
+    assert not found([3, 5], 0.51).any()
+    assert not found([3, 4], 0.51, (column > 3).astype(int)).any()
+    usable[column == 3] = False
+    assert not found([3, 4], 0.51).any()
 
 
 @pytest.mark.parametrize(
