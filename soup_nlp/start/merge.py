@@ -34,9 +34,9 @@ PIXELS = 1500
 """Largest number of pixels of a component to which a motion is fitted."""
 AGREE = 0.7
 """Least share of a component's superpixels that its motion explains."""
-UNEXPLAINED, LEAST_CONFIDENCE = 5.0, 0.3
-"""Error, in units of the flow's noise, above which a motion does not explain the flow of a
-superpixel, and the mean confidence above which the flow is not to blame."""
+UNEXPLAINED, LEAST_CONFIDENCE = 3.0, 0.3
+"""Error beyond that of an affine flow, in units of the flow's noise, above which a motion does not
+explain the flow of a superpixel, and the mean confidence above which the flow is not to blame."""
 DISCONTINUITIES = (1.0, 0.5, 0.25)
 """Jumps of the flow that separate two regions, relative to `discontinuity_px`. A smaller
 jump is tried where no single motion explains a region that a larger one separates."""
@@ -126,9 +126,10 @@ def earned(flow: FlowFit, choice: Choice) -> tuple[Choice, Mask]:
 
 
 def unexplained(flow: FlowFit, error: Float, component: Int, noise: float) -> Mask:
-    """(N,) True in pieces of components (N,) whose confident flow the motion does not explain.
+    """(N,) True in pieces of components (N,) whose flow is affine, but not that of the motion.
 
     They may move by themselves, along the epipolar lines: then the depth that fits best is wrong.
+    Superpixels with the flows of two surfaces are not affine.
 
     Args:
         flow: The flow of every superpixel.
@@ -136,7 +137,7 @@ def unexplained(flow: FlowFit, error: Float, component: Int, noise: float) -> Ma
         component: (N,) rigid component of every superpixel.
         noise: Noise of the flow, pixels.
     """
-    bad = error > UNEXPLAINED * noise
+    bad = error - flow.residual > UNEXPLAINED * noise
     bad &= flow.views.weight.mean(axis=1) > LEAST_CONFIDENCE
     piece = connected_pieces(bad, flow.seg, ~flow.seg.across(component))
     size = np.bincount(piece[bad], minlength=1)

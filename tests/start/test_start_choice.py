@@ -326,20 +326,24 @@ def test_only_a_piece_with_usable_flow_moves():
 def test_pieces_that_no_motion_explains_have_four_superpixels_and_confident_flow():
     seg = squares(2, 12)
     column = (seg.anchors[:, 0] // 8).astype(int)
-    usable = np.ones(len(seg), bool)
+    usable, residual = np.ones(len(seg), bool), np.full(len(seg), 0.05)
 
     def found(columns: list[int], error: float, component: np.ndarray = 0 * column) -> Mask:
         bad = np.isin(column, columns)
         errors = np.where(bad, error, 0.05)
-        return gathering.unexplained(flow_of(seg, usable=usable), errors, component, 0.1)
+        flow = flow_of(seg, usable=usable)._replace(residual=residual)
+        return gathering.unexplained(flow, errors, component, 0.1)
 
-    np.testing.assert_array_equal(found([3, 4], 0.51), np.isin(column, [3, 4]))
-    assert not found([3, 4], 0.49).any()
+    np.testing.assert_array_equal(found([3, 4], 0.36), np.isin(column, [3, 4]))
+    assert not found([3, 4], 0.34).any()
     # single columns have two superpixels, and outlines of components separate pieces
-    assert not found([3, 5], 0.51).any()
-    assert not found([3, 4], 0.51, (column > 3).astype(int)).any()
-    usable[column == 3] = False
-    assert not found([3, 4], 0.51).any()
+    assert not found([3, 5], 0.36).any()
+    assert not found([3, 4], 0.36, (column > 3).astype(int)).any()
+    # neither mixtures of flows nor an uncertain flow is a motion
+    residual[column == 3] = 0.1
+    assert not found([3, 4], 0.36).any()
+    residual[:], usable[column == 3] = 0.05, False
+    assert not found([3, 4], 0.36).any()
 
 
 @pytest.mark.parametrize(
