@@ -25,7 +25,8 @@ MIN_PIXELS = 200
 LEAST_SPREAD = 0.005
 """Smallest spread of a log ratio in the weight of a link."""
 MAX_GUESSED = 0.5
-"""A pair has no parallax if the depth of a larger share of its background is a guess."""
+"""A pair has no parallax if the depth of a larger share of its background is a guess, and a chain
+is not good if that of a larger share of all its images is."""
 MADE_BY = "soup_nlp.sequence.solve.solve_pairs(...)"
 """Where pairs of a chain come from, for messages."""
 SAME = 0.3

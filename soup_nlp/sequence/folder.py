@@ -20,7 +20,7 @@ from soup_nlp.report.models import AXES, thinned, write_model, write_ply
 from soup_nlp.sequence.chain import Chain, make_chain, read_pair
 from soup_nlp.sequence.fused import fuse, projected
 from soup_nlp.sequence.page import RATE, chain_page, depth_pictures, write_animation
-from soup_nlp.sequence.score import score
+from soup_nlp.sequence.score import certainty, score
 from soup_nlp.storage.files import as_path, is_file, read_json, write_bytes, write_text
 from soup_nlp.storage.folders import staged
 from soup_nlp.storage.rows import failed, read_rows
@@ -256,6 +256,7 @@ def summary(chain: Chain) -> dict[str, Any]:
             }
             for k in chain.links
         ],
+        "certainty": certainty(chain),
         "world_from_camera": [m.matrix for m in chain.world_from_camera],
         "tracks": [
             {

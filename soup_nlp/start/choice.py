@@ -25,6 +25,10 @@ PIECES, PIECE_SIZE = 6, 4
 of superpixels of a piece: fewer do not determine a motion."""
 
 
+LEAST_CONFIDENCE = 0.3
+"""Mean confidence of a superpixel above which an error is due to its motion, not to its flow."""
+
+
 def least_gain(noise: float) -> float:
     """Least gain in error (pixels) for which a superpixel changes its motion, for a flow noise."""
     return max(2 * noise, UNEXPLAINED_PX)
@@ -63,7 +67,7 @@ def of_pieces(flow: FlowFit, motions: list[Motion], cost: Float, noise: float) -
         noise: Flow noise, pixels.
     """
     bad = cost.min(axis=1) > max(3 * noise, UNEXPLAINED_PX)
-    bad &= flow.views.weight.mean(axis=1) > 0.3
+    bad &= flow.views.weight.mean(axis=1) > LEAST_CONFIDENCE
     piece = connected_pieces(bad, flow.seg)
     out: list[Motion] = []
     sizes = np.bincount(piece[piece >= 0], minlength=1)

@@ -10,6 +10,7 @@ import numpy as np
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.start.choice import (
     CLIP,
+    LEAST_CONFIDENCE,
     PIECE_SIZE,
     UNEXPLAINED_PX,
     Choice,
@@ -34,9 +35,9 @@ PIXELS = 1500
 """Largest number of pixels of a component to which a motion is fitted."""
 AGREE = 0.7
 """Least share of a component's superpixels that its motion explains."""
-UNEXPLAINED, LEAST_CONFIDENCE = 3.0, 0.3
+UNEXPLAINED = 3.0
 """Error beyond that of an affine flow, in units of the flow's noise, above which a motion does not
-explain the flow of a superpixel, and the mean confidence above which the flow is not to blame."""
+explain the flow of a superpixel."""
 DISCONTINUITIES = (1.0, 0.5, 0.25)
 """Jumps of the flow that separate two regions, relative to `discontinuity_px`. A smaller
 jump is tried where no single motion explains a region that a larger one separates."""

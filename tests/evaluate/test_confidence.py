@@ -398,8 +398,9 @@ def test_what_no_motion_explains_is_a_guess(small_room, sure):
     doubtful = replace(small_room, start=replace(small_room.start, unexplained=part))
     inside = part[small_room.segmentation.labels]
     sigma = sure_of(doubtful).sigma
-    assert sigma[inside].min() >= GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)
-    np.testing.assert_array_equal(sigma[~inside], sure.sigma[~inside])
+    least = GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)
+    assert sigma[inside].min() >= least * (1 - 1e-9)
+    np.testing.assert_allclose(sigma[~inside], sure.sigma[~inside], rtol=1e-9)
 
 
 def test_where_surfaces_bend_nothing_is_surer_than_relief_without_parallax(small_room):

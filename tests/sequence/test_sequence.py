@@ -75,11 +75,13 @@ def test_a_chain_says_which_depth_is_a_guess(tmp_path):
     half, none = make_chain([sure[0], unsure(sure[1])]), make_chain([*map(unsure, sure)])
     for chain, share, code in ((make_chain(sure), 0, 0), (half, 50, 0), (none, 100, 1)):
         write_chain(tmp_path, chain, "toy", ["a.png", "b.png", "c.png"])
+        told = json.loads((tmp_path / "chain.json").read_text())
+        assert told["certainty"]["guess"] == pytest.approx(share / 100)
         said = f"{share}% of all images is a guess: a turn alone or a constant depth"
         text = (tmp_path / "chain.html").read_text()
         assert (f"<b>{said}" in text) == bool(share)
         assert f", {share}% a guess)" in str(chain)
-        lines = "\n".join(chain_lines(chain, json.loads((tmp_path / "chain.json").read_text())))
+        lines = "\n".join(chain_lines(chain, told))
         assert (f"{share}% is a guess" in lines) == bool(share)
         assert ("half of it to 7.0%" in lines) == (share < 100)
         assert chain_exit_code(chain)[0] == code
