@@ -1,10 +1,9 @@
 """Check of a result folder: a table of claims, how each is recomputed, and its tolerance.
 
 Energy, constraints, depth and scores are recomputed from the arrays by `evaluate.recompute`, which
-shares no code with the solver. Everything else is compared with a SHA-256 or a copy in result.h5.
+shares no code with the solver. Every file is compared with the SHA-256 of it when it was written.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,11 +15,11 @@ from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute
 from soup_nlp.evaluate.scoring import DEPTHS, SURE
-from soup_nlp.report.layout import recorded_files, require_layout
+from soup_nlp.report.layout import require_layout
 from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import as_path, read_json
-from soup_nlp.storage.folders import digest_of, recover
-from soup_nlp.storage.h5_files import DIGEST, RECORD, read_attrs, read_digest, read_h5
+from soup_nlp.storage.folders import MARK, digest_of, mark_of, recover
+from soup_nlp.storage.h5_files import read_h5
 from soup_nlp.storage.store import require
 
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
@@ -94,7 +93,7 @@ class CheckReport:
         counts = {how: sum(r.how == how for r in self.rows) for how in (RECOMPUTED, WRITTEN)}
         lines = [
             f"     {counts[RECOMPUTED]} claims are recomputed from the arrays",
-            f"     {counts[WRITTEN]} are compared with the SHA-256 or the copy in result.h5",
+            f"     {counts[WRITTEN]} are compared with their SHA-256 in {MARK}",
             *(f"     left: {text}" for text in LEFT),
         ]
         return "\n".join([head, *map(str, self.rows), *lines])
@@ -243,29 +242,14 @@ def _compared(tree: Mapping[str, Any], name: str) -> tuple[Float, Float]:
     return (np.ones_like(gt) if name == "constant" else z), gt
 
 
-def _leaves(tree: Any, path: str = "") -> dict[str, Any]:
-    """Leaves of nested mappings and lists by their dotted path."""
-    if isinstance(tree, Mapping | list) and tree:
-        items = tree.items() if isinstance(tree, Mapping) else enumerate(tree)
-        return {k: v for name, x in items for k, v in _leaves(x, f"{path}.{name}").items()}
-    return {path.removeprefix("."): tree}
-
-
 def _written(r: Stored) -> Iterator[Claim]:
-    """Entries of summary.json against their copy, all of result.h5 and other files by SHA-256."""
-    copy, now = _leaves(json.loads(str(require(r.tree, f"{RECORD}/summary")))), _leaves(r.claims)
-    changed = sorted(k for k in copy.keys() | now.keys() if copy.get(k, k) != now.get(k, k))
-    same = read_attrs(r.folder / "result.h5").get(DIGEST) == read_digest(r.folder / "result.h5")
-    notes = {
-        "entries of summary.json": ", ".join(changed[:3]),
-        "contents of result.h5 as written": "" if same else "changed",
-    }
-    files = recorded_files(r.tree)
-    if not files:
-        notes["files as written"] = "result.h5 has no record of the files"
-    for name in sorted(files.keys() - {"summary.json"}):
+    """Every file by its SHA-256 in the mark of the folder."""
+    notes, files = {}, mark_of(r.folder).files
+    if not {"summary.json", "result.h5"} <= files.keys():
+        notes["files as written"] = f"no SHA-256 of this result: {MARK} is missing or damaged"
+    for name in sorted(files):
         path, note = r.folder / name, "missing"
-        if ".." not in name and path.is_file():
+        if path.is_file():
             note = "" if digest_of(path) == files[name] else "changed"
         notes[f"{name} as written"] = note
     for name, note in notes.items():

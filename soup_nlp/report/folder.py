@@ -3,8 +3,8 @@
 import base64
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import wraps
 from html import escape
@@ -22,16 +22,15 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture, write_png
 from soup_nlp.report.findings import guess_line
 from soup_nlp.report.formats import check_formats, write_formats
-from soup_nlp.report.layout import record_of, recorded_files, rows_in_file
+from soup_nlp.report.layout import rows_in_file
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import PAGE, Result, load, result_of
 from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.files import as_path, write_text
-from soup_nlp.storage.folders import claim, digest_of, files_in, staged
-from soup_nlp.storage.h5_files import RECORD, read_h5
-from soup_nlp.storage.store import replace_group, write_h5, write_json
+from soup_nlp.storage.folders import claim, staged
+from soup_nlp.storage.store import write_h5, write_json
 
 FULL = ("depth_ref_full.png", "depth_next_full.png")
 """Files of the depth at the size of the images, for a pair that was solved at a smaller size."""
@@ -147,15 +146,11 @@ def write_folder(
         if run.problem.output.page:
             write_text(new / PAGE, page(result, drawn))
         write_json(new / "summary.json", {**contents, "depth_png_scale": scales})
-        names = {path.name for path in new.iterdir()} | {"log.txt", "result.h5"}
+        attributes, rows = _attributes(run, config), rows_in_file(result.metre_unit)
+        write_h5(new / "result.h5", result.tree, attributes, rows)
+        names = {path.name for path in new.iterdir()} | {"log.txt"}
         files = [name for name in FILES if name in names] + sorted(names.difference(FILES))
         write_text(new / "log.txt", log if isinstance(log, str) else log(files))
-        # written last, since it holds the hashes of the others
-        digests = {name: digest_of(new / name) for name in files_in(new)}
-        record = record_of(digests, (new / "summary.json").read_text(encoding="utf-8"))
-        attributes, unit = _attributes(run, config), result.metre_unit
-        tree = {**result.tree, RECORD: record}
-        write_h5(new / "result.h5", tree, attributes, rows_in_file(unit))
     return files
 
 
@@ -214,28 +209,9 @@ def renew_page(folder: Path) -> Path:
         raise DataError(
             "result lacks what a page shows", where=folder, found=repr(error), hint="solve it again"
         ) from error
-    with extended(folder, overwrite=True) as new:
+    with staged(folder, overwrite=True) as new:
         write_text(new / PAGE, text)
     return folder / PAGE
-
-
-@contextmanager
-def extended(folder: Path, overwrite: bool = False) -> Iterator[Path]:
-    """An empty folder whose files are added to the result in `folder` and to its record.
-
-    Raises:
-        DataError: a file cannot be written, or one of the user has the name of a new file and
-            `overwrite` is not set.
-    """
-    with staged(folder, overwrite=overwrite) as new:
-        yield new
-        result = folder / "result.h5"
-        tree = read_h5(result)
-        files = recorded_files(tree)
-        if files:
-            files |= {name: digest_of(new / name) for name in files_in(new)}
-            record = record_of(files, str(tree[RECORD]["summary"]))
-            replace_group(result, new / "result.h5", RECORD, record, rows_in_file())
 
 
 def convert(
@@ -258,8 +234,7 @@ def convert(
     """
     names = check_formats(formats)
     result = load(folder)
-    where = extended(folder, overwrite) if out is None else staged(out, overwrite=overwrite)
-    with where as new:
+    with staged(folder if out is None else out, overwrite=overwrite) as new:
         return write_formats(new, result, names)
 
 

@@ -9,8 +9,8 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.pipeline.record import Run
 from soup_nlp.refine.records import Round
-from soup_nlp.storage.h5_files import RECORD, ReadTree
-from soup_nlp.storage.store import Row, Tree, parse_table, row_of
+from soup_nlp.storage.h5_files import ReadTree
+from soup_nlp.storage.store import Row, parse_table, row_of
 
 TABLE = """
 input/image_ref           1     H,W,3   reference image, 8-bit RGB
@@ -139,10 +139,6 @@ truth/components          1     H,W     component of a reference pixel, -1 for n
 truth/motions             truth  B,4,4  next_from_ref of each component
 truth/scene_flow          truth  H,W,3  true X' - X, each in its own frame's camera
 truth/points              truth  M,3    sparse truth: u and v in px, z in the unit of length
-
-record/files              text  F       names of the other files
-record/sha256             text  F       their SHA-256
-record/summary            text  -       summary.json
 """
 """Path, unit, axes and description of every array, see `parse_table`.
 
@@ -281,16 +277,3 @@ def _wrong(path: str, found: object, expected: str) -> DataError:
         found=found,
         expected=expected,
     )
-
-
-def record_of(digests: Mapping[str, str], summary: str) -> Tree:
-    """The record of the other files: their SHA-256 by name, and the text of summary.json."""
-    return {"files": [*digests], "sha256": [*digests.values()], "summary": summary}
-
-
-def recorded_files(tree: Mapping[str, Any]) -> dict[str, str]:
-    """SHA-256 of the files of a result by name, from its record; {} without a record."""
-    record = tree.get(RECORD, {})
-    if not {"files", "sha256"} <= record.keys():
-        return {}
-    return dict(zip(map(str, record["files"]), map(str, record["sha256"]), strict=True))

@@ -24,7 +24,7 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import PathLike, as_path
+from soup_nlp.storage.files import PathLike, as_path, read_text
 from soup_nlp.storage.system import deferred_signals, sweep, temporary_folder
 
 MARK = ".soup_nlp"
@@ -46,13 +46,13 @@ def mark_of(folder: Path) -> Mark:
     """The mark of a folder; empty if there is no valid one."""
     path = folder / MARK
     try:
-        if path.is_symlink() or not path.is_file():
+        if path.is_symlink():
             return Mark({})
-        mark = json.loads(path.read_text(encoding="utf-8"))
+        mark = json.loads(read_text(path, MARK))
         # a damaged mark must not name files outside the folder
         inside = [n for n in mark["files"] if not PurePosixPath(n).is_absolute() and ".." not in n]
         return Mark({str(n): str(mark["files"][n]) for n in inside}, str(mark.get("of", "")))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (DataError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return Mark({})
 
 
@@ -176,10 +176,11 @@ def staged(
 def _commit(stage: Path, target: Path, whole: bool, subject: str) -> None:
     """Mark a temporary folder as complete and move its files to their places."""
     new, before = {name: digest_of(stage / name) for name in files_in(stage)}, mark_of(target)
-    old = {k: v for k, v in before.files.items() if _state(target, k) == "made"}
-    for name in old.keys() & new.keys():
-        shutil.copymode(target / name, stage / name)
-    files = new if whole else old | new
+    for name in before.files.keys() & new.keys():
+        if _state(target, name) == "made":
+            shutil.copymode(target / name, stage / name)
+    # a file that was changed stays listed, so that it is known to be changed
+    files = new if whole else before.files | new
     of = {"of": subject or before.subject} if subject or before.subject else {}
     mark = json.dumps({**of, "files": dict(sorted(files.items()))}, indent=1)
     (stage / MARK).write_text(mark + "\n", encoding="utf-8")

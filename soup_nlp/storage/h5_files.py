@@ -1,6 +1,5 @@
 """Reading of HDF5 files, which rejects links and checks sizes before it allocates memory."""
 
-import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn, TypeAlias
@@ -15,12 +14,8 @@ from soup_nlp.storage.system import require_memory
 ReadTree: TypeAlias = dict[str, Any]
 """Nested dict of numpy arrays, as `read_h5` returns it."""
 
-RECORD = "record"
-"""Group of hashes of other files; `convert` rewrites it, so `contents_digest` leaves it out."""
 DEEPEST = 16
 """Largest number of nested groups."""
-DIGEST = "contents_sha256"
-"""Root attribute with the result of `contents_digest`."""
 BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError)
 """Exceptions that h5py raises for damaged files."""
 
@@ -103,35 +98,6 @@ def read_attrs(path: PathLike) -> dict[str, Any]:
     with _opened(path) as file:
         out = {k: v.item() if isinstance(v, np.generic) else v for k, v in file.attrs.items()}
         return {k: v.decode() if isinstance(v, bytes) else v for k, v in out.items()}
-
-
-def contents_digest(file: h5py.File) -> str:
-    """SHA-256 of all arrays and attributes of an open result, independent of their storage."""
-    items = [(name, item) for name, item in _items(file) if name.split("/")[0] != RECORD]
-    sha = hashlib.sha256()
-
-    def add(name: str, data: Any) -> None:
-        value = np.asarray(data)
-        sha.update(f"{name}\0{value.dtype.str}\0{value.shape}\0".encode(errors="surrogateescape"))
-        sha.update(repr(value.tolist()).encode() if value.dtype == object else value.tobytes())
-
-    for name, item in sorted([("", file), *items], key=lambda pair: pair[0]):
-        attrs = item.attrs
-        for key in sorted(attrs):
-            if (name, key) != ("", DIGEST):
-                add(f"{name}@{key}", attrs[key])
-        add(name, item[()] if isinstance(item, h5py.Dataset) else 0)
-    return sha.hexdigest()
-
-
-def read_digest(path: PathLike) -> str:
-    """The digest of the present contents of a result file, see `contents_digest`.
-
-    Raises:
-        DataError: see `read_h5`, which must be called before, since it checks the sizes.
-    """
-    with _opened(path) as file:
-        return contents_digest(file)
 
 
 @contextmanager

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from pydantic_core import to_jsonable_python
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import PathLike, read_bytes, write_bytes, write_text
-from soup_nlp.storage.h5_files import DIGEST, contents_digest
+from soup_nlp.storage.files import PathLike, write_bytes, write_text
 from soup_nlp.storage.versions import versions
 
 SCHEMA = 1
@@ -78,7 +77,7 @@ def write_h5(
 
     Each array becomes a dataset with the attributes `units`, `description` and `shape_letters`;
     each mapping a group. The root gets `attrs` (None is left out; values without a type of HDF5 are
-    stored as JSON text) plus `schema`, `versions` (JSON text), `machine` and a digest of all of it.
+    stored as JSON text) plus `schema`, `versions` (JSON text) and `machine`.
 
     Args:
         path: File to write; its folder must exist.
@@ -98,28 +97,9 @@ def write_h5(
                 if value is not None:
                     _write_attribute(file, key, value)
             _write_group(file, tree, rows)
-            _write_attribute(file, DIGEST, contents_digest(file))
     except (OSError, TypeError, ValueError, RuntimeError) as error:
         raise DataError("cannot write the HDF5 file", where=path, found=error) from error
     write_bytes(path, image.getvalue())
-
-
-def replace_group(
-    source: PathLike, target: PathLike, name: str, tree: Tree, rows: Mapping[str, Row]
-) -> None:
-    """Write a copy of a result file with one group replaced.
-
-    Raises:
-        DataError: the file cannot be read or written.
-    """
-    image = BytesIO(read_bytes(source, "result file"))
-    try:
-        with h5py.File(image, "r+", libver=FORMAT) as file:
-            del file[name]
-            _write_group(file, {name: tree}, rows)
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise DataError("result file cannot be changed", where=source, found=error) from error
-    write_bytes(target, image.getvalue())
 
 
 def _write_group(group: h5py.Group, tree: Tree, rows: Mapping[str, Row]) -> None:

@@ -60,7 +60,7 @@ ENDS = st.sampled_from([None, None, None, RuntimeError, KeyboardInterrupt, OSErr
 def test_results_and_files_of_the_user_share_a_folder(steps):
     """Results that are written, or fail, and files of the user, against two dicts of files."""
     with TemporaryDirectory() as home:
-        target, made, mine = Path(home) / "out", {}, {}
+        target, made, mine, listed = Path(home) / "out", {}, {}, set()
         for step, (names, writer, end) in enumerate(steps):
             files, whole = dict.fromkeys(names, str(step)), writer == "whole"
             refused = DataError if end in (None, OSError) else end
@@ -73,8 +73,10 @@ def test_results_and_files_of_the_user_share_a_folder(steps):
                     write(target, whole, end=end, **files)
             else:
                 write(target, whole, **files)
+                # what the user changed stays listed until the next whole result
+                listed = set(files) if whole else listed | files.keys()
                 made = files if whole else made | files
-                assert mark_of(target).files.keys() == made.keys()
+                assert mark_of(target).files.keys() == listed
             found = {name: (target / name).read_text() for name in files_in(target)}
             assert found == made | mine
             assert all(any(p.iterdir()) for p in target.rglob("*") if p.is_dir())

@@ -28,7 +28,7 @@ SMALL = [
 ]  # fmt: skip
 FORMATS = "glb,colmap,npy,pfm,png,motions"
 LEFT = (".soup_nlp",)
-"""Files without a claim: the list by which the program knows what it may overwrite."""
+"""Files without a claim: the list of the others. Damage that makes it no list is noticed."""
 
 
 def leaves(tree: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
