@@ -49,8 +49,8 @@ READERS = {
     "depth": partial(fmt.read_depth, scale=1000.0),
     "cam": camera_files.read_cam,
     "camera": camera_files.read_intrinsics,
-    "kitti": partial(camera_files.read_kitti_projections, names=["P0"]),
-    "vkitti": partial(camera_files.read_vkitti2_intrinsics, frames=(0,)),
+    "kitti": partial(camera_files.read_rows, names=["P0:"], count=12),
+    "vkitti": partial(camera_files.read_rows, names=["0 0"], count=4),
     "image": read_image,
 }
 MALFORMED = [
@@ -96,14 +96,14 @@ MALFORMED = [
     ("camera", "K.txt", "688 0 5 1 688 2 0 0 1", "upper triangular"),
     ("camera", "K.txt", b"\xff\xfe\x00\x81", "is not text"),
     ("camera", "K.yaml", "camera_model: equidistant\nK: [1, 0, 0, 0, 1, 0, 0, 0, 1]", "fisheye"),
-    ("kitti", "calib.txt", "1 2 3", "lacks projection P0"),
-    ("kitti", "calib.txt", "P1: 1 2", r"projection P0[\s\S]*found: P1"),
+    ("kitti", "calib.txt", "1 2 3", "lacks the numbers of P0:"),
+    ("kitti", "calib.txt", "P1: 1 2", r"numbers of P0:[\s\S]*found: P1:"),
     ("kitti", "calib.txt", "P0: 1 2 x", "not a number"),
-    ("kitti", "calib.txt", "P0: 1 2 3", r"projection P0[\s\S]*3 numbers"),
-    ("kitti", "calib.txt", "P0:" + 12 * " nan", r"projection P0[\s\S]*0 of them finite"),
-    ("vkitti", "a.txt", "frame K[0,0]\n0 1\n", "lacks columns"),
+    ("kitti", "calib.txt", "P0: 1 2 3", r"numbers of P0:[\s\S]*found: 1 2 3[\s\S]*12 finite"),
+    ("kitti", "calib.txt", "P0:" + 12 * " nan", r"numbers of P0:[\s\S]*12 finite"),
+    ("vkitti", "a.txt", "frame K[0,0]\n0 1\n", "lacks the numbers of 0 0"),
     ("vkitti", "a.txt", f"{COLUMNS}\n0 0 725 x 620.5 187\n", "not a number"),
-    ("vkitti", "a.txt", f"{COLUMNS}\n0 1 7 7 6 1\n\n0 0 7\n", r"1 complete rows[\s\S]*frame 0"),
+    ("vkitti", "a.txt", f"{COLUMNS}\n0 1 7 7 6 1\n\n0 0 7\n", r"of 0 0[\s\S]*found: 7[\s\S]*4 fin"),
     ("image", "a.png", b"not an image at all", r"cannot be decoded[\s\S]*not an i"),
     ("image", "a.tiff", np.zeros((4, 4), np.float32), "neither 8-bit nor 16-bit"),
 ]
@@ -165,8 +165,7 @@ def test_real_files(shared_data: Path, tmp_path: Path) -> None:
     write_kitti_flow(tmp_path / "a.png", flow)
     np.testing.assert_array_equal(fmt.read_flow(tmp_path / "a.png"), flow)
     calibration = folder / "calib" / "000027.txt"
-    (projection,) = camera_files.read_kitti_projections(calibration, ["P1"])
-    assert projection[0, 3] == -386.1448
+    assert camera_files.read_rows(calibration, ["P1:"], 12)[0, 3] == -386.1448
 
 
 @pytest.mark.parametrize("mark", [np.nan, np.inf, -np.inf, 1.1e9, -2e9])
@@ -240,25 +239,21 @@ def test_cameras(tmp_path: Path) -> None:
     assert camera_files.read_camera(path)[1].tolist() == [0, 0, 0.01]
 
 
-def test_kitti_projections(tmp_path: Path) -> None:
-    path = tmp_path / "calib.txt"
-    path.write_text(
+def test_rows_of_numbers(tmp_path: Path) -> None:
+    kitti = (
         "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.950000e-02\n"
         "K_00: 1 2 3 4 5 6 7 8 9\n\nP_rect_00: 1 2 3 4 5 6 7 8 9 10 11 12\nT_00: 1 2 3\n"
     )
-    (projection,) = camera_files.read_kitti_projections(path, ["P_rect_00"])
-    np.testing.assert_array_equal(projection, np.arange(1, 13).reshape(3, 4))
-
-
-def test_vkitti_intrinsics(tmp_path: Path) -> None:
-    path = tmp_path / "intrinsic.txt"
-    path.write_text(f"{COLUMNS}\n0 0 725 726 620.5 187\n0 1 7 7 6 1\n1 0 730 730 6 1\n\n2 0 725\n")
-    first, second = camera_files.read_vkitti2_intrinsics(path, (0, 1))
-    np.testing.assert_array_equal(first, [[725, 0, 620.5], [0, 726, 187], [0, 0, 1]])
-    assert second[0, 0] == 730
-    for missing in (2, 3):
-        with raises(rf"3 complete rows[\s\S]*a row of frame {missing}"):
-            camera_files.read_vkitti2_intrinsics(path, (0, missing))
+    path = put(tmp_path / "calib.txt", kitti.encode())
+    rows = camera_files.read_rows(path, ["P_rect_00:"], 12)
+    np.testing.assert_array_equal(rows, [np.arange(1, 13)])
+    vkitti = f"{COLUMNS}\n0 0 725 726 620.5 187\n0 1 7 7 6 1\n1 0 730 730 6 1\n\n2 0 725\n"
+    put(path, vkitti.encode())
+    rows = camera_files.read_rows(path, ["1 0", "0 0"], 4)
+    np.testing.assert_array_equal(rows, [[730, 730, 6, 1], [725, 726, 620.5, 187]])
+    for missing in ("2 0", "3 0"):
+        with raises(rf"lacks the numbers of {missing}"):
+            camera_files.read_rows(path, ["0 0", missing], 4)
 
 
 # --- images -------------------------------------------------------------------------------------

@@ -7,11 +7,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 from soup_nlp.data.datasets.layout import Folder, PairInput, Resolve, make_pair
-from soup_nlp.data.formats.camera_files import (
-    read_cam,
-    read_kitti_projections,
-    read_vkitti2_intrinsics,
-)
+from soup_nlp.data.formats.camera_files import check_intrinsics, read_cam, read_rows
 from soup_nlp.data.formats.images import assumed, decode, read_mask
 from soup_nlp.data.formats.map_files import (
     KITTI_DISPARITY,
@@ -27,12 +23,12 @@ from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Whole
 
 _KITTI = {
-    "kitti2012": ("image_0", "calib", ("P0", "P1"), "disp_occ"),
-    "kitti2015": ("image_2", "calib_cam_to_cam", ("P_rect_02", "P_rect_03"), "disp_occ_0"),
+    "kitti2012": ("image_0", "calib", ("P0:", "P1:"), "disp_occ"),
+    "kitti2015": ("image_2", "calib_cam_to_cam", ("P_rect_02:", "P_rect_03:"), "disp_occ_0"),
 }
-"""Folders of images and calibration, names of the projections, folder of disparities."""
+"""Folders of images and calibration, rows of the projections, folder of disparities."""
 KITTI_LAYOUT = (
-    "training/{0}/NNNNNN_10.png and _11.png, training/{1}/NNNNNN.txt ({2[0]}, {2[1]}); optional"
+    "training/{0}/NNNNNN_10.png and _11.png, training/{1}/NNNNNN.txt (rows {2[0]} {2[1]}); optional"
     " {3}, flow_occ, obj_map with NNNNNN_10.png"
 )
 
@@ -91,7 +87,7 @@ class KittiInput(PairInput):
         name = f"{int(self.index):06d}"
         images = [folder.need(f"{names}/{name}_{k}.png") for k in (10, 11)]
         calibration = folder.need(f"{calib}/{name}.txt")
-        left, right = read_kitti_projections(calibration, projections)
+        left, right = read_rows(calibration, projections, 12).reshape(2, 3, 4)
         K = left[:, :3].copy()
         baseline = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
         if not baseline > 0:
@@ -157,7 +153,8 @@ class VkittiInput(SceneFrames):
             assumed(folder.path, "Virtual KITTI 1 has no file of its camera", VKITTI1_TEXT)
         else:
             table = folder.need(f"{self.scene}/{self.variation}/intrinsic.txt")
-            cameras = read_vkitti2_intrinsics(table, numbers)
+            rows = read_rows(table, [f"{number} 0" for number in numbers], 4)
+            cameras = [check_intrinsics(intrinsics(*row), table) for row in rows]
         depths = [folder.read(read_vkitti_depth, file(depth, number)) for number in numbers]
         flows = [file(flow, self.frame)] if self.step == 1 else []
         truth = Truth(depths[0], depths[1], folder.read(read_vkitti_flow, *flows))

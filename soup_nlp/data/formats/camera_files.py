@@ -23,8 +23,6 @@ CAMERA = ("fx", "fy", "cx", "cy")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of distortion in OpenCV's order; up to six more have no common names."""
 
-_VKITTI2_COLUMNS = ["frame", "cameraID", "K[0,0]", "K[1,1]", "K[0,2]", "K[1,2]"]
-
 
 def _numbers(text: str, where: PathLike, what: str) -> list[float]:
     """Numbers of a text, separated by blanks or commas."""
@@ -169,54 +167,24 @@ def read_cam(path: PathLike) -> Float:
     return check_intrinsics(np.frombuffer(content, "<f8", 9).reshape(3, 3), path)
 
 
-def read_kitti_projections(path: PathLike, names: Sequence[str]) -> list[Float]:
-    """Read projections (3, 4), pixels and metres, of a KITTI calibration file.
+def read_rows(path: PathLike, names: Sequence[str], count: int) -> Float:
+    """Read the rows of a text file with these names as numbers (len(names), count).
 
-    Args:
-        path: A stereo/flow 2012 file ('P0: ...') or a 'calib_cam_to_cam.txt' ('P_rect_02: ...').
-        names: Names of the projections.
+    A projection of KITTI is the row "P0:" or "P_rect_02:" of 12 numbers, a camera of Virtual KITTI
+    2 the row "FRAME CAMERA" of fx fy cx cy.
     """
-    lines = read_text(path, "calibration file").splitlines()
-    entries = {name.strip(): text for name, _, text in (line.partition(":") for line in lines)}
+    lines = [line.split() for line in read_text(path, "calibration file").splitlines()]
     out = []
     for name in names:
-        values = np.array(_numbers(entries.get(name, ""), f"{path}, {name}", "calibration file"))
-        if values.size != 12 or not np.isfinite(values).all():
-            counts = f"{values.size} numbers, {int(np.isfinite(values).sum())} of them finite"
+        head = name.split()
+        rows = [line[len(head) :] for line in lines if line[: len(head)] == head]
+        row = _numbers(" ".join(rows[0] if rows else []), f"{path}, {name}", "calibration file")
+        if len(row) != count or not np.isfinite(row).all():
             raise DataError(
-                f"calibration file lacks projection {name}",
+                f"calibration file lacks the numbers of {name}",
                 where=path,
-                found=counts if name in entries else ", ".join(entries),
-                expected=f"a line '{name}: ...' with 12 finite numbers",
+                found=" ".join(rows[0]) if rows else ", ".join(line[0] for line in lines if line),
+                expected=f"a line '{name} ...' with {count} finite numbers",
             )
-        out.append(values.reshape(3, 4))
-    return out
-
-
-def read_vkitti2_intrinsics(path: PathLike, frames: Sequence[int]) -> list[Float]:
-    """Read intrinsics of the left camera at these frames from a Virtual KITTI 2 intrinsic.txt.
-
-    Its columns are: frame cameraID K[0,0] K[1,1] K[0,2] K[1,2].
-    """
-    lines = [line.split() for line in read_text(path, "intrinsics file").splitlines()]
-    if lines[:1] != [_VKITTI2_COLUMNS]:
-        raise DataError(
-            "intrinsics file lacks columns",
-            where=path,
-            found=" ".join(lines[0]) if lines else "",
-            expected=" ".join(_VKITTI2_COLUMNS),
-        )
-    rows = {tuple(words[:2]): words[2:] for words in lines[1:] if len(words) == 6}
-    out = []
-    for frame in frames:
-        row, where = rows.get((str(frame), "0")), f"{path}, frame {frame}"
-        if row is None:
-            raise DataError(
-                "intrinsics of the frame are missing",
-                where=path,
-                found=f"{len(rows)} complete rows",
-                expected=f"a row of frame {frame}, camera 0",
-            )
-        numbers = _numbers(" ".join(row), where, "intrinsics row")
-        out.append(check_intrinsics(intrinsics(*numbers), where))
-    return out
+        out.append(row)
+    return np.array(out)
