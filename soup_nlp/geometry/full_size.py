@@ -5,6 +5,7 @@ from scipy import ndimage
 
 from soup_nlp.arrays import Float, FloatMap, Image, Int, Labels
 from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.soup import LEAST_FACING
 
 COLOUR = 0.1
 """Standard deviation of colour differences, colours in [0, 1], of the weights of neighbours."""
@@ -14,57 +15,45 @@ ROWS = 128
 """Rows per block of computation."""
 
 
-def grown_labels(labels: Labels, small: Image, image: Image) -> Labels:
-    """Superpixels of a small image at the size of the large one, borders along its edges.
+def full_depth(
+    labels: Labels, small: Image, image: Image, normal: Float, offset: Float, K: Float
+) -> FloatMap:
+    """Depth of planes at the size of a large image, borders of superpixels along its edges.
 
     Joint bilateral upsampling (Kopf et al., 2007) of labels: near a border the 3 x 3 nearest pixels
     of the small image vote, with more weight the closer they are in position and colour.
 
     Args:
-        labels: (h, w) superpixel of every pixel; -1 is a label too.
+        labels: (h, w) superpixel of every pixel of the small image; -1 is a label too.
         small: (h, w, 3) small image.
         image: (H, W, 3) large image.
+        normal: (N, 3) normals of the planes `normal . X + offset = 0`, towards the camera.
+        offset: (N,) offsets.
+        K: (3, 3) intrinsics of the large image.
 
     Returns:
-        (H, W) labels.
+        (H, W) z; NaN where the label is -1 or a plane turns away.
     """
     (h, w), (height, width) = labels.shape, image.shape[:2]
     # pixels with more than one label among the 3 x 3 pixels around them
     border = ndimage.maximum_filter(labels, 3) != ndimage.minimum_filter(labels, 3)
     x = (np.arange(width) + 0.5) * (w / width) - 0.5
     column = np.rint(x).astype(np.int64).clip(0, w - 1)
-    out = np.empty((height, width), np.int32)
+    out = np.empty((height, width), np.float32)
     for top in range(0, height, ROWS):
-        bottom = min(top + ROWS, height)
-        y = (np.arange(top, bottom) + 0.5) * (h / height) - 0.5
+        rows = np.arange(top, min(top + ROWS, height))
+        y = (rows + 0.5) * (h / height) - 0.5
         row = np.rint(y).astype(np.int64).clip(0, h - 1)
-        part = labels[row[:, None], column]
+        plane = labels[row[:, None], column]
         v, u = np.nonzero(border[row[:, None], column])
         if len(v):
             position = np.stack([y[v], x[u]])
-            part[v, u] = _voted(labels, small, image[top + v, u], position, row[v], column[u])
-        out[top:bottom] = part
-    return out
-
-
-def plane_depth(labels: Labels, normal: Float, offset: Float, K: Float) -> FloatMap:
-    """(H, W) z of planes `normal . X + offset = 0`; NaN where a label is -1 or a plane turns away.
-
-    Args:
-        labels: (H, W) plane of every pixel.
-        normal: (N, 3) normals towards the camera.
-        offset: (N,) offsets.
-        K: (3, 3) intrinsics of the image.
-    """
-    height, width = labels.shape
-    out = np.empty((height, width), np.float32)
-    for top in range(0, height, ROWS):
-        block = labels[top : top + ROWS]
-        v, u = np.mgrid[top : top + len(block), 0:width]
-        facing = -np.einsum("hwc,hwc->hw", normal[block], rays(K, np.stack([u, v], axis=-1)))
+            plane[v, u] = _voted(labels, small, image[top + v, u], position, row[v], column[u])
+        uv = np.stack(np.meshgrid(np.arange(width), rows), axis=-1)
+        facing = -np.einsum("hwc,hwc->hw", normal[plane], rays(K, uv))
         with np.errstate(divide="ignore", invalid="ignore"):
-            z = offset[block] / facing
-        out[top : top + ROWS] = np.where((block >= 0) & (facing > 1e-6) & (z > 0), z, np.nan)
+            z = offset[plane] / facing
+        out[rows] = np.where((plane >= 0) & (facing > LEAST_FACING) & (z > 0), z, np.nan)
     return out
 
 

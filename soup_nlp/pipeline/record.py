@@ -13,7 +13,7 @@ from soup_nlp.evaluate.confidence import Confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.components import Components, find_components
-from soup_nlp.geometry.full_size import grown_labels, plane_depth
+from soup_nlp.geometry.full_size import full_depth
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup
@@ -210,14 +210,14 @@ def full_size(full: Pair, small: Pair, result: Reconstruction) -> FullSize:
     frame after their motions.
     """
     soup = result.soup
-    labels = grown_labels(result.labels, small.image_ref, full.image_ref)
-    depth_ref = plane_depth(labels, soup.n, soup.distance, full.K_ref)
+    images = small.image_ref, full.image_ref
+    depth_ref = full_depth(result.labels, *images, soup.n, soup.distance, full.K_ref)
     # X' = R X + t carries n . X + D = 0 to (R n) . X' + D - (R n) . t = 0
     turned = np.einsum("nij,nj->ni", soup.R, soup.n)
     moved = soup.distance - np.einsum("ni,ni->n", turned, soup.translation)
     source = result.source_next
     shown = np.where(source >= 0, result.labels.ravel()[source], -1).astype(np.int32)
-    labels_next = grown_labels(shown, small.image_next, full.image_next)
-    depth_next = plane_depth(labels_next, turned, moved, full.K_next)
+    images = small.image_next, full.image_next
+    depth_next = full_depth(shown, *images, turned, moved, full.K_next)
     scores = score_depths(full.truth, {"full": depth_ref.astype(np.float64)})
     return FullSize(depth_ref, depth_next, scores.get("full"))

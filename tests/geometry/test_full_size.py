@@ -9,7 +9,7 @@ from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.working_size import working_size
 from soup_nlp.geometry.camera import intrinsics, pixel_grid, project, rays
-from soup_nlp.geometry.full_size import grown_labels, plane_depth
+from soup_nlp.geometry.full_size import full_depth
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.verdict import facts
@@ -68,7 +68,8 @@ def test_labels_grow_to_the_edges_of_the_image():
     size = (width // 4, height // 4)
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     labels = cv2.resize(inside.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    grown = grown_labels(labels.astype(np.int32), small, image)
+    planes = np.tile([0.0, 0.0, -1.0], (2, 1)), np.array([1.0, 2.0])
+    grown = full_depth(labels.astype(np.int32), small, image, *planes, K) - 1
     blocks = cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST)
     assert (blocks != inside).sum() > 200
     # the remaining pixels have only neighbours of the other side in the small image
@@ -79,7 +80,8 @@ def test_planes_are_exact_at_every_pixel():
     pair = plane_pair()
     labels = np.zeros(pair.size, np.int32)
     labels[:5] = -1
-    z = plane_depth(labels, np.array([[0.1, 0.2, -1.0]]), np.array([5.0]), K)
+    plane = np.array([[0.1, 0.2, -1.0]]), np.array([5.0])
+    z = full_depth(labels, pair.image_ref, pair.image_ref, *plane, K)
     assert np.isnan(z[:5]).all()
     np.testing.assert_allclose(z[5:], pair.truth.depth_ref[5:], rtol=1e-6)
 
