@@ -189,13 +189,7 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
         (h1, w1), (h2, w2) = first.shape, second.shape
         return dis.calc(a, b, None)[:h1, :w1], dis.calc(b, a, None)[:h2, :w2]
 
-    try:
-        forward, backward = match(ref, nxt)
-        uv, gap = guided_flow(ref, nxt, match, forward, backward)
-        uv, gap = with_tiles(ref, nxt, match, uv, gap)
-    except cv2.error as error:
-        raise DataError(
-            "DIS flow failed", where=f"images {width}x{height}", found=str(error).strip()
-        ) from error
+    uv, gap = guided_flow(ref, nxt, match, *match(ref, nxt))
+    uv, gap = with_tiles(ref, nxt, match, uv, gap)
     confidence = confidence_of(gap) if consistency else np.isfinite(gap)
     return Flow(np.ascontiguousarray(uv), confidence.astype(np.float32), "dis")

@@ -62,17 +62,14 @@ def without_still_layer(ref: Image, nxt: Image) -> tuple[Image, Image]:
 
 
 def _derivatives(image: FloatMap) -> tuple[FloatMap, FloatMap]:
-    along, down = np.zeros_like(image), np.zeros_like(image)
-    along[:, :-1] = np.diff(image, axis=1)
-    down[:-1] = np.diff(image, axis=0)
-    return along, down
+    """Differences to the pixels on the right and below; 0 at the border."""
+    along = np.diff(image, axis=1, append=image[:, -1:])
+    return along, np.diff(image, axis=0, append=image[-1:])
 
 
 def _integrated(along: FloatMap, down: FloatMap, mean: float) -> Image:
     height, width = along.shape
-    divergence = along + down
-    divergence[:, 1:] -= along[:, :-1]
-    divergence[1:] -= down[:-1]
+    divergence = np.diff(along, axis=1, prepend=0) + np.diff(down, axis=0, prepend=0)
     v, u = np.arange(height)[:, None], np.arange(width)
     laplacian = 2 * (np.cos(np.pi * v / height) + np.cos(np.pi * u / width)) - 4
     laplacian[0, 0] = 1.0

@@ -17,13 +17,6 @@ RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 """Input values of black and white by the metadata `input_range` of an ONNX file; default "255"."""
 
 
-TAKES = {
-    1: ("one image", "one input (1, 3, H, W)"),
-    2: ("two images", "two inputs (1, 3, H, W), or one (1, 6, H, W)"),
-}
-"""What a network takes, and its inputs, by the number of its images."""
-
-
 class Network:
     """A network that onnxruntime runs on the CPU.
 
@@ -59,8 +52,8 @@ class Network:
         shapes = [i.shape for i in inputs]
         channels = [shape[1] if len(shape) == 4 else None for shape in shapes]
         if channels not in ([3] * count, [3 * count]):
-            images, expected = TAKES[count]
-            what = f"network does not take {images}"
+            what = f"network does not take {('one image', 'two images')[count - 1]}"
+            expected = f"{count} x (1, 3, H, W), or one input (1, {3 * count}, H, W)"
             raise DataError(what, where=source, found=shapes, expected=expected)
         word = self.session.get_modelmeta().custom_metadata_map.get("input_range", "255")
         if word not in RANGES:

@@ -62,11 +62,18 @@ def load_flow(path: PathLike) -> Flow:
     return flow
 
 
-def flow_from_truth(pair: Pair) -> Flow:
+def flow_from_truth(pair: Pair, source: str = "truth") -> Flow:
     """The true flow of a pair, with confidence 0 where it is unknown.
 
+    Args:
+        pair: Its truth has a flow.
+        source: "truth", or with Gaussian noise such as "truth+noise:0.5". The number is the
+            standard deviation of either component, pixels. The noise is correlated over a few
+            pixels, like errors of real flows: white noise would average out within a superpixel.
+            Every call adds the same noise.
+
     Raises:
-        DataError: the pair has no true flow.
+        DataError: the pair has no true flow, or the source has no such number.
     """
     if pair.truth is None or pair.truth.flow is None:
         raise DataError(
@@ -75,19 +82,9 @@ def flow_from_truth(pair: Pair) -> Flow:
             found=pair.truth or "no truth",
             hint="use the flow source 'dis' or give a flow file",
         )
-    return Flow(pair.truth.flow.astype(np.float32), source="truth")
-
-
-def noisy_truth(pair: Pair, source: str) -> Flow:
-    """The true flow of a pair with Gaussian noise, of a source such as "truth+noise:0.5".
-
-    The number is the standard deviation of either component, pixels. The noise is correlated over a
-    few pixels, like errors of real flows: white noise would average out within a superpixel. Every
-    call adds the same noise.
-
-    Raises:
-        DataError: the pair has no true flow, or the source has no such number.
-    """
+    flow = Flow(pair.truth.flow.astype(np.float32), source="truth")
+    if source == "truth":
+        return flow
     try:
         sigma = float(source.removeprefix(NOISE))
     except ValueError:
@@ -95,7 +92,6 @@ def noisy_truth(pair: Pair, source: str) -> Flow:
     if not 0 <= sigma < 1000:
         what = "noise of the flow is not a number of pixels"
         raise DataError(what, found=source, expected=f"{NOISE}0.5")
-    flow = flow_from_truth(pair)
     height, width = flow.confidence.shape
     pad = int(np.ceil(4 * CORRELATION))
     shape = (height + 2 * pad, width + 2 * pad, 2)
@@ -105,7 +101,7 @@ def noisy_truth(pair: Pair, source: str) -> Flow:
     # normalise: the deviation of blurred noise differs from its expectation in a small image
     noise = noise * np.float32(sigma / max(float(noise.std()), 1e-12))
     uv = np.where(flow.confidence[:, :, None] > 0, flow.uv + noise, flow.uv)
-    return Flow(uv.astype(np.float32), flow.confidence, f"{flow.source}+noise:{sigma:g}")
+    return Flow(uv.astype(np.float32), flow.confidence, f"truth+noise:{sigma:g}")
 
 
 class FlowOptions(Section):
@@ -265,8 +261,8 @@ def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
 
     Args:
         pair: The pair; its `flow` is ignored.
-        source: "dis", "truth", "truth+noise:SIGMA" (`noisy_truth`), the name of a plug-in, the path
-            of a network (.onnx) or of a flow file.
+        source: "dis", "truth", "truth+noise:SIGMA" (`flow_from_truth`), the name of a plug-in, the
+            path of a network (.onnx) or of a flow file.
         consistency: Whether DIS weights its flow by the forward-backward consistency.
 
     Raises:
@@ -275,10 +271,8 @@ def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
     if source == "dis":
         method = partial(dis_flow, consistency=consistency)
         return flow_between_bars(method, pair.image_ref, pair.image_next)
-    if source == "truth":
-        return flow_from_truth(pair)
-    if source.startswith(NOISE):
-        return noisy_truth(pair, source)
+    if source == "truth" or source.startswith(NOISE):
+        return flow_from_truth(pair, source)
     if is_network(source):
         return flow_between_bars(partial(learned_flow, source), pair.image_ref, pair.image_next)
     plugins = flow_sources()

@@ -72,8 +72,7 @@ def with_tiles(
     for surface in sorted(surfaces, key=len, reverse=True):
         corners = surface[:, :2] * shrink
         shift = np.rint(np.median(surface[:, 2:], axis=0) * shrink).astype(int)
-        box = _box(corners, TILE * shrink, shift, ref.shape, nxt.shape)
-        here, there = (_slices(box, offset) for offset in ((0, 0), shift))
+        here, there = _windows(corners, TILE * shrink, shift, ref.shape, nxt.shape)
         new, back = match(np.ascontiguousarray(ref[here]), np.ascontiguousarray(nxt[there]))
         new_gap = round_trip_error(new, back)
         new = new + shift.astype(np.float32)
@@ -157,20 +156,19 @@ def _ends(flow: FloatMap, usable: NDArray[np.bool_], shape: tuple[int, ...]) -> 
     return np.asarray(cv2.morphologyEx(ends, cv2.MORPH_CLOSE, square), np.float32)
 
 
-def _box(
+def _windows(
     corners: NDArray[np.int_],
     side: int,
     shift: NDArray[np.int_],
     shape: tuple[int, ...],
     next_shape: tuple[int, ...],
-) -> NDArray[np.int_]:
-    """((u0, v0), (u1, v1)) around tiles with a margin, in both images before and after a shift."""
+) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Rows and columns around tiles with a margin, in both images before and after a shift."""
     size, next_size = np.array(shape[::-1]), np.array(next_shape[::-1])
     low = np.maximum(np.maximum(corners.min(axis=0) - side // 2, 0), -shift)
     high = np.minimum(corners.max(axis=0) + side + side // 2, np.minimum(size, next_size - shift))
-    return np.stack([low, high])
-
-
-def _slices(box: NDArray[np.int_], offset: NDArray[np.int_] | tuple[int, int]) -> tuple[slice, ...]:
-    (u0, v0), (u1, v1) = box + np.asarray(offset)
-    return slice(v0, v1), slice(u0, u1)
+    here, there = (
+        tuple(slice(a, b) for a, b in zip((low + move)[::-1], (high + move)[::-1]))
+        for move in (0 * shift, shift)
+    )
+    return here, there
