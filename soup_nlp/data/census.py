@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import FloatMap, Image
+from soup_nlp.data.flow.consistency import sampled
 
 SOFT_GREY = 10.0
 """Difference in grey levels that becomes tanh(1) = 0.76."""
@@ -38,13 +39,5 @@ def census_at(layers: FloatMap, u: NDArray[np.floating], v: NDArray[np.floating]
     # cv2.remap accepts fewer than 32768 rows
     parts = [slice(a, a + 30000) for a in range(0, len(x), 30000)]
     return np.stack(
-        [
-            np.concatenate(
-                [
-                    cv2.remap(layer, x[s], y[s], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                    for s in parts
-                ]
-            )
-            for layer in layers
-        ]
+        [np.concatenate([sampled(layer, x[s], y[s]) for s in parts]) for layer in layers]
     )

@@ -52,9 +52,7 @@ def segment(
             found=count,
             expected=f"1 to {height * width // 4} for {width}x{height}",
         )
-    if count == 1:
-        return np.zeros((height, width), np.int32)
-    if method == "grid" or np.ptp(image) == 0:
+    if method == "grid" or count == 1 or np.ptp(image) == 0:
         # on an image of one colour SLIC has no edges to follow and would return the grid
         return _grid(height, width, count)
     for smoothing in SMOOTHING_PX:

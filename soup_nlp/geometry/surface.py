@@ -47,10 +47,7 @@ def joined(rec: Reconstruction, K: Float, group: NDArray[np.integer]) -> tuple[M
     """
     ray = rays(K, pixel_grid(*rec.labels.shape))
     out = []
-    for a, b in (
-        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
-        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
-    ):
+    for a, b in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
         i, k = rec.labels[a], rec.labels[b]
         continuous = (i == k) & np.isfinite(rec.depth_ref[a]) & np.isfinite(rec.depth_ref[b])
         across = (i != k) & (group[a] == group[b])

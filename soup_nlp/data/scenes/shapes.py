@@ -133,9 +133,8 @@ class Sheet(Shape):
         self.half, self.curvature = half, curvature
         self.bound = np.full(3, np.hypot(*half))
         c, s = np.cos(angle), np.sin(angle)
-        # rows times these turn the axis to y, and back
+        # rows times this turn the axis to y
         self._to_axis = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        self._back = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def intersect(self, origin: Float, rays: Float) -> Float:
         """See `Shape`; the cylinder is `k (x^2 + z^2) = 2 z`, which is valid for k = 0 too."""
@@ -155,7 +154,7 @@ class Sheet(Shape):
         """See `Shape`: unroll the cylinder."""
         k, p = self.curvature, points @ self._to_axis
         arc = np.arctan2(k * p[:, 0], 1 - k * p[:, 2]) / k if k else p[:, 0]
-        return np.stack([arc, p[:, 1], np.zeros(len(p))], axis=1) @ self._back
+        return np.stack([arc, p[:, 1], np.zeros(len(p))], axis=1) @ self._to_axis.T
 
     def place(self, material: Float) -> Float:
         """See `Shape`: roll the flat sheet up."""
@@ -164,10 +163,10 @@ class Sheet(Shape):
         half_angle = 0.5 * k * p[:, 0] / np.pi
         x = p[:, 0] * np.sinc(2 * half_angle)
         z = 0.5 * k * p[:, 0] ** 2 * np.sinc(half_angle) ** 2
-        return np.stack([x, p[:, 1], z], axis=1) @ self._back
+        return np.stack([x, p[:, 1], z], axis=1) @ self._to_axis.T
 
     def normals(self, points: Float) -> Float:
         """See `Shape`; -z at the centre."""
         k, p = self.curvature, points @ self._to_axis
         n = np.stack([k * p[:, 0], np.zeros(len(p)), k * p[:, 2] - 1], axis=1)
-        return n / np.linalg.norm(n, axis=1, keepdims=True) @ self._back
+        return n / np.linalg.norm(n, axis=1, keepdims=True) @ self._to_axis.T

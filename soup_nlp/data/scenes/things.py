@@ -1,6 +1,7 @@
 """Elements of rendered scenes: poses, colours, textures; rooms, vehicles, trees, people."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,10 +16,7 @@ ZERO = (0.0, 0.0, 0.0)
 
 def placed(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0) -> Float:
     """(4, 4) pose at a position (m), turned by `yaw` about y after `pitch` about x (degrees)."""
-    out = np.eye(4)
-    turns = [rotation.exp(np.radians(w)) for w in ([0.0, yaw, 0.0], [pitch, 0.0, 0.0])]
-    out[:3, :3], out[:3, 3] = turns[0] @ turns[1], (x, y, z)
-    return out
+    return about(turn=[0, yaw, 0], shift=(x, y, z)) @ about(turn=[pitch, 0, 0])
 
 
 def about(pivot: ArrayLike = ZERO, turn: ArrayLike = ZERO, shift: ArrayLike = ZERO) -> Float:
@@ -94,28 +92,26 @@ def backdrop(z: float, texture: Texture, glow: float = 0.45) -> Part:
     return Part(Plane(), placed(0, 0, z), texture, glow)
 
 
+@dataclass
 class SceneBuilder:
     """Makes the parts of one scene from one stream of random numbers.
 
-    Args:
+    Attributes:
         rng: Random numbers; those of a part depend on the order of the calls.
         half_width, half_height: Half the size of the image over the focal length.
         contrast: Factor of the contrast of all textures.
         seed: Number of the scene; some layouts choose by it.
     """
 
-    def __init__(
-        self,
-        rng: np.random.Generator,
-        half_width: float = 0.5,
-        half_height: float = 0.5,
-        contrast: float = 1.0,
-        seed: int = 0,
-    ) -> None:
-        self.rng, self.contrast, self.seed = rng, contrast, seed
-        self.half_width, self.half_height = half_width, half_height
-        self.uniform = rng.uniform
-        self.paints = [PAINTS[i] for i in rng.permutation(len(PAINTS))]
+    rng: np.random.Generator
+    half_width: float = 0.5
+    half_height: float = 0.5
+    contrast: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.uniform = self.rng.uniform
+        self.paints = [PAINTS[i] for i in self.rng.permutation(len(PAINTS))]
 
     def sign(self) -> float:
         """1 or -1, either with probability 1/2."""
