@@ -45,18 +45,14 @@ def check(
     ] = None,
 ) -> int:
     """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
-    if is_chain(folder):
-        claims = list(check_chain(folder))
-        print("\n".join(f"{'ok  ' if ok else 'FAIL'} {text}" for text, ok in claims))
-        good, claim = all(ok for _, ok in claims), "claim"
-    elif is_file(folder) and folder.suffix != ".sol":
+    if is_file(folder) and folder.suffix != ".sol":
         raise DataError(
             "nothing that can be checked",
             where=folder,
             expected="the folder of a result, an export's answer (.sol)",
         )
     elif is_folder(folder) or folder.suffix != ".sol":
-        report = check_folder(folder)
+        report = check_chain(folder) if is_chain(folder) else check_folder(folder)
         print(report)
         good, claim = report.ok, "claim"
     else:

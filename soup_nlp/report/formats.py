@@ -1,7 +1,7 @@
 """Files for other programs, by the name of their format, and the motions of a result."""
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -208,7 +208,9 @@ FORMATS: Mapping[str, tuple[Writer, str]] = {
 """Writer and description of every format."""
 
 
-def check_formats(names: Sequence[str]) -> list[str]:
+def check_formats(
+    names: Sequence[str], known: Collection[str] = FORMATS, hint: str | None = None
+) -> list[str]:
     """Check names of formats and return them without repetitions.
 
     Raises:
@@ -218,14 +220,15 @@ def check_formats(names: Sequence[str]) -> list[str]:
         raise ConfigError(
             "formats are no list of names",
             found=printable(repr_of(names), 60),
-            expected=f"a list of {', '.join(FORMATS)}",
+            expected=f"a list of {', '.join(known)}",
         )
-    wrong = [name for name in names if name not in FORMATS]
+    wrong = [name for name in names if name not in known]
     if wrong or not names:
         raise ConfigError(
             "unknown format" if wrong else "no format is named",
             found=", ".join(map(repr, wrong)) or None,
-            expected=", ".join(FORMATS),
+            expected=", ".join(known),
+            hint=hint,
         )
     return list(dict.fromkeys(names))
 

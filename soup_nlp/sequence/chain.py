@@ -40,15 +40,13 @@ class SolvedPair:
     Attributes:
         first: Index of the reference frame.
         second: Index of the next frame.
-        result: Result of the solve.
-        truth: Arrays of the truth by name, as in result.h5; empty if unknown.
+        result: Result of the solve, with the arrays of its input and truth only.
         parallax_px: Median displacement that the camera's translation causes, pixels.
     """
 
     first: int
     second: int
     result: Result
-    truth: dict[str, np.ndarray]
     parallax_px: float
 
     @property
@@ -74,8 +72,9 @@ def read_pair(first: int, second: int, folder: Path) -> SolvedPair:
     tree = result.tree
     parallax = float(np.median(tree["start"]["parallax"][result.components.of_superpixel == 0]))
     # a chain holds many pairs, whose other arrays it does not need
-    kept = replace(result, tree={"input": {name: tree["input"][name] for name in INPUTS}})
-    return SolvedPair(first, second, kept, dict(tree.get("truth", {})), parallax)
+    kept = {"input": {name: tree["input"][name] for name in INPUTS}}
+    kept["truth"] = tree.get("truth", {})
+    return SolvedPair(first, second, replace(result, tree=kept), parallax)
 
 
 def carried(of_pixel: NDArray[np.generic], rec: Reconstruction) -> NDArray[Any]:

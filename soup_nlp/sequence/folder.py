@@ -3,7 +3,7 @@
 It holds depth and clouds in one scale, trajectories, a table, a page and a video.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 
 from soup_nlp.arrays import Float, Image
-from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.report.check import check_folder
+from soup_nlp.errors import DataError
+from soup_nlp.report.check import CheckReport, Claim, check_folder
 from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
-from soup_nlp.report.formats import tum_text
+from soup_nlp.report.formats import check_formats, tum_text
 from soup_nlp.report.models import AXES, thinned, write_model, write_ply
 from soup_nlp.sequence.chain import Chain, make_chain, read_pair
 from soup_nlp.sequence.fused import fuse, projected
@@ -89,24 +89,25 @@ def read_chain(folder: Path) -> tuple[Chain, dict[str, Any]]:
     return make_chain(solved[: count - 1], solved[count - 1 :]), contents
 
 
-def check_chain(folder: Path) -> Iterator[tuple[str, bool]]:
-    """Claims of a chain with their results: every pair's, then scales and poses of the chain."""
+def check_chain(folder: Path) -> CheckReport:
+    """Recompute every claim of the pairs of a chain, and its scales and poses from the pairs."""
     chain, contents = read_chain(folder)
+    claims = []
     for pair in (folder / "pairs" / f"{p.first:03d}_{p.second:03d}" for p in chain.pairs):
-        report = check_folder(pair)
-        yield f"pair {pair.name}: every claim", report.ok
-    stored = np.array([row["scale"] for row in contents["scales"]], float)
-    yield "scales follow from the pairs", _same(stored, chain.scales)
-    poses = np.array(contents["world_from_camera"], float)
-    recomputed = np.array([m.matrix for m in chain.world_from_camera])
-    yield "camera poses follow from pairs and scales", _same(poses, recomputed)
-
-
-def _same(stored: Float, recomputed: Float) -> bool:
-    """Whether two arrays are equal up to rounding."""
-    size = float(np.abs(recomputed).max(initial=1.0))
-    same = stored.shape == recomputed.shape
-    return same and np.allclose(stored, recomputed, rtol=0, atol=SAME * size)
+        right = float(check_folder(pair).ok)
+        claims.append(Claim(f"pair {pair.name}: every claim", 1.0, right))
+    poses = np.array([m.matrix for m in chain.world_from_camera])
+    arrays: Mapping[str, tuple[Any, Float]] = {
+        "scales by the pairs": ([row["scale"] for row in contents["scales"]], chain.scales),
+        "camera poses by pairs and scales": (contents["world_from_camera"], poses),
+    }
+    for name, (stored, found) in arrays.items():
+        # null in JSON becomes NaN, which is no rounding error
+        claimed = np.array(stored, float)
+        gap = float(np.abs(claimed - found).max()) if claimed.shape == found.shape else np.inf
+        tolerance = SAME * float(np.abs(found).max(initial=1.0))
+        claims.append(Claim(name, 0.0, np.nan_to_num(gap, nan=np.inf), tolerance))
+    return CheckReport(tuple(claims))
 
 
 def write_fused(path: Path, chain: Chain, contents: Mapping[str, Any]) -> None:
@@ -158,17 +159,10 @@ def convert_chain(
     Raises:
         ConfigError: a format is not one of a chain.
     """
-    unknown = [name for name in names if name not in FORMATS]
-    if unknown or not names:
-        raise ConfigError(
-            "a chain has no such format",
-            found=", ".join(unknown) or "no format",
-            expected=", ".join(FORMATS),
-            hint="formats of single pairs: soup-nlp convert DIR/pairs/000_001 --to ...",
-        )
+    hint = "formats of single pairs: soup-nlp convert DIR/pairs/000_001 --to ..."
+    chosen = [FORMATS[name] for name in check_formats(names, FORMATS, hint)]
     chain, contents = read_chain(folder)
     with staged(folder if out is None else out, overwrite=overwrite) as new:
-        chosen = [FORMATS[name] for name in dict.fromkeys(names)]
         for name, write in chosen:
             write(new / name, chain, contents)
         return [name for name, _ in chosen]

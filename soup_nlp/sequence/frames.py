@@ -79,11 +79,6 @@ class Frames:
         return out
 
 
-def scene_frames(scene: str, count: int) -> Frames:
-    """The first frames of a rendered scene."""
-    return Frames(tuple(f"{scene}: frame {k}" for k in range(count)), scene=scene)
-
-
 def find_images(source: Path) -> list[Path]:
     """Images of a folder or of a pattern such as `clip/*.jpg`, in the order of their numbers.
 

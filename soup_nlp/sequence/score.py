@@ -27,8 +27,8 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     """
     if truths is not None and len(truths) != len(chain):
         raise DataError("truth and chain differ in length", found=len(truths), expected=len(chain))
-    stored = [*(pair.truth.get("depth_ref") for pair in chain.pairs)]
-    stored.append(chain.pairs[-1].truth.get("depth_next"))
+    known = [pair.result.tree["truth"] for pair in chain.pairs]
+    stored = [*(truth.get("depth_ref") for truth in known), known[-1].get("depth_next")]
     given = enumerate(stored if truths is None else truths)
     true = {k: z for k, z in given if z is not None and MEDIAN.counts(z)}
     if not true:
@@ -154,7 +154,7 @@ def path_error(chain: Chain) -> dict[str, float] | None:
     pose, positions = np.eye(4), [np.zeros(3)]
     for pair in chain.pairs:
         # component 0 of a truth is the static scene
-        motions = pair.truth.get("motions")
+        motions = pair.result.tree["truth"].get("motions")
         if motions is None or not np.isfinite(motions[0]).all():
             return None
         pose = pose @ np.linalg.inv(motions[0])

@@ -30,7 +30,6 @@ from soup_nlp.sequence.frames import (
     find_depths,
     find_images,
     key_frames,
-    scene_frames,
     video_frames,
 )
 from soup_nlp.storage.files import as_path
@@ -283,7 +282,8 @@ def _frames(
     if isinstance(source, str) and source.startswith(SCENE):
         if step != 1 or camera:
             raise ConfigError("a rendered scene has its own camera and steps", found=source)
-        return scene_frames(source.removeprefix(SCENE), most or 10)
+        scene = source.removeprefix(SCENE)
+        return Frames(tuple(f"{scene}: frame {k}" for k in range(most or 10)), scene=scene)
     depths, in_folder = list[Path](), False
     # with AUTO the limit applies to the chosen frames
     end = most if step else None

@@ -42,7 +42,7 @@ def small_result() -> Result:
     soup = Soup(np.ones(12), np.tile([0.0, 0.0, -1.0], (12, 1)), np.where(mine, 2.0, 4.0), R, t)
     pair = {"image_ref": image, "image_next": image[::-1].copy(), "K_ref": K, "K_next": K}
     return Result(
-        tree={"input": {**pair, "confidence": (u / 100).astype(np.float32)}},
+        tree={"input": {**pair, "confidence": (u / 100).astype(np.float32)}, "truth": {}},
         summary={"name": "board", "certainty": CERTAINTY},
         reconstruction=replace(reconstruct(soup, labels, K, K), sigma_ref=0.001 * (u + v)),
         components=find_components(soup, seg, mine.astype(int), K, K),
@@ -71,4 +71,4 @@ def toy_pairs() -> list[SolvedPair]:
     second = scaled(first, 0.5)
     rec = replace(second.reconstruction, depth_ref=0.5 * depth)
     second = replace(second, reconstruction=rec)
-    return [SolvedPair(k, k + 1, r, {}, 5.0) for k, r in enumerate((first, second))]
+    return [SolvedPair(k, k + 1, r, 5.0) for k, r in enumerate((first, second))]

@@ -44,14 +44,14 @@ def browser(opened):
 
 
 def canvas(browser):
-    """Pixels of the 3D view without overlays, as floats."""
+    """Pixels of the 3D view without overlays, as numbers with a sign."""
     browser.value("document.querySelector('.hint').style.visibility = 'hidden'")
     box = browser.value(
         "(() => { const r = document.getElementById('canvas').getBoundingClientRect();"
         " return [r.left, r.top, r.width, r.height].map(Math.round); })()"
     )
     x, y, width, height = box
-    return browser.screenshot()[y : y + height, x : x + width].astype(float)
+    return browser.screenshot()[y : y + height, x : x + width].astype(np.int16)
 
 
 def drawn(image):
@@ -60,8 +60,8 @@ def drawn(image):
 
 
 def apart(a, b):
-    """Share of the pixels that differ."""
-    return float((np.abs(a - b).max(axis=2) > 8).mean())
+    """Share of the pixels that differ, of every third row and column."""
+    return float((np.abs(a[::3, ::3] - b[::3, ::3]).max(axis=2) > 8).mean())
 
 
 def test_it_loads_without_an_error_and_fetches_nothing(browser):

@@ -119,11 +119,15 @@ def test_a_pair_without_parallax_is_bridged():
         source_next=identity,
     )
     middle = replace(still, reconstruction=rec, components=replace(still.components, members=rest))
-    still_between = [first, SolvedPair(1, 2, middle, {}, 0.0), replace(second, first=2, second=3)]
-    chain = make_chain(still_between)
-    assert [k.flagged for k in chain.links] == [True, True, False]
-    assert chain.links[-1].bridge
-    assert chain.scales[2] == pytest.approx(2, rel=0.01)
+    still = [SolvedPair(k, k + 1, middle, 0.0) for k in range(5)]
+    moving = replace(first, first=1, second=2), replace(second, first=3, second=4)
+    # also before the first and after the last motion
+    chain = make_chain([still[0], moving[0], still[2], moving[1], still[4]])
+    ends = [(k.first, k.second) for k in chain.links]
+    assert ends == [(0, 1), (1, 2), (2, 3), (3, 4), (1, 3)]
+    assert [k.flagged for k in chain.links] == [True] * 4 + [False]
+    assert [k.bridge for k in chain.links] == [False] * 4 + [True]
+    assert chain.scales[3] / chain.scales[1] == pytest.approx(2, rel=0.01)
 
 
 def test_labels_are_carried_to_the_next_frame():

@@ -15,7 +15,6 @@ from soup_nlp.sequence.frames import (
     find_images,
     key_frames,
     parallax,
-    scene_frames,
     video_frames,
 )
 from soup_nlp.sequence.solve import _frames
@@ -138,9 +137,10 @@ def test_an_unreadable_frame_is_found_before_the_first_solve(kind, tmp_path, cap
 
 
 def test_frames_of_a_scene_follow_each_other():
-    assert scene_frames("street", 4).pair(2, 3)["frame"] == 2
+    frames = Frames(("a",) * 4, scene="street")
+    assert frames.pair(2, 3)["frame"] == 2
     with pytest.raises(DataError):
-        scene_frames("street", 4).pair(0, 2)
+        frames.pair(0, 2)
 
 
 def test_frames_of_another_sequence_are_left_alone(tmp_path, capsys):
