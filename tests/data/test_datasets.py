@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import raises, write_cam, write_dpt, write_flo, write_kitti_flow
+from helpers_files import put, raises, write_cam, write_dpt, write_flo, write_kitti_flow
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.images import DataWarning
@@ -115,75 +115,65 @@ def test_folder_bad_truth(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
 # --- KITTI --------------------------------------------------------------------------------------
 
 
-def kitti2012(root: Path) -> Path:
-    base = root / "training"
+KITTI = {
+    "kitti2012": ("image_0", "calib", "P0", "P1", "disp_occ"),
+    "kitti2015": ("image_2", "calib_cam_to_cam", "P_rect_02", "P_rect_03", "disp_occ_0"),
+}
+CAMERAS = "time: 09-Jan\n{}: 100 0 4 5 0 100 3 0 0 0 1 0\n{}: 100 0 4 -49 0 100 3 0 0 0 1 0\n"
+
+
+def kitti(root: Path, kind: str) -> Path:
+    images, calibration, left, right, disparities = KITTI[kind]
     for k in (10, 11):
-        picture(base / "image_0" / f"000007_{k}.png", np.full((H, W), k, np.uint8))
-    (base / "calib").mkdir()
-    (base / "calib" / "000007.txt").write_text(
-        "P0: 100 0 4 0 0 100 3 0 0 0 1 0\nP1: 100 0 4 -54 0 100 3 0 0 0 1 0\n"
-    )
+        picture(root / "training" / images / f"000007_{k}.png", k)
+    text = CAMERAS.format(left, right).encode()
+    put(root / "training" / calibration / "000007.txt", text)
     disparity = np.full((H, W), 10 * 256)
     disparity[0, 0] = 0
     flow = np.ones((H, W, 2))
     flow[0, 0] = np.nan
-    png16(base / "disp_occ" / "000007_10.png", disparity)
-    write_kitti_flow(base / "flow_occ" / "000007_10.png", flow)
+    png16(root / "training" / disparities / "000007_10.png", disparity)
+    write_kitti_flow(root / "training" / "flow_occ" / "000007_10.png", flow)
     return root
 
 
 @pytest.mark.parametrize("below", ["", "training"])
 @pytest.mark.parametrize("index", ["7", "000007"])
-def test_kitti2012(tmp_path: Path, below: str, index: str) -> None:
-    pair = load("kitti2012", kitti2012(tmp_path) / below, index=index)
+@pytest.mark.parametrize("kind", KITTI)
+def test_kitti(tmp_path: Path, kind: str, below: str, index: str) -> None:
+    root = kitti(tmp_path, kind)
+    pair = load(kind, root / below, index=index)
     truth = pair.truth
-    assert pair.name == "kitti2012_000007"
+    assert pair.name == f"{kind}_000007"
     assert pair.K_ref[0, 2] == 4.0
     assert np.isnan(truth.depth_ref[0, 0])
     np.testing.assert_allclose(truth.depth_ref[1:], 54 / 10)
     assert np.isnan(truth.flow[0, 0]).all()
     assert (truth.flow[1:] == 1).all()
+    assert truth.depth_next is truth.components is None
+    picture(root / "training" / "obj_map" / "000007_10.png", np.eye(H, W, dtype=np.uint8))
+    assert load(kind, root, index="7").truth.components.sum() == H
 
 
-def test_kitti2012_errors(tmp_path: Path) -> None:
-    root = kitti2012(tmp_path)
-    with raises(r"000008_10\.png[\s\S]*expected: training/image_0"):
-        load("kitti2012", root, index="8")
+@pytest.mark.parametrize("kind", KITTI)
+def test_kitti_errors(tmp_path: Path, kind: str) -> None:
+    root = kitti(tmp_path, kind)
+    images, calibration, left, right, _ = KITTI[kind]
+    with raises(rf"000008_10\.png[\s\S]*expected: training/{images}[\s\S]*{calibration}"):
+        load(kind, root, index="8")
     for index in ("seven", "-7", ""):
         with pytest.raises(ConfigError, match=r"input\.index[\s\S]*such as '27' or '000027'"):
-            load("kitti2012", root, index=index)
-    first = "P0: 100 0 4 0 0 100 3 0 0 0 1 0\n"
+            load(kind, root, index=index)
     for text, match in {
-        first: "lacks the numbers of P1:",
-        "P0: 1 2 3\nP1: 1 2 3\n": "lacks the numbers of P0:",
-        first + first.replace("P0", "P1"): "no baseline",
+        CAMERAS.format(left, "P9"): f"lacks the numbers of {right}:",
+        f"{left}: 1 2 3\n{right}: 1 2 3\n": f"lacks the numbers of {left}:",
+        CAMERAS.format(left, right).replace("-49", "5"): "no baseline",
     }.items():
-        (root / "training" / "calib" / "000007.txt").write_text(text)
+        put(root / "training" / calibration / "000007.txt", text.encode())
         with raises(match):
-            load("kitti2012", root, index="7")
+            load(kind, root, index="7")
     with raises(r"has no training|has no image_0|nothing"):
-        load("kitti2012", tmp_path / "nowhere", index="7")
-
-
-def test_kitti2015(tmp_path: Path) -> None:
-    base = tmp_path / "training"
-    for k in (10, 11):
-        picture(base / "image_2" / f"000001_{k}.png", k)
-    (base / "calib_cam_to_cam").mkdir()
-    (base / "calib_cam_to_cam" / "000001.txt").write_text(
-        "calib_time: 09-Jan-2012 13:57:47\n"
-        "P_rect_02: 100 0 4 5 0 100 3 0 0 0 1 0\nP_rect_03: 100 0 4 -49 0 100 3 0 0 0 1 0\n"
-    )
-    png16(base / "disp_occ_0" / "000001_10.png", np.full((H, W), 10 * 256))
-    write_kitti_flow(base / "flow_occ" / "000001_10.png", np.full((H, W, 2), 2.0))
-    picture(base / "obj_map" / "000001_10.png", np.eye(H, W, dtype=np.uint8))
-    truth = load("kitti2015", tmp_path, index="1").truth
-    assert truth.depth_next is None
-    np.testing.assert_allclose(truth.depth_ref, 5.4)
-    assert (truth.flow == 2).all()
-    assert truth.components.sum() == H
-    with raises(r"image_2[\s\S]*calib_cam_to_cam"):
-        load("kitti2015", tmp_path, index="2")
+        load(kind, tmp_path / "nowhere", index="7")
 
 
 # --- Virtual KITTI ------------------------------------------------------------------------------

@@ -15,13 +15,7 @@ from soup_nlp.data.datasets.benchmarks import KittiInput
 from soup_nlp.data.flow import dis
 from soup_nlp.data.flow.consistency import confidence_of, leaves, round_trip_error
 from soup_nlp.data.flow.dis import dominant_homographies, guided_flow
-from soup_nlp.data.flow.sources import (
-    dis_flow,
-    flow_from_truth,
-    flow_sources,
-    load_flow,
-    resolve_flow,
-)
+from soup_nlp.data.flow.sources import dis_flow, flow_sources, resolve_flow
 from soup_nlp.data.pair import Flow, Pair, Truth
 
 K = np.array([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
@@ -136,49 +130,32 @@ def test_a_consistent_round_trip_gives_confidence() -> None:
     assert (confidence_of(gap, support=5) == 1).mean() > 0.98
 
 
-def test_load_flow(tmp_path: Path) -> None:
-    uv = np.ones((4, 5, 2), np.float32)
+def test_flows_of_files_and_of_the_truth(tmp_path: Path) -> None:
+    uv = np.full((60, 80, 2), [3.0, 1.0])
     uv[1, 2, 0] = np.nan
+    pair = pair_of(Truth(flow=uv))
     write_flo(tmp_path / "a.flo", uv)
     write_kitti_flow(tmp_path / "a.png", uv)
-    for name in ("a.flo", "a.png"):
-        flow = load_flow(tmp_path / name)
-        assert flow.source == name
-        assert flow.confidence.sum() == 19
+    for source in ("truth", str(tmp_path / "a.flo"), str(tmp_path / "a.png")):
+        flow = resolve_flow(pair, source)
+        assert flow.source == Path(source).name
+        assert flow.confidence.sum() == 60 * 80 - 1
         assert flow.confidence[1, 2] == 0
         assert flow.uv[1, 2].tolist() == [0, 0]
-    with raises(r"differ in size[\s\S]*\(4, 5[\s\S]*\(60, 80\)"):
-        resolve_flow(pair_of(), str(tmp_path / "a.flo"))
-    write_flo(tmp_path / "b.flo", np.full((4, 5, 2), np.nan))
-    with raises("every pixel as unknown"):
-        load_flow(tmp_path / "b.flo")
-
-
-def test_flow_from_truth() -> None:
-    uv = np.full((60, 80, 2), 2.0)
-    uv[0, 0] = np.nan
-    kept = flow_from_truth(pair_of(Truth(flow=uv)))
-    assert kept.confidence[0, 0] == 0
-    assert kept.confidence.sum() == 60 * 80 - 1
-    assert np.isnan(uv[0, 0]).all()
+        assert flow.uv[0, 0].tolist() == [3, 1]
+    assert np.isnan(pair.truth.flow[1, 2, 0])
+    write_flo(tmp_path / "small.flo", uv[:4, :5])
+    write_flo(tmp_path / "unknown.flo", np.full((4, 5, 2), np.nan))
+    for name, match in {
+        "small.flo": r"differ in size[\s\S]*\(4, 5[\s\S]*\(60, 80\)",
+        "unknown.flo": "every pixel as unknown",
+        "other.flo": "flow file is missing",
+    }.items():
+        with raises(match):
+            resolve_flow(pair, str(tmp_path / name))
     for truth in (None, Truth(depth_ref=np.ones((60, 80)))):
         with raises("no true flow"):
-            flow_from_truth(pair_of(truth))
-
-
-def test_resolve_flow(tmp_path: Path) -> None:
-    pair = pair_of(Truth(flow=np.zeros((60, 80, 2))))
-    assert resolve_flow(pair, "truth").source == "truth"
-    flow = resolve_flow(pair, "dis")
-    assert flow.source == "dis"
-    assert np.median(np.abs(flow.uv - [3, 1])) < 0.1
-    write_flo(tmp_path / "mine.flo", np.full((60, 80, 2), [3.0, 1.0]))
-    assert resolve_flow(pair, str(tmp_path / "mine.flo")).source == "mine.flo"
-    with raises(r"unknown flow source[\s\S]*dis, truth"):
-        resolve_flow(pair, "raft")
-    with raises("flow file is missing"):
-        resolve_flow(pair, str(tmp_path / "other.flo"))
-    assert pair.with_flow(flow).flow is flow
+            resolve_flow(pair_of(truth), "truth")
 
 
 PLUGINS = SimpleNamespace(
@@ -207,7 +184,7 @@ def test_a_flow_source_is_an_entry_point(tmp_path: Path, monkeypatch: pytest.Mon
         ("array_only", r"returned no Flow[\s\S]*ndarray"),
         ("broken", r"plug-in failed[\s\S]*AttributeError: .*weights"),
         ("absent", r"plug-in failed[\s\S]*AttributeError"),
-        ("unheard", r"SIGMA, absent, array_only, broken, cropped, mine, or the path"),
+        ("unheard", r"dis, truth, .*SIGMA, absent, array_only, broken, cropped, mine, or the path"),
     ]:
         with raises(match):
             resolve_flow(pair, name)

@@ -6,10 +6,14 @@ from helpers_truth import assert_partition, majority
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.borders import fit_affine, follow_depth, follow_flow
+from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Flow
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.case import superpixels
 
+MEMORY = {"input": {"kind": "memory", "hash": "0"}}
 HEIGHT, WIDTH, EDGE = 48, 64, 26
 """EDGE is inside a column of cells of 8 pixels."""
 
@@ -112,13 +116,13 @@ def test_scattered_pixels_are_no_outliers():
 @pytest.mark.slow
 def test_following_the_flow_leaves_fewer_mixed_superpixels():
     """Superpixels of two components; the ratio is 0.35, as SLIC mixes few at the wanted number."""
-    scene = {"kind": "scene", "scene": "orbit", "seed": 3, "width": 384, "height": 164}
+    pair = render_scene("orbit", 3, 384, 164)
+    pair = pair.with_flow(flow_from_truth(pair))
     share = {}
     for margin in (1.0, None):
         cut = {"superpixels": 300, "follow_flow_px": margin}
-        settings = {"input": scene, "flow": {"source": "truth"}, "segmentation": cut}
-        case = prepare(make_problem(settings))
-        purity = majority(case.pair.truth, case.segmentation)[1]
+        labels = superpixels(make_problem({**MEMORY, "segmentation": cut}), pair)
+        purity = majority(pair.truth, build_segmentation(labels, pair.image_ref))[1]
         share[margin] = float((purity < 0.95).mean())
-    np.testing.assert_array_equal(case.segmentation.labels, segment(case.pair.image_ref, 300))
+    np.testing.assert_array_equal(labels, segment(pair.image_ref, 300))
     assert share[1.0] < 0.5 * share[None]

@@ -46,8 +46,10 @@ def test_noise_has_its_size_and_correlation_length(pair):
     assert not is_named("flow.flo")
 
 
-@pytest.mark.parametrize("quality", [100, 25])
-@pytest.mark.parametrize("bars", [(16, 8, 0, 0), (0, 0, 40, 40), (16, 16, 16, 24)])
+@pytest.mark.parametrize(
+    ("bars", "quality"),
+    [((16, 8, 0, 0), 25), ((0, 0, 40, 40), 25), ((16, 16, 16, 24), 25), ((16, 16, 16, 24), 100)],
+)
 def test_black_bars_do_not_change_the_flow_between_them(pair, bars, quality):
     above, below, left, right = bars
 
@@ -227,14 +229,14 @@ def test_flows_that_do_not_fit_name_their_cause(tmp_path: Path) -> None:
         resolve_flow(pair, str(path))
 
 
-@pytest.mark.parametrize("change", [-1.0, 0.5, 1 / 256])
-def test_a_backward_flow_is_compared_with_the_images_too(change: float, tmp_path: Path) -> None:
+def test_a_backward_flow_is_compared_with_the_images_too(tmp_path: Path) -> None:
     pair = render_scene("orbit", 0, 256, 108)
     back = dis_flow(pair.image_next, pair.image_ref).uv
     write_flo(tmp_path / "f.flo", pair.truth.flow)
     options = FlowOptions(source="f.flo", backward="b.flo")
     write_flo(tmp_path / "b.flo", back)
     assert (options.load(pair, lambda name: tmp_path / name).confidence > 0).mean() > 0.7
-    write_flo(tmp_path / "b.flo", change * back)
-    with pytest.raises(DataError, match=r"does not fit the images[\s\S]*b\.flo"):
-        options.load(pair, lambda name: tmp_path / name)
+    for change in (-1.0, 0.5, 1 / 256):
+        write_flo(tmp_path / "b.flo", change * back)
+        with pytest.raises(DataError, match=r"does not fit the images[\s\S]*b\.flo"):
+            options.load(pair, lambda name: tmp_path / name)

@@ -74,32 +74,22 @@ def test_depth_motion_and_flow_agree_exactly(name):
 
 
 @pytest.mark.parametrize("name", FIRST)
-def test_next_depth_sees_the_moved_points(name):
-    p = pair(name)
-    T = p.truth
-    seen = ~T.occluded
-    target = (camera.pixel_grid(*p.size) + T.flow)[seen]
-    z = (points(p) + T.scene_flow)[seen][:, 2]
-    got = 1 / sample(1 / T.depth_next, target)  # inverse depth is linear on a plane
-    # the other pixels straddle an edge, where interpolation mixes two surfaces
-    assert np.mean(abs(got - z) < 2e-3 * z) > 0.95
-    assert target.min() >= -1e-6
-    assert (target <= np.array([WIDTH, HEIGHT]) - 1 + 1e-6).all()
-
-
-@pytest.mark.parametrize("name", FIRST)
-def test_occluded_points_are_hidden_or_outside(name):
+def test_moved_points_are_seen_or_hidden_or_outside(name):
     p = pair(name)
     T = p.truth
     target = camera.pixel_grid(*p.size) + T.flow
+    z = (points(p) + T.scene_flow)[..., 2]
+    seen = ~T.occluded
+    got = 1 / sample(1 / T.depth_next, target[seen])  # inverse depth is linear on a plane
+    # the other pixels straddle an edge, where interpolation mixes two surfaces
+    assert np.mean(abs(got - z[seen]) < 2e-3 * z[seen]) > 0.95
     size = np.array([WIDTH, HEIGHT])
     inside = ((target >= -1e-6) & (target <= size - 1 + 1e-6)).all(axis=-1)
+    assert T.occluded[~inside].all()
     hidden = T.occluded & inside
-    z = (points(p) + T.scene_flow)[..., 2][hidden]
     near = ndimage.minimum_filter(T.depth_next, 3)  # nearest surface around the target
     at = np.round(target[hidden]).astype(int)
-    assert np.mean(near[at[:, 1], at[:, 0]] < z * (1 - 1e-4)) > 0.97
-    assert T.occluded[~inside].all()
+    assert np.mean(near[at[:, 1], at[:, 0]] < z[hidden] * (1 - 1e-4)) > 0.97
     assert 0.001 < T.occluded.mean() < 0.25
 
 
@@ -231,32 +221,24 @@ def test_images_are_exposed_well_and_keep_their_brightness(name):
 # --- shapes -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("curvature", "angle"), [(0.9, 0.2), (-1.3, -0.1)])
-def test_sheet_is_isometric_and_its_material_coordinates_are_exact(curvature, angle):
+@pytest.mark.parametrize("angle", [0.3, -0.1])
+@pytest.mark.parametrize("curvature", [0.0, 1e-9, 1e-4, -0.8, 1.1])
+def test_sheet_is_isometric_and_hit_where_it_is(curvature, angle):
     sheet = Sheet((0.6, 0.4), curvature, angle)
     rng = np.random.default_rng(0)
     a = np.zeros((500, 3))
-    a[:, :2] = rng.uniform(-1, 1, (500, 2)) * sheet.half
+    a[:, :2] = rng.uniform(-0.99, 0.99, (500, 2)) * sheet.half
     b = a + 1e-5 * np.c_[rng.standard_normal((500, 2)), np.zeros(500)]
-    step = sheet.place(b) - sheet.place(a)
+    on = sheet.place(a)
+    step = sheet.place(b) - on
     length = np.linalg.norm(step, axis=1)
     np.testing.assert_allclose(length, np.linalg.norm(a - b, axis=1), rtol=1e-6)
-    np.testing.assert_allclose(sheet.material(sheet.place(a)), a, atol=1e-12)
-    across = np.einsum("ni,ni->n", step / length[:, None], sheet.normals(sheet.place(a)))
+    np.testing.assert_allclose(sheet.material(on), a, atol=1e-12)
+    across = np.einsum("ni,ni->n", step / length[:, None], sheet.normals(on))
     assert abs(across).max() < 1e-4
-
-
-@pytest.mark.parametrize("curvature", [0.0, 1e-9, 1e-4, -0.8, 1.1])
-def test_rays_to_points_of_a_sheet_hit_it_there(curvature):
-    sheet = Sheet((0.6, 0.4), curvature, 0.3)
-    rng = np.random.default_rng(1)
-    material = np.zeros((300, 3))
-    material[:, :2] = rng.uniform(-0.99, 0.99, (300, 2)) * sheet.half
-    on = sheet.place(material)
     eye = np.array([0.1, -0.1, -3.0])
-    t = sheet.intersect(eye, on - eye)
-    np.testing.assert_allclose(t, 1, atol=1e-9)
-    beyond = sheet.place(material / np.abs(material / [0.6, 0.4, 1]).max(1)[:, None] * 1.01)
+    np.testing.assert_allclose(sheet.intersect(eye, on - eye), 1, atol=1e-9)
+    beyond = sheet.place(a / np.abs(a / [0.6, 0.4, 1]).max(1)[:, None] * 1.01)
     assert np.isinf(sheet.intersect(eye, beyond - eye)).mean() > 0.95
 
 

@@ -11,7 +11,7 @@ from soup_nlp.data.working_size import working_size
 from soup_nlp.geometry.camera import intrinsics, pixel_grid, project, rays
 from soup_nlp.geometry.full_size import full_depth
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.pipeline.run import run
+from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.report.verdict import facts
 
 pytestmark = pytest.mark.slow
@@ -93,9 +93,9 @@ def test_a_large_pair_comes_back_at_its_size():
         "max_size": 0.012,
         "flow": {"source": "truth"},
         "segmentation": {"superpixels": 60, "neighbours": 6},
-        "refine": {"enabled": False},
     }
-    done = run(make_problem(settings), pair=pair)
+    case = prepare(make_problem(settings), pair=pair)
+    done = make_run(case, skipped(case))
     assert done.pair.size[0] * done.pair.size[1] <= 12_500
     assert done.full.depth_ref.shape == (128, 256)
     covered = np.isfinite(done.full.depth_next)
