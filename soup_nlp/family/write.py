@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from soup_nlp import __version__
 from soup_nlp.data.pair import Pair
 from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.export.sol import write_sol
@@ -23,6 +22,7 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
 from soup_nlp.storage.files import write_text
 from soup_nlp.storage.store import write_json
+from soup_nlp.storage.versions import __version__
 
 Entry = dict[str, Any]
 
