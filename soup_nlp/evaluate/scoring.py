@@ -25,8 +25,7 @@ from soup_nlp.evaluate.metrics import (
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.start import epipolar
 from soup_nlp.storage.files import as_path
-from soup_nlp.storage.h5_files import read_h5
-from soup_nlp.storage.store import require
+from soup_nlp.storage.store import read_h5, require
 
 DEPTHS = {"solution": "ref", "nlp": "nlp_ref", "start": "start_ref", "rigid": "rigid_ref"}
 """Depth maps of the reference frame that a result stores, by the name of their metrics."""

@@ -21,9 +21,9 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import NormForm
 from soup_nlp.model.symbolic import Graph
 from soup_nlp.pipeline.record import Case
-from soup_nlp.storage.files import read_json, write_text
+from soup_nlp.storage.files import read_json, write_json, write_text
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.store import parse_table, write_h5, write_json
+from soup_nlp.storage.store import parse_table, write_h5
 from soup_nlp.storage.versions import versions
 
 STUB = "soup"

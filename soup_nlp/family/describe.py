@@ -19,7 +19,7 @@ from soup_nlp.export.verify import FEASIBLE, Kind, Residuals, active, examine, k
 from soup_nlp.family.frozen import load_frozen
 from soup_nlp.family.instances import VERSION, build_instance, case_of, parse_name
 from soup_nlp.model.nlp import NLP
-from soup_nlp.storage.store import write_json
+from soup_nlp.storage.files import write_json
 
 CLASSES = {0: "constant", 1: "linear", 2: "quadratic", 3: "general"}
 LETTERS = {0: "C", 1: "L", 2: "Q", 3: "O"}

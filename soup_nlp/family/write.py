@@ -20,8 +20,7 @@ from soup_nlp.family.frozen import Frozen, load_frozen
 from soup_nlp.family.instances import VERSION, Instance, build_instance, case_of, problems
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
-from soup_nlp.storage.files import write_text
-from soup_nlp.storage.store import write_json
+from soup_nlp.storage.files import write_json, write_text
 from soup_nlp.storage.versions import __version__
 
 Entry = dict[str, Any]

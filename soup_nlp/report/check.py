@@ -19,8 +19,7 @@ from soup_nlp.report.layout import require_layout
 from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import as_path, read_json
 from soup_nlp.storage.folders import MARK, digest_of, mark_of, recover
-from soup_nlp.storage.h5_files import read_h5
-from soup_nlp.storage.store import require
+from soup_nlp.storage.store import read_h5, require
 
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
 """Rounding of a recomputed number: relative to it or to its sum, and absolute."""

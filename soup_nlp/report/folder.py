@@ -28,9 +28,9 @@ from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import PAGE, Result, load, result_of
 from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
-from soup_nlp.storage.files import as_path, write_text
+from soup_nlp.storage.files import as_path, write_json, write_text
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.store import write_h5, write_json
+from soup_nlp.storage.store import write_h5
 
 FULL = ("depth_ref_full.png", "depth_next_full.png")
 """Files of the depth at the size of the images, for a pair that was solved at a smaller size."""

@@ -13,8 +13,7 @@ from soup_nlp.geometry.rotation import log
 from soup_nlp.report.figures import write_clipped_depth_png16
 from soup_nlp.report.models import AXES, write_cloud, write_colmap, write_glb
 from soup_nlp.report.result import FRAMES, Result
-from soup_nlp.storage.files import write_bytes, write_text
-from soup_nlp.storage.store import write_json
+from soup_nlp.storage.files import write_bytes, write_json, write_text
 
 CONVENTIONS = {
     "axes": f"of a camera: {AXES}",
@@ -67,7 +66,6 @@ def _write_pfm(path: Path, result: Result, frame: int) -> None:
 
 
 def _colmap(folder: Path, result: Result) -> list[str]:
-    (folder / "colmap").mkdir(exist_ok=True)
     write_colmap(folder / "colmap", result)
     return ["colmap"]
 

@@ -9,8 +9,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.pipeline.record import Run
 from soup_nlp.refine.records import Round
-from soup_nlp.storage.h5_files import ReadTree
-from soup_nlp.storage.store import Row, parse_table, row_of
+from soup_nlp.storage.store import ReadTree, Row, parse_table, row_of
 
 TABLE = """
 input/image_ref           1     H,W,3   reference image, 8-bit RGB

@@ -75,8 +75,8 @@ def write_ply(
     return len(table)
 
 
-def write_cloud(path: PathLike, result: Result, frame: int) -> int:
-    """Write the points of the reference image in frame 0 or 1 as PLY; returns their number.
+def write_cloud(path: PathLike, result: Result, frame: int) -> None:
+    """Write the points of the reference image in frame 0 or 1 as PLY.
 
     Properties beside position, normal and colour: `confidence` of the flow, `component` and
     `sigma_log_depth`. Points that are not `result.sure` are left out.
@@ -96,7 +96,7 @@ def write_cloud(path: PathLike, result: Result, frame: int) -> int:
         f"{keep.mean():.1%} of the pixels: without hidden ones, those at jumps of the depth, and"
         " guesses (output.min_confidence=0 keeps them)",
     ]
-    return write_ply(
+    write_ply(
         path,
         result.points[frame][keep],
         result.images[0][keep],
@@ -133,8 +133,8 @@ def thinned(mask: Mask, most: float) -> Mask:
     return out
 
 
-def write_glb(path: PathLike, result: Result, frame: int) -> int:
-    """Write the mesh of frame 0 or 1, textured with the image; returns the number of triangles.
+def write_glb(path: PathLike, result: Result, frame: int) -> None:
+    """Write the mesh of frame 0 or 1, textured with the image.
 
     Axes are those of glTF: x right, y up, the camera looks along -z from the origin. Lengths are
     in the unit of the reconstruction, which the extras of the asset name.
@@ -167,7 +167,6 @@ def write_glb(path: PathLike, result: Result, frame: int) -> int:
     scene = trimesh.Scene(metadata=extras)
     scene.add_geometry(mesh, node_name=f"{name} frame", geom_name=f"{name} frame")
     write_bytes(path, scene.export(file_type="glb"))
-    return len(faces)
 
 
 # --- COLMAP's text model -------------------------------------------------------------------------
@@ -178,8 +177,8 @@ IMAGES = ("ref.png", "next.png")
 """Names of the images in a model."""
 
 
-def write_colmap(folder: Path, result: Result) -> int:
-    """Write `images/`, `masks/` and `sparse/0/` into a folder; returns the number of points.
+def write_colmap(folder: Path, result: Result) -> None:
+    """Write `images/`, `masks/` and `sparse/0/` into a folder.
 
     The world is the reference camera (x right, y down, z ahead); both images have poses
     cam_from_world. COLMAP models are static: the points are background points visible in both
@@ -202,7 +201,6 @@ def write_colmap(folder: Path, result: Result) -> int:
         [(every, uv[0]), (every, uv[1])],
         f"{result.name}; unit: {result.unit}",
     )
-    return len(points)
 
 
 def write_model(

@@ -24,7 +24,7 @@ from soup_nlp.report.findings import ORIGINS, guess_line, limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.result import Result
 from soup_nlp.start.components import TIES
-from soup_nlp.storage.store import plain
+from soup_nlp.storage.files import plain
 
 MODES = {
     "image_ref": "image",

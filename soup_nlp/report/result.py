@@ -21,9 +21,8 @@ from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.layout import require_layout, result_tree
-from soup_nlp.storage.files import as_path, is_file, read_json, read_text
-from soup_nlp.storage.h5_files import ReadTree, read_attrs, read_h5
-from soup_nlp.storage.store import plain, require
+from soup_nlp.storage.files import as_path, is_file, plain, read_json, read_text
+from soup_nlp.storage.store import ReadTree, read_attrs, read_h5, require
 
 PAGE = "report.html"
 """Name of the page in a result folder."""

@@ -21,10 +21,9 @@ from soup_nlp.sequence.chain import Chain, make_chain, read_pair
 from soup_nlp.sequence.fused import fuse, projected
 from soup_nlp.sequence.page import RATE, chain_page, depth_pictures, write_animation
 from soup_nlp.sequence.score import certainty, score
-from soup_nlp.storage.files import as_path, is_file, read_json, write_bytes, write_text
+from soup_nlp.storage.files import as_path, is_file, read_json, write_bytes, write_json, write_text
 from soup_nlp.storage.folders import staged
 from soup_nlp.storage.rows import failed, read_rows
-from soup_nlp.storage.store import write_json
 from soup_nlp.storage.system import scratch
 
 CHAIN = "chain.json"
@@ -264,7 +263,7 @@ def summary(chain: Chain) -> dict[str, Any]:
 
 
 def write_video(path: Path, pictures: list[Image]) -> None:
-    """Write pictures as MPEG-4 of the first one's size."""
+    """Write pictures of one size as MPEG-4."""
     height, width = pictures[0].shape[:2]
     # encoders need even sides
     size = width - width % 2, height - height % 2
@@ -274,10 +273,7 @@ def write_video(path: Path, pictures: list[Image]) -> None:
         coder = cv2.VideoWriter.fourcc(*"mp4v")
         video = cv2.VideoWriter(str(file), coder, RATE, size)
         for picture in pictures:
-            # the encoder would drop frames of another size
-            same = picture.shape[:2] == (height, width)
-            resized = picture[: size[1], : size[0]] if same else cv2.resize(picture, size)
-            video.write(cv2.cvtColor(resized, cv2.COLOR_RGB2BGR))
+            video.write(cv2.cvtColor(picture[: size[1], : size[0]], cv2.COLOR_RGB2BGR))
         video.release()
         write_bytes(path, file.read_bytes())
 

@@ -285,7 +285,7 @@ def parallax(one: Image, other: Image, K: Float) -> float | None:
     are the intrinsics, pixels.
     """
     start = cv2.goodFeaturesToTrack(one, 1000, 0.01, 7)
-    if start is None or one.shape != other.shape:
+    if start is None:
         return None
     options = {"winSize": (21, 21), "maxLevel": 4}
     end, forward, _ = cv2.calcOpticalFlowPyrLK(one, other, start, None, **options)

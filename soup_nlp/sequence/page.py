@@ -26,8 +26,7 @@ from soup_nlp.report.pictures import depth_bar
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.fused import Cloud, every_kth, fuse, movers, shown_tracks
 from soup_nlp.sequence.score import certainty, link_table, score_text
-from soup_nlp.storage.files import PathLike, write_bytes
-from soup_nlp.storage.store import plain
+from soup_nlp.storage.files import PathLike, plain, write_bytes
 
 WIDTH = 720
 """Larger side of an image in the page, pixels."""

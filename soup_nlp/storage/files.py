@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from pydantic_core import to_jsonable_python
 
 from soup_nlp.errors import DataError, SoupError, printable
 
@@ -269,3 +271,37 @@ def write_text(path: PathLike, text: str) -> None:
     """Write a text file in UTF-8, see `write_bytes`."""
     # names of files may contain bytes that are not UTF-8
     write_bytes(path, text.encode("utf-8", "backslashreplace"))
+
+
+def plain(obj: object) -> Any:
+    """An object as JSON types: NumPy becomes Python, NaN and infinities None, paths text.
+
+    Dataclasses become mappings; tuples and arrays become lists.
+
+    Raises:
+        DataError: a type that JSON does not have.
+    """
+    return to_jsonable_python(obj, inf_nan_mode="null", fallback=_builtin)
+
+
+def _builtin(obj: object) -> Any:
+    """An object of a type that pydantic does not know as one that it knows."""
+    if isinstance(obj, np.generic | np.ndarray):
+        return obj.tolist()
+    if isinstance(obj, Mapping):
+        return dict(obj)
+    raise DataError(
+        "value cannot be written as JSON",
+        found=type(obj).__name__,
+        expected="numbers, text, mappings, lists, arrays or dataclasses",
+    )
+
+
+def write_json(path: PathLike, obj: object) -> None:
+    """Write an object as JSON (see `plain`); two-space indent, UTF-8.
+
+    Raises:
+        DataError: the object holds a type that JSON does not have, or the file cannot be written.
+    """
+    text = json.dumps(plain(obj), indent=2, ensure_ascii=False, allow_nan=False)
+    write_text(path, text + "\n")

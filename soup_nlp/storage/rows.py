@@ -15,8 +15,7 @@ from typing import Any
 from unittest import mock
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import is_file, parse_json, read_bytes
-from soup_nlp.storage.store import plain
+from soup_nlp.storage.files import is_file, parse_json, plain, read_bytes
 from soup_nlp.storage.system import end_with_parent
 from soup_nlp.storage.versions import code_version
 

@@ -10,8 +10,7 @@ from helpers_odd_results import STRUCTURE
 
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import read_json
-from soup_nlp.storage.h5_files import read_attrs, read_h5
-from soup_nlp.storage.store import write_h5
+from soup_nlp.storage.store import read_attrs, read_h5, write_h5
 
 
 @pytest.fixture(scope="module")

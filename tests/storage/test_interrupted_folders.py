@@ -173,7 +173,8 @@ import resource, sys
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.storage.folders import staged
-from soup_nlp.storage.store import write_h5, write_json
+from soup_nlp.storage.files import write_json
+from soup_nlp.storage.store import write_h5
 import numpy as np
 resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
 try:

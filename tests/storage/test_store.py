@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import read_json, write_text
-from soup_nlp.storage.h5_files import read_attrs, read_h5
-from soup_nlp.storage.store import parse_table, require, write_h5, write_json
+from soup_nlp.storage.files import read_json, write_json, write_text
+from soup_nlp.storage.store import parse_table, read_attrs, read_h5, require, write_h5
 from soup_nlp.storage.versions import code_version, versions
 
 

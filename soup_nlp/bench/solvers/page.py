@@ -16,8 +16,8 @@ from soup_nlp.bench.study import markdown, page_text, panels, save, show, titled
 from soup_nlp.export.verify import Limits
 from soup_nlp.family.describe import write_results
 from soup_nlp.family.write import REACHED
+from soup_nlp.storage.files import write_json
 from soup_nlp.storage.rows import Row
-from soup_nlp.storage.store import write_json
 
 PROBLEM = ["problem", "superpixels", "formulation", "problem_hash"]
 """Columns that identify a problem."""
