@@ -68,12 +68,19 @@ def page(result: Result, drawn: Mapping[str, Picture]) -> str:
         "limits": "\n".join(f"<li>{escape(line)}</li>" for line in limits(result)),
         "components": _components(result),
         "verdict": escape(result.verdict) or "not recorded",
-        "three": web_file("three.js"),
-        "script": web_file("page.js"),
-        # "<" could end the script element
-        "data": json.dumps(plain(data)).replace("<", "\\u003c"),
     }
-    return Template(web_file("page.html")).substitute(parts)
+    return filled("page", data, parts)
+
+
+def filled(name: str, data: Mapping[str, Any], parts: Mapping[str, object]) -> str:
+    """A page as one HTML file: the template of a name with its script and other parts."""
+    return Template(web_file(f"{name}.html")).substitute(
+        parts,
+        three=web_file("three.js"),
+        script=web_file("view.js") + web_file(f"{name}.js"),
+        # "<" could end the script element
+        data=json.dumps(plain(data)).replace("<", "\\u003c"),
+    )
 
 
 @cache

@@ -9,7 +9,6 @@ import json
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import cv2
@@ -21,12 +20,12 @@ from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.findings import guess_line
 from soup_nlp.report.models import GLTF
-from soup_nlp.report.page import colour_bar, encoded, packed, table, web_file
+from soup_nlp.report.page import colour_bar, encoded, filled, packed, table
 from soup_nlp.report.pictures import depth_bar
 from soup_nlp.sequence.chain import Chain
 from soup_nlp.sequence.fused import Cloud, every_kth, fuse, movers, shown_tracks
 from soup_nlp.sequence.score import certainty, link_table, score_text
-from soup_nlp.storage.files import PathLike, plain, write_bytes
+from soup_nlp.storage.files import PathLike, write_bytes
 
 WIDTH = 720
 """Larger side of an image in the page, pixels."""
@@ -72,25 +71,22 @@ def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
     links = table(*link_table(contents))
     if contents["score"]:
         links += f"<p>{score_text(contents['score'])}.</p>"
-    return Template(web_file("chain.html")).substitute(
-        title=html.escape(str(contents["name"])),
-        certainty=html.escape(guess_line(certainty(chain), "all images")),
-        last=len(chain) - 1,
-        # "<" could end the script element
-        data=json.dumps(plain(data)).replace("<", "\\u003c"),
-        three=web_file("three.js"),
-        script=web_file("chain.js"),
-        bar=colour_bar(depth_bar(near, far)),
-        tracks=_tracks(chain, scene["tracks"]),
-        links=links,
-        unit=html.escape(str(contents["unit"])),
-    )
+    parts = {
+        "title": html.escape(str(contents["name"])),
+        "certainty": html.escape(guess_line(certainty(chain), "all images")),
+        "last": len(chain) - 1,
+        "bar": colour_bar(depth_bar(near, far)),
+        "tracks": _tracks(chain, scene["tracks"]),
+        "links": links,
+        "unit": html.escape(str(contents["unit"])),
+    }
+    return filled("chain", data, parts)
 
 
 def _scene(chain: Chain) -> dict[str, Any]:
     """The 3D view: clouds, paths and cameras as numbers and packed arrays."""
     still = fuse(chain, STILL)
-    K, (height, width) = chain.camera(0), chain.image(0).shape[:2]
+    height, width = chain.image(0).shape[:2]
 
     def points(cloud: Cloud) -> dict[str, str]:
         numbers = packed(cloud["points"].astype(np.float32))
@@ -106,7 +102,7 @@ def _scene(chain: Chain) -> dict[str, Any]:
             for k, t in enumerate(shown_tracks(chain))
         ],
         "cameras": [pose.matrix for pose in chain.world_from_camera],
-        "K": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+        "K": chain.camera(0),
         "size": [width, height],
         "middle": float(np.median(still["points"][:, 2])) if len(still) else 1.0,
         "far": float(np.abs(still["points"]).max(initial=1.0)),

@@ -1,17 +1,7 @@
 /* The page of a chain: static scene, what moves, cameras and paths by frame. */
-"use strict";
 (async () => {
-const $ = (id) => document.getElementById(id);
-const data = JSON.parse($("data").textContent), scene = data.scene, frames = data.frames;
-
-/* numbers that were deflated and written as base64 */
-async function unpack(text, Kind) {
-  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Kind(await new Response(stream).arrayBuffer());
-}
-
-let draw = () => {}, showFrame = () => {};
+const frames = data.frames;
+let showFrame = () => {};
 function show() {
   const k = Number($("time").value);
   $("image").src = frames[k][0];
@@ -32,20 +22,9 @@ $("play").addEventListener("click", () => {
   }, 250);
 });
 
-let renderer = null;
-try {
-  renderer = new THREE.WebGLRenderer({ canvas: $("canvas"), antialias: true, preserveDrawingBuffer: true });
-} catch (error) {
-  $("message").textContent = "This browser shows no WebGL 2: the 3D view is left out.";
-}
-if (renderer) {
-  renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-  renderer.setClearColor(0x20262e);
-  const world = new THREE.Scene(), body = new THREE.Group();
-  /* y up, as viewers expect */
-  body.matrixAutoUpdate = false;
-  body.matrix.makeScale(1, -1, -1);
-  world.add(body);
+const view = makeView(40, scene.far);
+if (view) {
+  const { renderer, body, draw } = view;
   /* colours are written as they are */
   const size = { value: 2 * renderer.getPixelRatio() };
   const material = new THREE.ShaderMaterial({
@@ -68,77 +47,37 @@ if (renderer) {
     out.frustumCulled = false;
     return out;
   };
-  const line = (corners, colour) => {
-    const ends = corners.slice(1).flatMap((c, k) => [...corners[k], ...c]);
-    const own = new THREE.BufferGeometry();
-    own.setAttribute("position", new THREE.BufferAttribute(Float32Array.from(ends), 3));
-    const out = new THREE.LineSegments(own, new THREE.LineBasicMaterial({ color: colour, depthTest: false }));
-    out.renderOrder = 1;
-    out.frustumCulled = false;
-    return out;
-  };
+  const path = (corners, colour) => lines(corners.slice(1).flatMap((c, k) => [corners[k], c]), colour, true);
   const still = await cloud(scene.still);
   const moving = await Promise.all(scene.moving.map(cloud));
   body.add(still, ...moving);
   const paths = new THREE.Group();
-  for (const track of scene.tracks) paths.add(line(track.path, track.colour));
+  for (const track of scene.tracks) paths.add(path(track.path, track.colour));
   const cameras = new THREE.Group(), eyes = scene.cameras.map((m) => [m[0][3], m[1][3], m[2][3]]);
-  cameras.add(line(eyes, 0xffa94d));
-  const s = 0.08 * scene.middle, [fx, fy, cx, cy] = scene.K, [width, height] = scene.size;
-  const corner = (u, v) => [s * (u - cx) / fx, s * (v - cy) / fy, s];
-  const [a, b, c, d] = [corner(0, 0), corner(width, 0), corner(width, height), corner(0, height)], o = [0, 0, 0];
-  const now = line([o, a, b, o, c, d, o, a, d, c, b], 0xffa94d);
-  now.matrixAutoUpdate = false;
-  cameras.add(now);
+  const now = frustum(0xffa94d, true);
+  cameras.add(path(eyes, 0xffa94d), now);
   body.add(paths, cameras);
 
-  const eye = new THREE.PerspectiveCamera(40, 1, scene.middle / 200, scene.far * 4);
-  const controls = new THREE.OrbitControls(eye, $("canvas"));
-  const up = (x, y, z) => new THREE.Vector3(x, -y, -z), m = scene.middle;
-  const [x, y, z] = eyes[eyes.length - 1];
+  const m = scene.middle, [x, y, z] = eyes[eyes.length - 1];
   const VIEWS = {
-    aside: () => { eye.position.copy(up(0.26 * m, -0.27 * m, -0.48 * m)); controls.target.copy(up(x / 2, y / 2, 0.6 * m)); },
-    above: () => { eye.position.copy(up(x / 2, -1.6 * m, m / 2 + z / 2)); controls.target.copy(up(x / 2, 0, m / 2 + z / 2 + 0.01 * m)); },
-    camera: () => {
-      const pose = new THREE.Matrix4().set(...scene.cameras[Number($("time").value)].flat());
-      eye.position.copy(new THREE.Vector3(0, 0, 0).applyMatrix4(pose).applyMatrix4(body.matrix));
-      controls.target.copy(new THREE.Vector3(0, 0, m).applyMatrix4(pose).applyMatrix4(body.matrix));
-    },
-  };
-  let wanted = false;
-  draw = () => {
-    if (wanted) return;
-    wanted = true;
-    requestAnimationFrame(() => { wanted = false; controls.update(); renderer.render(world, eye); });
+    aside: () => view.look([0.26 * m, -0.27 * m, -0.48 * m], [x / 2, y / 2, 0.6 * m]),
+    above: () => view.look([x / 2, -1.6 * m, m / 2 + z / 2], [x / 2, 0, m / 2 + z / 2 + 0.01 * m]),
+    camera: () => view.look([0, 0, 0], [0, 0, m], matrix(scene.cameras[Number($("time").value)])),
   };
   showFrame = (k) => {
     moving.forEach((own, j) => { own.visible = j === k && $("movers").checked; });
-    now.matrix.set(...scene.cameras[k].flat());
+    now.matrix.copy(matrix(scene.cameras[k]));
     if ($("follow").checked) VIEWS.camera();
     draw();
   };
-  const resize = () => {
-    const stage = $("stage");
-    renderer.setSize(stage.clientWidth, stage.clientHeight, false);
-    eye.aspect = stage.clientWidth / stage.clientHeight;
-    eye.updateProjectionMatrix();
-    draw();
-  };
-  for (const name of Object.keys(VIEWS)) {
-    const button = document.createElement("button");
-    button.textContent = name;
-    button.onclick = () => { VIEWS[name](); draw(); };
-    $("views").append(button);
-  }
+  buttons("views", Object.keys(VIEWS).map((name) => [name, name]), (name) => { VIEWS[name](); draw(); });
   $("size").oninput = () => { size.value = Number($("size").value) * renderer.getPixelRatio(); draw(); };
   $("paths").onchange = () => { paths.visible = $("paths").checked; draw(); };
   $("cameras").onchange = () => { cameras.visible = $("cameras").checked; draw(); };
-  $("movers").onchange = () => show();
-  $("follow").onchange = () => show();
-  controls.addEventListener("change", draw);
-  addEventListener("resize", resize);
+  $("movers").onchange = show;
+  $("follow").onchange = show;
   VIEWS.aside();
-  resize();
+  view.resize();
   if (still.geometry.attributes.position.count) $("message").remove();
   else $("message").textContent = "All depth of the static scene is a guess: nothing of it is drawn.";
 }

@@ -1,10 +1,5 @@
 /* The page of a result: rebuilds both frames from superpixels, planes and motions. */
-"use strict";
 (async () => {
-const $ = (id) => document.getElementById(id);
-const data = JSON.parse($("data").textContent);
-const scene = data.scene;
-
 for (const image of document.querySelectorAll("figure > img"))
   image.onclick = () => image.parentElement.classList.toggle("large");
 addEventListener("keydown", (event) => {
@@ -24,13 +19,6 @@ const [left, right] = ["ref", "next"].map((name) => document.querySelector(`img[
 if (left && right) {
   [$("before").src, $("after").src, $("split").hidden] = [left.src, right.src, false];
   $("edge").oninput = () => { $("before").style.clipPath = `inset(0 ${100 - $("edge").value}% 0 0)`; };
-}
-
-/* numbers that were deflated and written as base64 */
-async function unpack(text, Kind) {
-  const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Kind(await new Response(stream).arrayBuffer());
 }
 
 const [labels, planes, motion, motionCamera, borrowed, seen, surface, sigma, component, tie] = await Promise.all([
@@ -141,16 +129,10 @@ function motionTexture(values) {
   return out;
 }
 
-let renderer;
-try {
-  renderer = new THREE.WebGLRenderer({ canvas: $("canvas"), antialias: true, preserveDrawingBuffer: true });
-} catch (error) {
-  $("message").textContent = "This browser shows no WebGL 2: the 3D view is left out, the pictures are below.";
-  return;
-}
-renderer.outputColorSpace = THREE.SRGBColorSpace;
-renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-renderer.setClearColor(0x20262e);
+const view = makeView(50, Math.max(scene.deepest, scene.middle));
+if (!view) return;
+const { body, eye, controls, draw } = view;
+controls.zoomToCursor = true;
 
 /* all colours are written as they are: no light, no change of colour space */
 const texture = async (name) => {
@@ -201,36 +183,12 @@ const cloud = new THREE.Points(geometry(null), material);
 mesh.frustumCulled = fringe.frustumCulled = cloud.frustumCulled = false;
 cloud.visible = false;
 
-/* y up and z towards the viewer, as viewers expect */
-const world = new THREE.Scene(), body = new THREE.Group();
-body.matrixAutoUpdate = false;
-body.matrix.makeScale(1, -1, -1);
-world.add(body);
 body.add(mesh, fringe, cloud);
 
-const flat = (rows) => new THREE.Matrix4().set(...rows.flat());
-let pose = flat(scene.camera);
-const [fx, fy, cx, cy] = [scene.K[0][0], scene.K[1][1], scene.K[0][2], scene.K[1][2]];
-
-function frustum(colour) {
-  const s = 0.09 * scene.middle, corner = (u, v) => [s * (u - cx) / fx, s * (v - cy) / fy, s];
-  const [width, height] = scene.size;
-  const c = [corner(0, 0), corner(width, 0), corner(width, height), corner(0, height)];
-  const top = [s * (width / 2 - cx) / fx, s * (-0.2 * height - cy) / fy, s], o = [0, 0, 0];
-  const lines = [o, c[0], o, c[1], o, c[2], o, c[3], c[0], c[1], c[1], c[2], c[2], c[3], c[3], c[0],
-    c[0], top, top, c[1]];
-  return line(lines, colour);
-}
-function line(corners, colour) {
-  const out = new THREE.LineSegments(new THREE.BufferGeometry(),
-    new THREE.LineBasicMaterial({ color: colour }));
-  out.geometry.setAttribute("position", new THREE.BufferAttribute(Float32Array.from(corners.flat()), 3));
-  out.frustumCulled = false;
-  return out;
-}
+let pose = matrix(scene.camera);
+const [[fx], [, fy]] = scene.K;
 const cameras = new THREE.Group();
 const cameraRef = frustum(0x6fb7ff), cameraNext = frustum(0xffa94d);
-cameraNext.matrixAutoUpdate = false;
 cameras.add(cameraRef, cameraNext);
 body.add(cameras);
 
@@ -245,20 +203,11 @@ function drawPaths(values) {
     seen.add(key);
     const shift = values.subarray(9 * i + 6, 9 * i + 9);
     if (Math.hypot(...shift) < 0.01 * pivot[2]) continue;
-    const path = line([pivot, pivot.map((x, k) => x + shift[k])], 0xff5566);
-    path.material.depthTest = false;
-    path.renderOrder = 1;
-    paths.add(path);
+    paths.add(lines([pivot, pivot.map((x, k) => x + shift[k])], 0xff5566, true));
   }
 }
 body.add(paths);
 
-const eye = new THREE.PerspectiveCamera(50, 1, scene.middle / 200, Math.max(scene.deepest, scene.middle) * 4);
-const controls = new THREE.OrbitControls(eye, $("canvas"));
-controls.zoomToCursor = true;
-
-/* a point of the reference camera's frame, y up */
-const up = (x, y, z) => new THREE.Vector3(x, -y, -z);
 function fit(margin) {
   const aspect = $("stage").clientWidth / $("stage").clientHeight;
   const tall = Math.max(scene.size[1] / fy, scene.size[0] / fx / aspect) * margin;
@@ -266,44 +215,19 @@ function fit(margin) {
 }
 const m = scene.middle;
 const VIEWS = {
-  aside: () => { fit(1); eye.position.copy(up(0.2 * m, -0.17 * m, -0.45 * m)); controls.target.copy(up(0, 0.02 * m, m)); },
-  reference: () => { fit(1); eye.position.copy(up(0, 0, 0)); controls.target.copy(up(0, 0, m)); },
-  next: () => {
-    fit(1);
-    eye.position.copy(new THREE.Vector3(0, 0, 0).applyMatrix4(pose).applyMatrix4(body.matrix));
-    controls.target.copy(new THREE.Vector3(0, 0, m).applyMatrix4(pose).applyMatrix4(body.matrix));
-    setTime(1);
-  },
-  left: () => { fit(1.1); eye.position.copy(up(-0.75 * m, -0.15 * m, 0.15 * m)); controls.target.copy(up(0, 0, m)); },
-  right: () => { fit(1.1); eye.position.copy(up(0.75 * m, -0.15 * m, 0.15 * m)); controls.target.copy(up(0, 0, m)); },
+  aside: () => { fit(1); view.look([0.2 * m, -0.17 * m, -0.45 * m], [0, 0.02 * m, m]); },
+  reference: () => { fit(1); view.look([0, 0, 0], [0, 0, m]); },
+  next: () => { fit(1); view.look([0, 0, 0], [0, 0, m], pose); setTime(1); },
+  left: () => { fit(1.1); view.look([-0.75 * m, -0.15 * m, 0.15 * m], [0, 0, m]); },
+  right: () => { fit(1.1); view.look([0.75 * m, -0.15 * m, 0.15 * m], [0, 0, m]); },
   top: () => {
     fit(1.3);
     const reach = Math.min(scene.far, 3 * m), height = 0.55 * reach / Math.tan(eye.fov * Math.PI / 360);
-    eye.position.copy(up(0, -height, 0.5 * reach - 0.01 * m)); controls.target.copy(up(0, 0, 0.5 * reach));
+    view.look([0, -height, 0.5 * reach - 0.01 * m], [0, 0, 0.5 * reach]);
   },
 };
-
-let wanted = false;
-function draw() {
-  if (wanted) return;
-  wanted = true;
-  requestAnimationFrame(() => {
-    wanted = false;
-    controls.update();
-    uniforms.focal.value = $("canvas").height / 2 / Math.tan(eye.fov / 2 * Math.PI / 180);
-    renderer.render(world, eye);
-  });
-}
-controls.addEventListener("change", draw);
-
-function resize() {
-  const { clientWidth, clientHeight } = $("stage");
-  renderer.setSize(clientWidth, clientHeight, false);
-  eye.aspect = clientWidth / clientHeight;
-  eye.updateProjectionMatrix();
-  draw();
-}
-addEventListener("resize", resize);
+/* points are as large as their pixels */
+view.before = () => { uniforms.focal.value = $("canvas").height / 2 / Math.tan(eye.fov * Math.PI / 360); };
 
 function setTime(value) {
   $("time").value = value;
@@ -321,13 +245,6 @@ async function setMode(name) {
   draw();
 }
 function setView(name) { VIEWS[name](); eye.updateProjectionMatrix(); controls.update(); draw(); }
-function buttons(id, entries, act) {
-  for (const [value, word] of entries) {
-    const button = document.createElement("button");
-    Object.assign(button, { value, textContent: word, onclick: () => act(value) });
-    $(id).append(button);
-  }
-}
 /* the address opens what is shown */
 const asked = { mode: data.modes[0].name, view: "aside" };
 function remember(change) {
@@ -467,7 +384,7 @@ $("paths").onchange = () => { paths.visible = $("paths").checked; draw(); };
 /* held: both cameras stand in one place, and everything moves as they see it */
 function hold(held) {
   uniforms.motion.value = held ? raw : home;
-  pose = held ? new THREE.Matrix4() : flat(scene.camera);
+  pose = held ? new THREE.Matrix4() : matrix(scene.camera);
   cameraNext.matrix.copy(pose);
   drawPaths(held ? motionCamera : motion);
   draw();
@@ -507,7 +424,7 @@ async function show() {
 addEventListener("hashchange", show);
 setFar(scene.far);
 hold(false);
-resize();
+view.resize();
 await show();
 $("message").textContent = "";
 document.body.dataset.ready = "yes";
