@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple
 
 import casadi as ca
@@ -31,46 +31,33 @@ class Block(NamedTuple):
 
     Attributes:
         label: Of the kind.
-        size: Their number.
         lower, upper: Bounds of each.
-        places: Makes what their names have in brackets; "" for none.
+        superpixels: (M, a) of each, for its name; a = 0 where that is the label alone.
     """
 
     label: str
-    size: int
     lower: float
     upper: float
-    places: Callable[[], list[str]]
+    superpixels: Int
 
 
 def _bounds(blocks: list[Block]) -> tuple[Float, Float]:
     """Lower and upper bounds of all blocks, in their order."""
-    count = [b.size for b in blocks]
+    count = [len(b.superpixels) for b in blocks]
     return np.repeat([b.lower for b in blocks], count), np.repeat([b.upper for b in blocks], count)
 
 
 def _names(blocks: list[Block]) -> list[str]:
-    return [f"{b.label}[{place}]" if place else b.label for b in blocks for place in b.places()]
-
-
-def _of_elements(superpixels: Int) -> list[str]:
-    """`i` or `i,k` for every element (E, a); `i,3` for the third of several of a superpixel."""
-    labels = [",".join(map(str, row)) for row in superpixels.tolist()]
-    if len(set(labels)) == len(labels):
-        return labels
-    seen: Counter[str] = Counter()
+    """`label[i]` or `label[i,k]`; `label[i,3]` for the third of several of a superpixel."""
     out = []
-    for label in labels:
-        seen[label] += 1
-        out.append(f"{label},{seen[label]}")
+    for block in blocks:
+        places = [",".join(map(str, row)) for row in block.superpixels.tolist()]
+        several, seen = len(set(places)) < len(places), Counter[str]()
+        for place in places:
+            seen[place] += 1
+            inside = f"{place},{seen[place]}" if several else place
+            out.append(f"{block.label}[{inside}]" if inside else block.label)
     return out
-
-
-def _of_superpixels(size: int, count: int) -> list[str]:
-    """`i` for every superpixel, or `i,1` and so on for `count` rows of each."""
-    if count == 1:
-        return [str(i) for i in range(size)]
-    return [f"{i},{c + 1}" for i in range(size) for c in range(count)]
 
 
 @dataclass
@@ -106,12 +93,11 @@ class Builder:
         fields, layout = tuple(element.fields.items()), self.layout
         term = name, element.norms, fields, arity, self.view, self.option, layout.stride
         kernel, slacks = _kernel(*term, self.form.norm)
-        places = partial(_of_elements, element.superpixels)
         index, rows = [layout.of(i) for i in element.superpixels.T], []
         for norm in slacks:
-            slack = Block(f"s_{norm}", size, 0.0, np.inf, places)
-            index.append(layout.size + _added(self.slacks, slack)[:, None])
-            rows.append(_added(self.rows, Block(f"epigraph_{norm}", size, 0.0, np.inf, places)))
+            own = 0.0, np.inf, element.superpixels
+            index.append(layout.size + _added(self.slacks, Block(f"s_{norm}", *own))[:, None])
+            rows.append(_added(self.rows, Block(f"epigraph_{norm}", *own)))
         data = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
         table = Table(
             np.concatenate(index, axis=1), data, np.array(rows, np.int64).reshape(-1, size).T
@@ -145,10 +131,8 @@ class Builder:
             total: Whether the superpixels add up to one row (r = 1).
         """
         size, count = len(index), body.numel()
-        number, places = size * count, partial(_of_superpixels, size, count)
-        if total:
-            number, places = 1, partial(list, [""])
-        block = Block(name.removeprefix("t_"), number, lower, upper, places)
+        own = np.zeros((1, 0), int) if total else np.repeat(np.arange(size), count)[:, None]
+        block = Block(name.removeprefix("t_"), lower, upper, own)
         rows = np.broadcast_to(_added(self.rows, block).reshape(-1, count), (size, count))
         symbols = ca.SX.sym("none", 0) if row is None else row
         kernel = Kernel(name, x, symbols, _SYMBOLS, constraints=body)
@@ -198,14 +182,20 @@ class Builder:
             g_names=lambda: _names(self.rows),
             compiled=f.compiled,
         )
-        return _with_slacks(nlp) if self.slacks else nlp
+        if not self.slacks:
+            return nlp
+        slack, row = nlp.slacks()
+        best = nlp.x0.copy()
+        # a row is s^2 - |v|^2 - eps^2, so at s = 0 its negative is s^2 at the best s
+        best[slack] = np.sqrt(np.maximum(-nlp.constraints(nlp.x0)[row], 1e-12))
+        return replace(nlp, x0=best)
 
 
 def _added(blocks: list[Block], block: Block) -> Int:
     """Append a block; the numbers of its variables or rows among those of all blocks."""
-    first = sum(b.size for b in blocks)
+    first = sum(len(b.superpixels) for b in blocks)
     blocks.append(block)
-    return first + np.arange(block.size)
+    return first + np.arange(len(block.superpixels))
 
 
 @lru_cache(maxsize=200)
@@ -240,21 +230,3 @@ def _kernel(
         curvature=sum((f.curvature for f in forms), ca.SX(0)),
     )
     return kernel, named
-
-
-def _with_slacks(nlp: NLP) -> NLP:
-    """The NLP with slack variables at the norms' values."""
-    x0 = nlp.x0.copy()
-    for group in nlp.groups:
-        kernel, table = group.kernel, group.table
-        slacks = [j for j in range(kernel.nx) if kernel.x[j].name().startswith("s_")]
-        if slacks:
-            # the constraint is s^2 - |v|^2 - eps^2, so at s = 0 its negative is s^2 at the best s
-            local = x0[table.index].copy()
-            local[:, slacks] = 0.0
-            symbols = [kernel.x, kernel.row, kernel.theta]
-            con = ca.Function("c", symbols, [kernel.constraints]).map(group.size)
-            theta = np.repeat(nlp.thetas()[:, None], group.size, axis=1)
-            value = np.asarray(con(local.T, table.data.T, theta)).reshape(len(slacks), -1)
-            x0[table.index[:, slacks]] = np.sqrt(np.maximum(-value, 1e-12)).T
-    return replace(nlp, x0=x0)

@@ -93,14 +93,14 @@ class Kernel:
         return {k: ca.Function(f"{self.name}_{k}", args, ca.cse([v])) for k, v in out.items()}
 
     @_once
-    def second_order(self, hessian: str) -> ca.Function | None:
+    def second_order(self, hessian: str) -> dict[str, ca.Function]:
         """The upper triangle of the Hessian of one element, sparse.
 
         Args:
             hessian: One of HESSIANS.
 
         Returns:
-            Function of (x, row, theta, lam_f, lam_c); None where it is 0.
+            Function "hess" of (x, row, theta, lam_f, lam_c); absent where it is 0.
         """
         lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
         H = ca.SX(self.nx, self.nx)
@@ -111,9 +111,9 @@ class Kernel:
             H += ca.hessian(ca.dot(lam_c, self.constraints), self.x)[0]
         H = ca.sparsify(ca.triu(H))
         if not H.nnz():
-            return None
+            return {}
         args = [self.x, self.row, self.theta, lam_f, lam_c]
-        return ca.Function(f"{self.name}_hess", args, ca.cse([H]))
+        return {"hess": ca.Function(f"{self.name}_hess", args, ca.cse([H]))}
 
 
 def nonzeros(function: ca.Function | None) -> tuple[Int, Int]:

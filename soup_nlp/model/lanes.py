@@ -6,6 +6,7 @@ take a fifth of the time.
 """
 
 import ctypes
+import logging
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -19,6 +20,7 @@ from soup_nlp.model.compile import shared_library
 from soup_nlp.model.kernel import Blocks, in_blocks
 from soup_nlp.model.operations import OPERATIONS, input_sizes, instructions, operation
 
+log = logging.getLogger(__name__)
 LANES = 8
 
 _HEAD = f"""
@@ -69,10 +71,6 @@ void {name}_sum(long blocks, const double *x, const int *index, const double *ta
 """
 
 
-class NoCompilerError(Exception):
-    """There is no compiler that works; `vectors` replaces it."""
-
-
 def c_source(function: ca.Function) -> str:
     """C of an SX function with one output, on vectors, and the loop over its table.
 
@@ -108,22 +106,17 @@ def _text(function: ca.Function) -> str:
     return str(function.serialize())
 
 
-def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL:
-    """Machine code of functions with distinct names, cached by content.
-
-    Raises:
-        NoCompilerError: There is no compiler, or it fails.
-    """
+def compile_lanes(functions: Sequence[ca.Function]) -> ctypes.CDLL | None:
+    """Machine code of functions with distinct names, cached by content; None without a compiler."""
     # what the source depends on, in a tenth of the time that writing it takes
     translation = "".join(op.c for op in OPERATIONS.values()) + _HEAD + _LOOP
     key = "\0".join([translation, *map(_text, functions)])
     path = shared_library(key, lambda: "\n".join([_HEAD, *(c_source(f) for f in functions)]))
-    if path is None:
-        raise NoCompilerError("no working C compiler")
     try:
-        return ctypes.CDLL(str(path))
+        return None if path is None else ctypes.CDLL(str(path))
     except OSError as error:
-        raise NoCompilerError(str(error)) from error
+        log.warning("compiled kernels cannot be loaded: %s", error)
+        return None
 
 
 class Summed:

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from scipy import sparse
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group, Hessian
 from soup_nlp.model.pattern import Pattern, hessian_entries, jacobian_entries
@@ -86,22 +86,17 @@ class NLP:
     def _first(self) -> Mapping[str, Sum]:
         """f, its gradient, g, its Jacobian."""
         sizes = {"f": 1, "grad": self.nx, "con": self.ng, "jac": self.nnzj}
-        jacobian = iter(self.jacobian_pattern.places)
-        targets = []
-        for group in self.groups:
-            size, table = group.size, group.table
-            target = {"f": np.zeros((size, 1), int), "grad": table.index, "con": table.rows}
-            if group.kernel.nc:
-                target["jac"] = next(jacobian)
-            targets.append(target)
+        targets = [
+            {"f": np.zeros((g.size, 1), int), "grad": g.table.index, "con": g.table.rows, "jac": p}
+            for g, p in zip(self.groups, self.jacobian_pattern.places)
+        ]
         functions = [g.kernel.first_order() for g in self.groups]
         return summed(self.groups, functions, targets, self._given, sizes, self.compiled)
 
     @cached_property
     def _second(self) -> Mapping[str, Sum]:
         """The Hessian, apart from the rest, since a start at a KKT point does not need it."""
-        second = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
-        functions = [{"hess": f} if f else {} for f in second]
+        functions = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
         targets = [{"hess": p} for p in self.hessian_pattern.places]
         sizes = {"hess": self.nnzh}
         return summed(self.groups, functions, targets, self._given, sizes, self.compiled)
@@ -118,7 +113,7 @@ class NLP:
 
     @cached_property
     def jacobian_pattern(self) -> Pattern:
-        """Of g's Jacobian; places for every group with constraints."""
+        """Of g's Jacobian; places for every group."""
         return Pattern((self.ng, self.nx), partial(jacobian_entries, self.groups))
 
     @cached_property
@@ -152,6 +147,19 @@ class NLP:
         for name in values.keys() - self.theta.keys():
             raise ModelError("unknown parameter", found=name, expected=", ".join(self.theta))
         return np.array(list({**self.theta, **values}.values()), float)
+
+    def slacks(self) -> tuple[Int, Int]:
+        """Slack variables s of epigraphs, and the row of each, `s^2 >= |v|^2 + eps^2`."""
+        pairs = [np.zeros((2, 0), int)]
+        for group in self.groups:
+            names = [group.kernel.x[k].name() for k in range(group.kernel.nx)]
+            local = [k for k, name in enumerate(names) if name.startswith("s_")]
+            if local:
+                pairs.append(
+                    np.array([group.table.index[:, local], group.table.rows]).reshape(2, -1)
+                )
+        variables, rows = np.concatenate(pairs, axis=1)
+        return variables, rows
 
     def sizes(self) -> dict[str, int]:
         """Sizes with stable keys."""

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -13,16 +12,8 @@ from scipy import sparse
 from soup_nlp.arrays import Float, Int
 from soup_nlp.model.kernel import Group, nonzeros
 
-
-class Entries(NamedTuple):
-    """Where the nonzeros of a set of elements stand.
-
-    Attributes:
-        rows, columns: (E, k).
-    """
-
-    rows: NDArray[np.integer]
-    columns: NDArray[np.integer]
+Entries = tuple[NDArray[np.integer], NDArray[np.integer]]
+"""(E, k) rows and columns of the nonzeros of a set of elements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +66,10 @@ class Pattern:
 
 
 def jacobian_entries(groups: Sequence[Group]) -> Iterator[Entries]:
-    """Nonzeros of g's Jacobian; one set for every group that has constraints."""
+    """Nonzeros of g's Jacobian; one set for every group."""
     for group in groups:
-        if group.kernel.nc:
-            r, c = nonzeros(group.kernel.first_order()["jac"])
-            yield Entries(group.table.rows[:, r], group.table.index[:, c])
+        r, c = nonzeros(group.kernel.first_order().get("jac"))
+        yield group.table.rows[:, r], group.table.index[:, c]
 
 
 def hessian_entries(groups: Sequence[Group], hessian: str) -> Iterator[Entries]:
@@ -87,5 +77,5 @@ def hessian_entries(groups: Sequence[Group], hessian: str) -> Iterator[Entries]:
     for group in groups:
         # half the bytes sort in half the time
         index = group.table.index.astype(np.int32)
-        one, two = (index[:, k] for k in nonzeros(group.kernel.second_order(hessian)))
-        yield Entries(np.minimum(one, two), np.maximum(one, two))
+        one, two = (index[:, k] for k in nonzeros(group.kernel.second_order(hessian).get("hess")))
+        yield np.minimum(one, two), np.maximum(one, two)

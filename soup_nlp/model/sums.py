@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
 from soup_nlp.model.kernel import Group
-from soup_nlp.model.lanes import LANES, NoCompilerError, Summed, compile_lanes
+from soup_nlp.model.lanes import LANES, Summed, compile_lanes
 from soup_nlp.model.vectors import Vectors
 
 log = logging.getLogger(__name__)
@@ -83,17 +83,16 @@ def summed(
     for group, own_functions, own_targets in zip(groups, functions, targets):
         library, blocks = None, None
         if compiled and own_functions:
-            try:
-                # one library per kernel: the cache then still holds the kernels that did not change
-                library = compile_lanes(list(own_functions.values()))
-                blocks = group.table.blocks(LANES, np.int32)
-            except NoCompilerError as error:
+            # one library per kernel: the cache then still holds the kernels that did not change
+            library = compile_lanes(list(own_functions.values()))
+            if library is None:
                 compiled = False
                 log.info(
-                    "no machine code: %s; kernels run in numpy, and a solve takes about a third"
-                    " longer (a C compiler on the PATH, gcc or clang, is used)",
-                    error,
+                    "no machine code: kernels run in numpy, and a solve takes about a third"
+                    " longer (a C compiler on the PATH, gcc or clang, is used)"
                 )
+            else:
+                blocks = group.table.blocks(LANES, np.int32)
         for key, f in own_functions.items():
             target, size = own_targets[key], sizes[key]
             sums[key].terms.append(

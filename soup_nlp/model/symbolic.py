@@ -53,7 +53,7 @@ class Graph:
         """(x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian."""
         nlp = self._nlp
         second = [g.kernel.second_order(nlp.hessian_kind) for g in nlp.groups]
-        local = self._local("hess", [{"hess": h} if h else {} for h in second])
+        local = self._local("hess", second)
         symbols = [self._x, self._p, self._lam_f, self._lam_g]
         names = ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
         return ca.Function("nlp_hess_l", symbols, [_matrix(nlp.hessian_pattern, local)], *names)

@@ -125,12 +125,9 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, 
     visible = next(g for g in nlp.groups if g.kernel.name == "visible").table.rows
     lam_g[visible[:, 1:]] = -rim / facing[:, None]
     gradient = nlp.gradient(nlp.x0)
-    # an epigraph's slack s is in no other row than s^2 >= |v|^2 + eps^2
-    for group in nlp.groups:
-        slacks = [i for i in range(group.kernel.nx) if group.kernel.x[i].name().startswith("s_")]
-        for slack, row in zip(slacks, group.table.rows.T):
-            s = group.table.index[:, slack]
-            lam_g[row] = -gradient[s] / (2 * nlp.x0[s])
+    slack, row = nlp.slacks()
+    # an epigraph's slack is in no other row
+    lam_g[row] = -gradient[slack] / (2 * nlp.x0[slack])
     J = nlp.jacobian(nlp.x0)
     force = gradient + J.T @ lam_g
     equal = np.flatnonzero(nlp.lbg == nlp.ubg)

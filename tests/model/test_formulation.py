@@ -28,7 +28,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.pattern import Entries, Pattern
+from soup_nlp.model.pattern import Pattern
 from soup_nlp.model.symbolic import Graph
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 
@@ -197,7 +197,7 @@ def test_a_pattern_is_the_union_of_its_sets(size):
     whole = rng.integers(0, size, (2, 7, 5))[:, [0, 0, 1, 2, 2, 2, 3, 4, 5, 6]]
     other = rng.integers(0, size, (2, 4, 3))
     other[:, 1] = whole[:, 6, :3]
-    pattern = Pattern((size, size), lambda: [Entries(*whole), Entries(*other)])
+    pattern = Pattern((size, size), lambda: [whole, other])
     keys = pattern.columns * size + pattern.rows
     assert (np.diff(keys) > 0).all()
     for (rows, columns), place in zip((whole, other), pattern.places):
