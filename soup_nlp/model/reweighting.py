@@ -1,5 +1,6 @@
 """Departures from the paper's weights and graph: in a scene, across components, in pixels."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,7 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.oracle import relief
+from soup_nlp.model.oracle import PAIR_TERMS, relief
 
 LEAST_STEP = 0.05
 """Least step of inverse depth that E_order asks for where it asks for one, relative."""
@@ -24,15 +25,17 @@ CREASE = 0.01
 degrees: 0.005 and 0.02 differ by at most 0.0006 in the mean relative error of robot."""
 
 
-def across(
-    data: EnergyData,
-    group: Int,
-    *,
-    arap: float = 1.0,
-    prior: float = 1.0,
-    cont: float = 1.0,
-    orient: float = 1.0,
-) -> EnergyData:
+def scaled(data: EnergyData, edges: Mask, pairs: Mask, factors: Mapping[str, float]) -> EnergyData:
+    """The same data with terms times a factor each, by name, on some edges and pairs."""
+    chosen, weights = {"edges": edges, "pairs": pairs}, {}
+    for name, factor in factors.items():
+        term = PAIR_TERMS[name]
+        weight = getattr(data, term.weight)
+        weights[term.weight] = np.where(chosen[term.graph], factor, 1.0) * weight
+    return replace(data, **weights)
+
+
+def across(data: EnergyData, group: Int, **factors: float) -> EnergyData:
     """The same data with terms times a factor each between superpixels of different groups.
 
     As-rigid-as-possible holds inside a component. Across components it pulls a component that the
@@ -44,19 +47,10 @@ def across(
     Args:
         data: Data of the pair.
         group: (N,) component or surface of every superpixel, as the start finds them.
-        arap: Factor of E_arap; 1 is the paper's energy, as for the others.
-        prior: Factor of E_prior.
-        cont: Factor of E_cont.
-        orient: Factor of E_orient.
+        factors: By the name of a term; 1 is the paper's energy.
     """
-    split, edges = (group[a] != group[b] for a, b in (data.pairs.T, data.edges.T))
-    return replace(
-        data,
-        edge_weight=np.where(edges, arap, 1.0) * data.edge_weight,
-        prior_weight=np.where(edges, prior, 1.0) * data.prior_weight,
-        pair_weight=np.where(split, cont, 1.0) * data.pair_weight,
-        orient_weight=np.where(split, orient, 1.0) * data.orient_weight,
-    )
+    pairs, edges = (group[a] != group[b] for a, b in (data.pairs.T, data.edges.T))
+    return scaled(data, edges, pairs, factors)
 
 
 def rigid_scene(data: EnergyData, soup: Soup, scene: Mask, weight: float) -> EnergyData:
@@ -176,18 +170,6 @@ def with_order(
     return replace(data, order_weight=weight * order, order_step=step)
 
 
-def in_noise(data: EnergyData, noise: float) -> EnergyData:
-    """The same data with E_prior measured in units of the flow's noise.
-
-    Relief that changes the flow by less than a share of its noise is not supported by the flow.
-
-    Args:
-        data: Data of the pair.
-        noise: Pixels.
-    """
-    return replace(data, prior_weight=noise * data.prior_weight)
-
-
 def at_occlusions(
     data: EnergyData, soup: Soup, component: Int, gap: float, factor: float
 ) -> EnergyData:
@@ -245,11 +227,6 @@ def in_pixels(
     )
 
 
-def without_flow(data: EnergyData, wrong: Mask) -> EnergyData:
-    """The same data where the flow of superpixels `wrong` (N,) does not count."""
-    return replace(data, pixel_weight=np.where(wrong[:, None], 0.0, data.pixel_weight))
-
-
 def within_bending(
     data: EnergyData, bends: Mask, rigid: Weights, bent: Weights, rotation_px: float
 ) -> EnergyData:
@@ -266,19 +243,10 @@ def within_bending(
         rotation_px: Pixels per radian of rotation difference on edges with an end there.
     """
     edges, pairs = (bends[ends[:, 0]] & bends[ends[:, 1]] for ends in (data.edges, data.pairs))
-
-    def more(inside: Mask, term: str) -> Float:
-        weight = getattr(rigid, term)
-        return np.where(inside, getattr(bent, term) / weight if weight else 1.0, 1.0)
-
-    return replace(
-        data,
-        rotation_scale=np.where(bends[data.edges].any(axis=1), rotation_px, data.rotation_scale),
-        edge_weight=more(edges, "arap") * data.edge_weight,
-        prior_weight=more(edges, "prior") * data.prior_weight,
-        pair_weight=more(pairs, "cont") * data.pair_weight,
-        orient_weight=more(pairs, "orient") * data.orient_weight,
-    )
+    weights = {k: getattr(rigid, k) for k in ("arap", "prior", "cont", "orient")}
+    factors = {k: getattr(bent, k) / weight for k, weight in weights.items() if weight}
+    scale = np.where(bends[data.edges].any(axis=1), rotation_px, data.rotation_scale)
+    return scaled(replace(data, rotation_scale=scale), edges, pairs, factors)
 
 
 def in_translations(data: EnergyData, soup: Soup) -> EnergyData:

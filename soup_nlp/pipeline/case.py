@@ -24,7 +24,6 @@ from soup_nlp.model.energy_options import (
 from soup_nlp.model.reweighting import (
     across,
     at_occlusions,
-    in_noise,
     in_pixels,
     in_translations,
     over_ground,
@@ -32,7 +31,6 @@ from soup_nlp.model.reweighting import (
     with_order,
     with_prior,
     within_bending,
-    without_flow,
 )
 from soup_nlp.pipeline.flow import with_flow
 from soup_nlp.pipeline.record import Case
@@ -231,7 +229,9 @@ def build_energy(
     data = build_energy_data(
         seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, at_anchors
     )
-    data = without_flow(in_noise(data, start.noise), start.wrong)
+    # E_prior is in units of the flow's noise, which supports no relief below a share of it
+    pixel_weight = np.where(start.wrong[:, None], 0.0, data.pixel_weight)
+    data = replace(data, prior_weight=start.noise * data.prior_weight, pixel_weight=pixel_weight)
     prior_weight, bending = data.prior_weight, bending_weights(e.weights, len(seg))
     data = across(data, start.component, arap=e.arap_across, prior=e.arap_across)
     data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * prior_weight)

@@ -35,7 +35,8 @@ from soup_nlp.model.energy_data import (
 )
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.reweighting import across, in_noise, in_pixels, rigid_scene
+from soup_nlp.model.reweighting import across, in_pixels, rigid_scene
+from soup_nlp.pipeline.case import build_energy
 from soup_nlp.start.choice import limited_noise
 
 # --- invariances ---------------------------------------------------------------------------------
@@ -301,10 +302,17 @@ def test_prior_is_the_relative_slope_of_inverse_depth():
 
 
 @pytest.mark.parametrize(("error", "noise"), [(0.0, 0.05), (0.3, 0.3), (9.0, 0.6)])
-def test_prior_is_measured_in_the_noise_of_the_flow(error, noise):
-    problem = tiny("pixels")
-    data = in_noise(problem.data, limited_noise(np.full(12, error)))
-    np.testing.assert_allclose(data.prior_weight, noise * problem.data.prior_weight)
+def test_prior_is_measured_in_the_noise_of_the_flow(error, noise, small_room):
+    assert limited_noise(np.full(12, error)) == noise
+    wrong = np.arange(len(small_room)) == 5
+    start = replace(small_room.start, noise=noise * small_room.start.noise, wrong=wrong)
+    seg, whole = small_room.segmentation, small_room.data
+    data, _ = build_energy(small_room.problem, small_room.pair, seg, start)
+    weight, expected = (d.prior_weight[: len(seg.edges)] for d in (data, whole))
+    np.testing.assert_allclose(weight, noise * expected)
+    # what the start says of the flow counts as well
+    assert not data.pixel_weight[wrong].any()
+    assert data.pixel_weight[~wrong].any(axis=1).mean() > 0.9
 
 
 def test_ties_across_groups_keep_a_share_of_weight():
