@@ -16,9 +16,9 @@ from soup_nlp.export.artefact import (
     FORMATS,
     export_case,
     form_label,
-    parse_formulations,
+    parse_formulation,
 )
-from soup_nlp.family.instances import SCENES, SIZES, STANDARD, STARTS, select
+from soup_nlp.family.instances import SCENES, SIZES, STARTS, select
 from soup_nlp.family.write import write_family
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.folders import claim, default_folder, staged
@@ -38,7 +38,7 @@ def export(
     quiet: options.Quiet = False,
 ) -> None:
     """Write the NLP for other solvers; several sizes or formulations make a folder each."""
-    forms = parse_formulations(formulation, coordinates)
+    forms = [parse_formulation(text, coordinates) for text in formulation or [""]]
     # without repetitions
     sizes: list[int | None] = [*dict.fromkeys(superpixels or ())] or [None]
     several = len(sizes) * len(forms) > 1
@@ -99,11 +99,8 @@ def family(
     overwrite: options.Overwrite = False,
 ) -> int:
     """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
-    wanted = options.numbers(sizes, "--sizes")
-    forms = ["/".join(form.values()) for form in parse_formulations(formulation, coordinates)]
-    chosen = select(
-        wanted, options.listed(scenes), [form or STANDARD for form in forms], options.listed(starts)
-    )
+    wanted, named = options.numbers(sizes, "--sizes"), options.listed(scenes)
+    chosen = select(wanted, named, formulation or [""], options.listed(starts), coordinates)
     if out.is_dir() and any(out.iterdir()) and not (out / "index.json").is_file():
         raise DataError(
             "folder holds other files", where=out, expected="a new or empty folder, or a set"

@@ -68,15 +68,15 @@ CHOICES = {"gauge": (*GAUGES, TANGENT), "norm": NORMS}
 """Values of each part of a formulation, in the order of its label."""
 
 
-def parse_formulation(text: str) -> dict[str, str]:
-    """Parse `gauge/norm`; missing parts are those of the problem file.
+def parse_formulation(text: str, coordinates: Coordinates = "matrix") -> dict[str, str]:
+    """Parse `gauge/norm`; missing parts, of "" all, are those of the problem file.
 
     "tangent" in the place of a gauge becomes `coordinates`.
 
     Raises:
-        ConfigError: a word is not one of the choices.
+        ConfigError: a word is not one of the choices, or a gauge is named for tangent coordinates.
     """
-    words = [w.strip() for w in text.split("/")]
+    words = [w.strip() for w in text.split("/")] if text else []
     if len(words) > len(CHOICES):
         raise ConfigError(
             "too many words", where="--formulation", found=text, expected="/".join(CHOICES)
@@ -87,28 +87,12 @@ def parse_formulation(text: str) -> dict[str, str]:
                 f"unknown {key}", where="--formulation", found=word, expected=", ".join(choices)
             )
     out = dict(zip(CHOICES, words))
-    if out.get("gauge") == TANGENT:
-        out = {"coordinates": out.pop("gauge"), **out}
-    return out
-
-
-def parse_formulations(
-    texts: Sequence[str] | None, coordinates: Coordinates
-) -> list[dict[str, str]]:
-    """Formulations of the command line, all of them in the coordinates.
-
-    Raises:
-        ConfigError: a word is unknown, or a gauge is named for tangent coordinates.
-    """
-    forms = [parse_formulation(text) for text in texts or []] or [{}]
-    if coordinates == TANGENT:
-        for form in forms:
-            if "gauge" in form:
-                raise ConfigError(
-                    "tangent coordinates have no gauge", where="--formulation", found=form["gauge"]
-                )
-        forms = [{"coordinates": coordinates, **form} for form in forms]
-    return forms
+    if TANGENT not in (coordinates, out.get("gauge")):
+        return out
+    gauge = out.pop("gauge", TANGENT)
+    if gauge != TANGENT:
+        raise ConfigError("tangent coordinates have no gauge", where="--formulation", found=gauge)
+    return {"coordinates": TANGENT, **out}
 
 
 def form_label(form: Formulation) -> str:

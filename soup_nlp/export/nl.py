@@ -134,7 +134,7 @@ def header(
         program: Parts of the NLP.
         bounds: (ng,) lower and upper bounds of the rows.
         longest: Length of the longest name of a row and of a variable.
-        defined: Defined variables by use, see `NlBody`.
+        defined: See `NlBody.classes`.
     """
     lower, upper = bounds
     equations = lower == upper

@@ -56,14 +56,13 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
     stamped = []
     linear: list[tuple[Float, Int, Int]] = []
     for group in groups:
-        name, table = group.kernel.name, group.table
-        parts = split(group, theta)
-        template = make_template(name, parts.nonlinear, group, theta)
+        table, parts = group.table, split(group, theta)
+        template = make_template(parts.nonlinear, group, theta)
         for values in (*template.numbers.values(), parts.coefficient):
             if not np.isfinite(values).all():
                 raise ExportError(
                     "number of an expression is not finite",
-                    where=name,
+                    where=group.kernel.name,
                     hint="a kernel divides by a column that is 0 somewhere",
                 )
         goal = np.full((group.size, int(parts.objective)), OBJECTIVE)
@@ -153,7 +152,7 @@ def split(group: Group, theta: Float) -> Split:
     out = ca.densify(ca.vertcat(*given))
     # before the split, since a piecewise constant part such as sign(a) has a zero derivative and
     # would look linear
-    trace(kernel.name, out, group, theta)
+    trace(out, group, theta)
     jacobian = ca.jacobian(out, kernel.x)
     r, c = jacobian.sparsity().get_triplet()
     row, column = np.asarray(r, np.int64), np.asarray(c, np.int64)

@@ -75,7 +75,7 @@ class _Graph:
             return self.constant(key, OPERATIONS[op].numpy(*(self.number[a] for a in args)))
 
 
-def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
+def trace(outputs: ca.SX, group: Group, theta: Float) -> _Graph:
     """Expression graph of the outputs; numbers are scalars, or (E,) if they depend on data.
 
     Raises:
@@ -101,7 +101,9 @@ def trace(name: str, outputs: ca.SX, group: Group, theta: Float) -> _Graph:
             work[target] = graph.apply(op, tuple(work[a] for a in inputs))
         else:
             raise ExportError(
-                "operation cannot be written to .nl", where=name, found=NAMES.get(op, str(op))
+                "operation cannot be written to .nl",
+                where=kernel.name,
+                found=NAMES.get(op, str(op)),
             )
     return graph
 
@@ -123,19 +125,13 @@ class Template:
     numbers: dict[int, Float]
 
 
-def make_template(name: str, outputs: ca.SX, group: Group, theta: Float) -> Template:
-    """Make the template of the outputs of a kernel.
-
-    Args:
-        name: Name for messages.
-        outputs: (m,) expressions of the kernel's x, row and theta.
-        group: Kernel and table.
-        theta: Values of the shared parameters.
+def make_template(outputs: ca.SX, group: Group, theta: Float) -> Template:
+    """Make the template of (m,) expressions of a kernel's x, row and theta.
 
     Raises:
         ExportError: an operation has no .nl opcode.
     """
-    graph = trace(name, outputs, group, theta)
+    graph = trace(outputs, group, theta)
     names = _defined(graph, group)
     defined = tuple((n, _emit(graph, n, names)) for n in sorted(names))
     roots: list[Text | None] = []

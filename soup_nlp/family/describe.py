@@ -17,9 +17,8 @@ from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import FEASIBLE, Kind, Residuals, active, examine, kind, violations
 from soup_nlp.family.frozen import load_frozen
-from soup_nlp.family.instances import VERSION, build_instance, case_of, parse_name
+from soup_nlp.family.instances import build_instance, case_of, parse_name
 from soup_nlp.model.nlp import NLP
-from soup_nlp.storage.files import write_json
 
 CLASSES = {0: "constant", 1: "linear", 2: "quadratic", 3: "general"}
 LETTERS = {0: "C", 1: "L", 2: "Q", 3: "O"}
@@ -173,11 +172,3 @@ def check_sol(path: Path) -> Verdict:
             examine(nlp, sol.x, sol.lam_g),
             [kind(k, v, FEASIBLE, False) for k, v in violations(nlp, sol.x).items()],
         )
-
-
-def write_results(path: Path, rows: list[dict[str, Any]], note: dict[str, Any]) -> None:
-    """Write results.
-
-    `note` has entries that hold for all rows, such as machine and limits.
-    """
-    write_json(path, {"set": "SOUP", "version": VERSION, **note, "results": rows})

@@ -21,7 +21,7 @@ from soup_nlp.family.frozen import Frozen
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.formulation import Coordinates, Formulation
 from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.reweighting import first_edges
@@ -107,8 +107,11 @@ def select(
     scenes: Sequence[str],
     forms: Sequence[str],
     starts: Sequence[str] = STARTS,
+    coordinates: Coordinates = "matrix",
 ) -> list[Instance]:
     """Instances of sizes, scenes, formulations and starts.
+
+    Missing parts of a formulation are those of STANDARD.
 
     Raises:
         ConfigError: one of them is not part of the family.
@@ -127,20 +130,17 @@ def select(
                 found=", ".join(wrong) or "nothing",
                 expected=", ".join(map(str, members)),
             )
-    labels = [_whole(form) for form in forms]
+    labels = {}
+    for form in forms:
+        words = dict(zip(CHOICES, STANDARD.split("/"))) | parse_formulation(form, coordinates)
+        labels["/".join([words.pop("coordinates", words["gauge"]), words["norm"]])] = form
     return [
         Instance(scene, form, size, start)
         for scene in dict.fromkeys(scenes)
-        for form in dict.fromkeys(labels)
+        for form in labels
         for size in dict.fromkeys(sizes)
         for start in dict.fromkeys(starts)
     ]
-
-
-def _whole(form: str) -> str:
-    """A formulation completed by the parts of STANDARD."""
-    words = dict(zip(CHOICES, STANDARD.split("/"))) | parse_formulation(form)
-    return "/".join([words.pop("coordinates", words["gauge"]), words["norm"]])
 
 
 def case_of(record: Frozen, pair: Pair | None = None) -> Case:

@@ -11,7 +11,7 @@ from test_export import problem_of, write
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import ConfigError, ExportError
-from soup_nlp.export.artefact import parse_formulations
+from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.sol import write_sol
 from soup_nlp.model import oracle
@@ -156,9 +156,8 @@ def test_an_answer_in_tangent_coordinates_becomes_a_result(exported, tmp_path, c
 
 
 def test_tangent_coordinates_have_no_gauge():
-    assert parse_formulations(None, "tangent") == [{"coordinates": "tangent"}]
-    assert parse_formulations(["tangent/epigraph"], "matrix") == [
-        {"coordinates": "tangent", "norm": "epigraph"}
-    ]
+    assert parse_formulation("", "tangent") == {"coordinates": "tangent"}
+    tangent = {"coordinates": "tangent", "norm": "epigraph"}
+    assert parse_formulation("tangent/epigraph") == tangent
     with pytest.raises(ConfigError, match="gauge"):
-        parse_formulations(["unit-offset"], "tangent")
+        parse_formulation("unit-offset", "tangent")

@@ -8,6 +8,7 @@ import pytest
 
 from soup_nlp.bench.solvers import runner
 from soup_nlp.cli.main import main
+from soup_nlp.family.instances import VERSION
 from soup_nlp.family.write import _reached
 from soup_nlp.storage.rows import read_rows
 
@@ -63,7 +64,9 @@ def test_a_solver_of_ones_own_is_a_command_line(record, tmp_path, monkeypatch, c
     # a false claim is no verified run
     assert main(words) == 1
     assert "-" in capsys.readouterr().out
-    result = json.loads((out / "results.json").read_text())["results"][0]
+    stored = json.loads((out / "results.json").read_text())
+    assert (stored["set"], stored["version"]) == ("SOUP", VERSION)
+    (result,) = stored["results"]
     assert result["status"] == "mine with fast=1"
     assert result["claimed"]
     assert not result["verified"]

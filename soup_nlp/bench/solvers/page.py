@@ -14,7 +14,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.bench.processes import machine
 from soup_nlp.bench.study import markdown, page_text, panels, save, show, titled
 from soup_nlp.export.verify import Limits
-from soup_nlp.family.describe import write_results
+from soup_nlp.family.instances import VERSION
 from soup_nlp.family.write import REACHED
 from soup_nlp.storage.files import write_json
 from soup_nlp.storage.rows import Row
@@ -248,8 +248,8 @@ def write_pictures(folder: Path, frame: pd.DataFrame, limits: Limits) -> None:
     family = of_family(frame)
     if len(family):
         draw_profiles(folder / "profiles.png", by_start(family), ("cpu_seconds", "objective"))
-        note = {"limits": asdict(limits), "machine": machine()}
-        write_results(folder / "results.json", neutral(family), note)
+        head = {"set": "SOUP", "version": VERSION, "limits": asdict(limits), "machine": machine()}
+        write_json(folder / "results.json", {**head, "results": neutral(family)})
         write_json(folder / "reached.json", summary(family))
 
 
@@ -281,7 +281,7 @@ CASADI = ("ipopt", "sqpmethod", "uno", "bonmin", "fatrop")
 
 
 def neutral(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """The runs in the solver-independent form of `family.describe`."""
+    """The runs in a form that no solver is special in."""
     names = {"cpu_seconds": "time", "wall_seconds": "wall_time"}
     kept = ["solver", "name", "n", "m", "status", "objective", "iterations", "claimed", "verified"]
     kept += ["primal", "dual", "complementarity"]
