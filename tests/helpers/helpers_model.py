@@ -322,7 +322,8 @@ WORLDS = {
 def world(name: str, units: str, at_anchors: bool) -> tuple[Soup, EnergyData]:
     pose, move = WORLDS[name]
     pair = plane_world(pose, move, WIDTH, HEIGHT)
-    seg = build_segmentation(segment(pair.image_ref, 12, "grid"), pair.image_ref, neighbours=5)
+    labels = segment(pair.image_ref, 12, "grid")
+    seg = build_segmentation(labels, pair.image_ref, neighbours=5, boundary_samples=2)
     data = build_energy_data(
         seg, pair.flow, pair.K_ref, pair.K_next, 8, 0, arap_at_anchors=at_anchors
     )

@@ -97,7 +97,7 @@ class Problem:
     def __init__(self, name: str) -> None:
         pair = with_true_flow(render_scene(name, 0, 160, 120))
         labels = segment(pair.image_ref, 20)
-        seg = build_segmentation(labels, pair.image_ref, neighbours=6)
+        seg = build_segmentation(labels, pair.image_ref, neighbours=6, boundary_samples=2)
         noise = np.random.default_rng(5).normal(0, 0.2, pair.flow.uv.shape)
         flow = replace(pair.flow, uv=pair.flow.uv + noise)
         self.start = propose(FlowFit.of(seg, flow, pair.K_ref, pair.K_next)).soup
@@ -363,7 +363,8 @@ def test_a_wrong_option_of_the_soup_is_a_solver_error(room):
 def slanted() -> tuple[Soup, EnergyData]:
     pose, move = plane_pose(2.5, yaw=25, pitch=-30), motion((1, 0.5, -1), (0.2, 0.1, -0.1))
     pair = plane_world(pose, move, 96, 72)
-    seg = build_segmentation(segment(pair.image_ref, 20, "grid"), pair.image_ref, neighbours=6)
+    labels = segment(pair.image_ref, 20, "grid")
+    seg = build_segmentation(labels, pair.image_ref, neighbours=6, boundary_samples=2)
     truth = plane_soup(pose, move, len(seg))
     data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 12, 0)
     return truth, in_pixels(data, truth, seg)
