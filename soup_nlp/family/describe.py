@@ -20,8 +20,8 @@ from soup_nlp.family.frozen import load_frozen
 from soup_nlp.family.instances import build_instance, case_of, parse_name
 from soup_nlp.model.nlp import NLP
 
-CLASSES = {0: "constant", 1: "linear", 2: "quadratic", 3: "general"}
-LETTERS = {0: "C", 1: "L", 2: "Q", 3: "O"}
+CLASSES = ("constant", "linear", "quadratic", "general")
+LETTERS = "CLQO"
 """CUTEst letter of each class of an objective; constant rows count as linear."""
 RANK = 1e-8
 """Singular values below this share of the largest count as 0."""
@@ -61,10 +61,9 @@ def classification(nlp: NLP, kinds: dict[str, Any]) -> str:
     It has letters for the objective and the constraints, R for twice differentiable, 2 for second
     derivatives, M for a modelling exercise, Y if there are slack variables, n and m.
     """
-    number_of = {word: number for number, word in CLASSES.items()}
-    rows = max(number_of[c["class"]] for c in kinds["constraint_classes"].values())
+    rows = max(CLASSES.index(c["class"]) for c in kinds["constraint_classes"].values())
     internal = nlp.x_names()[-1].startswith("s_")
-    letters = LETTERS[number_of[kinds["objective_class"]]] + LETTERS[max(rows, 1)]
+    letters = LETTERS[CLASSES.index(kinds["objective_class"])] + LETTERS[max(rows, 1)]
     return f"{letters}R2-M{'Y' if internal else 'N'}-{nlp.nx}-{nlp.ng}"
 
 

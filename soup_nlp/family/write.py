@@ -163,9 +163,7 @@ def instance_data(entry: Mapping[str, Any]) -> Entry:
     The dual bound is 0: every term of the objective is at least 0.
     """
     best, rows = entry["best_known"], entry["constraint_classes"].values()
-    by_class = {
-        word: sum(c["rows"] for c in rows if c["class"] == word) for word in CLASSES.values()
-    }
+    by_class = {word: sum(c["rows"] for c in rows if c["class"] == word) for word in CLASSES}
     return {
         "name": entry["name"],
         "file": entry["file"],

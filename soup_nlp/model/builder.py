@@ -95,9 +95,10 @@ class Builder:
         kernel, slacks = _kernel(*term, self.form.norm)
         index, rows = [layout.of(i) for i in element.superpixels.T], []
         for norm in slacks:
-            own = 0.0, np.inf, element.superpixels
-            index.append(layout.size + _added(self.slacks, Block(f"s_{norm}", *own))[:, None])
-            rows.append(_added(self.rows, Block(f"epigraph_{norm}", *own)))
+            slack = Block(f"s_{norm}", 0.0, np.inf, element.superpixels)
+            index.append(layout.size + _added(self.slacks, slack)[:, None])
+            row = Block(f"epigraph_{norm}", 0.0, np.inf, element.superpixels)
+            rows.append(_added(self.rows, row))
         data = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
         table = Table(
             np.concatenate(index, axis=1), data, np.array(rows, np.int64).reshape(-1, size).T

@@ -108,20 +108,10 @@ def operation(number: int) -> Operation:
     return OPERATIONS[number]
 
 
-class Instruction(NamedTuple):
-    """One instruction of an SX function.
-
-    Attributes:
-        operation: CasADi's number of it.
-        output: Register that takes the result; of OP_OUTPUT: output and nonzero of the function.
-        inputs: Registers of the operands; of OP_INPUT: input and nonzero of the function.
-        constant: Value of OP_CONST, else 0.
-    """
-
-    operation: int
-    output: list[int]
-    inputs: list[int]
-    constant: float
+Instruction = tuple[int, list[int], list[int], float]
+"""CasADi's number of an operation; the register that takes the result, or output and nonzero of the
+function (OP_OUTPUT); registers of the operands, or input and nonzero (OP_INPUT); the value of
+OP_CONST, else 0."""
 
 
 def instructions(function: ca.Function) -> tuple[Instruction, ...]:
@@ -140,7 +130,7 @@ LARGE = 20_000
 
 def _instructions(f: ca.Function) -> tuple[Instruction, ...]:
     return tuple(
-        Instruction(
+        (
             operation := f.instruction_id(k),
             f.instruction_output(k),
             f.instruction_input(k),

@@ -1,4 +1,7 @@
-"""Departures from the paper's weights and graph: in a scene, across components, in pixels."""
+"""Departures from the paper's weights and graph: in a scene, across components, in pixels.
+
+Every function takes the data of a pair, and where it needs it the soup of its start.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -45,7 +48,6 @@ def across(data: EnergyData, group: Int, **factors: float) -> EnergyData:
     depth is real, and they need not face the same way.
 
     Args:
-        data: Data of the pair.
         group: (N,) component or surface of every superpixel, as the start finds them.
         factors: By the name of a term; 1 is the paper's energy.
     """
@@ -61,7 +63,6 @@ def rigid_scene(data: EnergyData, soup: Soup, scene: Mask, weight: float) -> Ene
 
     Args:
         data: Data of the pair in the paper's units.
-        soup: Start.
         scene: (N,) the scene, one rigid component; superpixels without confident flow are left out.
         weight: w1 of these edges; 0 is the paper's graph.
     """
@@ -93,8 +94,6 @@ def over_ground(data: EnergyData, soup: Soup, grounded: Mask, weight: Float) -> 
     horizon would recede below the ground, although the initialisation has put it there.
 
     Args:
-        data: Data of the pair.
-        soup: Start.
         grounded: (N,) whether a superpixel without depth of its own has ground below it.
         weight: (E,) weight of E_prior on edges between two of them.
     """
@@ -120,7 +119,6 @@ def with_prior(
     """The same data with E_depth instead of E_prior where a depth prior counts.
 
     Args:
-        data: Data of the pair.
         soup: Start; where the flow leaves slopes open, its planes are those of the prior.
         log_depth: (N,) log depth of the anchors by the depth prior.
         opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
@@ -158,8 +156,6 @@ def with_order(
     Where nothing else gives a scale, the step of the start is asked for; else none, only the order.
 
     Args:
-        data: Data of the pair.
-        soup: Start.
         order: (P,) probability of the order, signed as `EnergyData.order_weight`.
         placed: (N,) True where the steps of the start are asked for.
         weight: Of a sure order.
@@ -180,7 +176,6 @@ def at_occlusions(
     component away from the camera, and nothing else fixes its scale.
 
     Args:
-        data: Data of the pair.
         soup: Start, its components scaled to where they touch.
         component: (N,) group of every superpixel, as the start finds them.
         gap: Smallest gap in depth that is one, relative to the farther side.

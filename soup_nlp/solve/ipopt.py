@@ -133,12 +133,7 @@ class _Iterations:
             self.reason = "Time_Limit"
 
     def ended(self, stats: Mapping[str, Any], out: Mapping[str, Float]) -> Stage:
-        """The record of the call: Ipopt's answer, or the best iterate where it did not converge.
-
-        Args:
-            stats: Of CasADi's solver.
-            out: Its answer.
-        """
+        """Record of the call: the answer `out`, or the best iterate where it did not converge."""
         status = self.reason or str(stats.get("return_status", "Unknown"))
         converged = status in GOOD
         history = {k: np.asarray(v, float) for k, v in stats.get("iterations", {}).items()}

@@ -151,10 +151,7 @@ class Presolve:
         """Gauss-Newton stages with growing theta, then the exact Hessian, at the final smoothing.
 
         On inverse depths if the energy's units allow it; at their base, charts agree to first
-        order, so that the multipliers serve both.
-
-        Args:
-            before: The last program, whose multipliers are the first ones here.
+        order, so that the multipliers of the program before serve both.
         """
         o = self.o
         program = self._program(self.soup, chart=exact_chart(self.data))
