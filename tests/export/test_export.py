@@ -261,10 +261,10 @@ def test_options_are_checked(tmp_path, capsys):
     assert not list(tmp_path.rglob("manifest.json"))
 
 
-def test_a_presolved_start_has_multipliers(tmp_path):
+def test_a_presolved_start_has_multipliers(tmp_path, capsys):
     assert main(["export", "orbit", "-o", str(tmp_path), *TINY, "--superpixels", "16"]) == 0
-    assert json.loads((tmp_path / "manifest.json").read_text())["initial_duals"]
-    _, nlp, _, (v, r), _ = problem_of(tmp_path)
+    _, nlp, _, (v, r), manifest = problem_of(tmp_path)
+    assert manifest["initial_duals"]
     builder = ca.NlpBuilder()
     builder.import_nl(str(tmp_path / "soup.nl"), {})
     x, lam = np.empty(nlp.nx), np.empty(nlp.ng)
@@ -272,6 +272,12 @@ def test_a_presolved_start_has_multipliers(tmp_path):
     # the multipliers make the start stationary, in AMPL's sign
     gradient = nlp.gradient(x)
     assert np.abs(gradient - nlp.jacobian(x).T @ lam).max() < 1e-3 < np.abs(gradient).max()
+    # solvers start there, although the case of the folder is prepared without a presolve
+    write_sol(tmp_path / "start.sol", x, None, v, r, "start", 400)
+    main(["check", str(tmp_path / "start.sol")])
+    line = next(s for s in capsys.readouterr().out.splitlines() if s.startswith("energy"))
+    energy = f"{manifest['exact_energy_at_start']['total']:.6g}"
+    assert line == f"energy      start {energy}  solution {energy}"
 
 
 def test_no_multipliers_where_the_start_is_not_stationary(exported):

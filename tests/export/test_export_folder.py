@@ -52,20 +52,6 @@ def test_sizes_of_equal_number_have_their_own_folders(tmp_path, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 1
 
 
-def test_the_start_of_a_presolved_export_is_where_solvers_start(tmp_path, capsys):
-    assert write(tmp_path, "--superpixels", "12", "--presolve", "-q") == 0
-    manifest = json.loads((tmp_path / "manifest.json").read_text())
-    _, _, _, (v, r), _ = problem_of(tmp_path)
-    # the case of the folder is prepared without a presolve: its start is in the file
-    x = np.empty(len(v))
-    x[v] = ReadBack(tmp_path / "soup.nl").x0
-    write_sol(tmp_path / "start.sol", x, None, v, r, "start", 400)
-    main(["check", str(tmp_path / "start.sol")])
-    line = next(s for s in capsys.readouterr().out.splitlines() if s.startswith("energy"))
-    value = f"{manifest['exact_energy_at_start']['total']:.6g}"
-    assert line == f"energy      start {value}  solution {value}"
-
-
 @pytest.fixture(scope="module")
 def small(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("small")

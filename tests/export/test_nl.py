@@ -64,17 +64,6 @@ def test_casadi_reads_back_every_formulation(form, tmp_path):
     assert nonzeros.split()[:2] == [str(nlp.nnzj), str(file.counts["gradient_nonzeros"])]
 
 
-def test_parameters_and_start_are_written(tmp_path):
-    nlp, _ = Tiny().nlp(PAPER, FORMS[0])
-    other = replace(nlp, theta={**nlp.theta, "eps": 0.5}, x0=nlp.x0 + 0.25)
-    back = ReadBack(write_nl(tmp_path / "a.nl", other).path)
-    file = write_nl(tmp_path / "b.nl", nlp)
-    assert np.array_equal(back.x0, (nlp.x0 + 0.25)[file.variables])
-    f = float(back.values(nlp.x0[file.variables])[0])
-    assert f == pytest.approx(nlp.value(nlp.x0, nlp.thetas(eps=0.5)), rel=1e-13)
-    assert abs(f - value(nlp, nlp.x0)[0]) > 1e-3
-
-
 def test_shared_expressions_are_written_once(tmp_path):
     nlp, layout = Tiny().nlp(PAPER, FORMS[0])
     file = write_nl(tmp_path / "soup.nl", nlp)

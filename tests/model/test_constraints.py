@@ -142,12 +142,17 @@ def violations(nlp: NLP, x: np.ndarray, data: EnergyData, f: Formulation) -> dic
 @pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_every_row_and_every_bound_is_the_specified_one(gauge, norm):
-    problem = tiny("pixels")
+    problem, share = tiny("pixels"), np.linspace(1.0, 4.0, 12)
+    data = replace(problem.data, share=share / share.sum())
     f = form(gauge=gauge, norm=norm, depth_ratio=4.0, min_facing=0.02)
-    nlp, layout = problem.nlp(weights_for("pixels"), f)
+    nlp, layout = build_matrix_nlp(problem.soup, data, weights_for("pixels"), f)
+    # the start is feasible
+    assert np.isfinite(nlp.x0).all()
+    found = violations(nlp, nlp.x0, data, f)
+    assert max(found.values()) <= 1e-9, found
     # off the manifold, where no entry of any row is 0
     x = wiggle(nlp, layout.size, 1, 0.3)
-    spec, g = bodies(nlp, x, problem.data, 4.0), value(nlp, x)[1]
+    spec, g = bodies(nlp, x, data, 4.0), value(nlp, x)[1]
     kinds = {kind_of(name) for name in nlp.g_names()}
     assert kinds == spec.keys() | ({"epigraph"} if norm == "epigraph" else set())
     for kind, body in spec.items():
@@ -217,17 +222,6 @@ def test_the_presolve_constrains_scale_and_visibility_only(chart, units):
 # --- what the constraints mean ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("norm", NORMS)
-@pytest.mark.parametrize("gauge", GAUGES)
-def test_the_start_is_feasible(gauge, norm):
-    problem = tiny("pixels")
-    f = form(gauge=gauge, norm=norm)
-    nlp, _ = problem.nlp(weights_for("pixels"), f)
-    assert np.isfinite(nlp.x0).all()
-    found = violations(nlp, nlp.x0, problem.data, f)
-    assert max(found.values()) <= 1e-9, found
-
-
 @pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
 def test_the_start_of_the_presolve_is_feasible(chart):
     problem = tiny("pixels")
@@ -254,7 +248,7 @@ def test_visibility_bounds_the_depth_over_a_superpixel(ratio):
     pre, tangent = build_tangent_nlp(problem.soup, problem.data, PAPER, f)
     rim = problem.data.rim_ray
     admitted = 0
-    for _ in range(200):
+    for _ in range(60):
         n = rng.normal(0, 1, (12, 3)) * [4, 4, 1]
         n /= -np.sign(n[:, 2:]) * np.linalg.norm(n, axis=1, keepdims=True)
         soup = replace(problem.soup, n=n)
@@ -268,7 +262,7 @@ def test_visibility_bounds_the_depth_over_a_superpixel(ratio):
         sees = (facing > 0).all(axis=1)
         other = unseen(pre, tangent.pack(replace(soup, n=np.where(sees[:, None], n, [0, 0, -1.0]))))
         assert (other[sees] >= bad[sees]).all()
-    assert admitted > 100
+    assert admitted > 30
 
 
 def unseen(nlp: NLP, x: np.ndarray) -> np.ndarray:
@@ -364,7 +358,7 @@ def test_ipopt_gets_every_kind_of_bound(side):
     [("room", "unit-offset"), ("street", "unit-translation")],
 )
 def test_the_raw_answer_of_a_default_solve_keeps_every_constraint(scene, gauge):
-    small = ["input.width=96", "input.height=72", "segmentation.superpixels=30"]
+    small = ["input.width=96", "input.height=72", "segmentation.superpixels=20"]
     own = [f"formulation.gauge={gauge}", "flow.source=truth"]
     case = prepare(load_problem(scene, [*small, *own]))
     f = case.formulation()

@@ -21,13 +21,11 @@ from helpers_model import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soup_nlp.errors import ConfigError, ModelError
+from soup_nlp.errors import ModelError
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import TERMS
-from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.pattern import Pattern
 from soup_nlp.model.symbolic import Graph
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
@@ -163,18 +161,6 @@ def test_the_print_shows_sizes_and_sparsity():
         assert re.search(rf"^  {name} +\d+ x ", text, re.M), name
 
 
-@pytest.mark.parametrize("wrong", [{"gauge": "sideways"}, {"hessian": "guess"}])
-def test_unknown_kinds_of_formulation_are_refused(wrong):
-    with pytest.raises(ConfigError, match=next(iter(wrong.values()))):
-        Formulation.make(wrong)
-
-
-def test_unknown_parameters_are_refused():
-    nlp, _ = tiny().nlp(PAPER, form())
-    with pytest.raises(ModelError, match="unknown parameter"):
-        nlp.thetas(epsilon=1.0)
-
-
 def test_a_table_must_fit_its_kernel_and_be_finite():
     nlp, _ = tiny().nlp(PAPER, form())
     group = next(g for g in nlp.groups if g.kernel.name == "normal")
@@ -219,17 +205,3 @@ def test_the_same_soup_has_the_same_objective_in_all_variables(norm, units):
     assert found[0] > 0
     np.testing.assert_allclose(found[:-1], found[0], rtol=1e-12)
     assert found[-1] == pytest.approx(found[0], rel=1e-11)
-
-
-def test_the_length_unit_weighs_distances_by_share():
-    problem = tiny()
-    share = np.linspace(1.0, 4.0, len(problem.soup))
-    share /= share.sum()
-    data = replace(problem.data, share=share)
-    nlp, layout = build_matrix_nlp(problem.soup, data, PAPER, form(gauge="unit-translation"))
-    row = nlp.g_names().index(next(name for name in nlp.g_names() if name.startswith("unit")))
-    g = nlp.constraints(nlp.x0)
-    assert g[row] == pytest.approx(1.0, rel=1e-12)
-    # with equal shares the unit would be the mean distance, which is another one
-    soup = layout.unpack(nlp.x0[: layout.size])
-    assert abs(float(np.mean(soup.distance)) - 1) > 0.01

