@@ -1,13 +1,17 @@
 """bench speed: plan, costs and page on artificial rows; one tiny real run."""
 
+import pickle
+from pathlib import Path
+
 import pytest
 from helpers_files import sets
 
 from soup_nlp.bench.processes import machine
 from soup_nlp.bench.speed import speed_cells, speed_page, timed_pairs, with_costs
 from soup_nlp.bench.study import Cell, frame_of
+from soup_nlp.cli import bench
 from soup_nlp.cli.main import main
-from soup_nlp.storage.rows import read_rows
+from soup_nlp.storage.rows import Job, Row, Say, measure_all, read_rows
 
 pytestmark = pytest.mark.slow
 
@@ -102,8 +106,15 @@ def test_bad_input_ends_with_2(tmp_path, capsys, words):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_real_run_and_its_table(tmp_path):
+def test_a_real_run_and_its_table(tmp_path, monkeypatch):
     out = tmp_path / "out"
+
+    def here(jobs: list[Job], path: Path, say: Say, fresh: bool) -> list[Row]:
+        assert fresh
+        return measure_all(pickle.loads(pickle.dumps(jobs)), path, say=say)
+
+    # `test_rows.py` measures rows in new processes
+    monkeypatch.setattr(bench, "measure_all", here)
     size = ["--scenes", "street", "--sizes", "24", "--neighbours", "4", "--seeds", "0"]
     small = sets(
         "formulation.compiled=false solver.presolve_eps=[0.3] solver.presolve_iterations=3"

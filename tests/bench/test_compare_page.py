@@ -1,7 +1,5 @@
 """Page and pictures of a comparison of solvers from artificial rows; its command."""
 
-import json
-import warnings
 from dataclasses import asdict
 
 import numpy as np
@@ -24,6 +22,7 @@ from soup_nlp.bench.solvers.page import page as page_of
 from soup_nlp.bench.study import panels
 from soup_nlp.cli.main import main
 from soup_nlp.export.verify import Limits
+from soup_nlp.storage.rows import read_rows
 
 pytestmark = pytest.mark.slow
 
@@ -84,12 +83,9 @@ def test_a_profile_names_the_solvers_that_solve_nothing():
     assert told == ["one", "two", "none by three"]
 
 
-@pytest.mark.parametrize("rows", [ROWS, ROWS[2:3]], ids=["some", "none"])
-def test_pictures_of_runs(rows, tmp_path):
-    frame = frame_of_runs(rows)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        draw_profiles(tmp_path / "p.png", {"": frame}, ("seconds", "energy"))
+def test_a_picture_of_runs_with_and_without_a_verified_one(tmp_path):
+    groups = {"some": frame_of_runs(ROWS), "none": frame_of_runs(ROWS[2:3])}
+    draw_profiles(tmp_path / "p.png", groups, ("seconds", "energy"))
     assert (tmp_path / "p.png").stat().st_size > 5000
 
 
@@ -169,24 +165,13 @@ def test_rows_belong_to_a_start_and_a_size(tmp_path):
 # --- the command ---------------------------------------------------------------------------------
 
 
-def test_command(tmp_path, capsys):
-    words = ["compare", "orbit", "-o", str(tmp_path)]
-    words += ["--solvers", "soup-nlp", "--seconds", "20", *SMALL]
-    assert main(words) == 0
-    rows = [json.loads(x) for x in (tmp_path / "runs.jsonl").read_text().splitlines()]
-    assert rows[0]["verified"]
-    assert "1 verified" in capsys.readouterr().out
-    for name in ("README.md", "profile.png"):
-        assert (tmp_path / name).stat().st_size > 0
-    assert main([*words, "--seconds", "-1"]) == 2
-    assert main(["compare", "orbit", "--solvers", "nothing"]) == 2
-
-
 def test_files_are_read_before_anything_runs(tmp_path, capsys):
     words = ["-o", str(tmp_path), "--solvers", "soup-nlp,soup-nlp", "--seconds", "5", *SMALL]
     assert main(["compare", "orbit", "orbitt.yaml", *words]) == 2
     assert main(["compare", "orbit", *words, "--set", "segmentation.superpixels=0"]) == 2
     assert "superpixels" in capsys.readouterr().err
+    assert main(["compare", "orbit", *words, "--seconds", "-1"]) == 2
+    assert main(["compare", "orbit", *words, "--solvers", "nothing"]) == 2
     assert not list(tmp_path.iterdir())
 
 
@@ -201,14 +186,21 @@ def test_an_interrupted_comparison_has_a_page_and_goes_on(tmp_path, monkeypatch,
 
     monkeypatch.setattr(runner, "isolated", second_is_interrupted)
     out = tmp_path / "out"
-    words = ["compare", "orbit", "--solvers", "ipopt-tuned,soup-nlp", "--seconds", "5"]
+    words = ["compare", "orbit", "--solvers", "ipopt-tuned,soup-nlp", "--seconds", "20"]
     # the first solver need not converge
     words += ["--iterations", "30", "-o", str(out), *SMALL]
     assert main(words) == 130
     assert "1 runs" in (out / "README.md").read_text()
     assert (out / "profile.png").stat().st_size > 0
     assert "the runs that were finished are kept" in capsys.readouterr().err
-    assert np.isfinite([json.loads((out / "runs.jsonl").read_text())["energy"]]).all()
+    (first,) = read_rows(out / "runs.jsonl")
+    assert np.isfinite(first["energy"])
     monkeypatch.setattr(runner, "isolated", isolated)
     assert main(words) == 0
     assert "2 runs" in (out / "README.md").read_text()
+    # the solve of the package is verified
+    same, package = read_rows(out / "runs.jsonl")
+    assert same == first
+    assert package["verified"]
+    verified = first["verified"] + package["verified"]
+    assert f"2 runs: {verified} verified" in capsys.readouterr().out
