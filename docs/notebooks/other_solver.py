@@ -41,9 +41,9 @@ folder = Path(tempfile.mkdtemp())
 # %%
 (folder / "orbit.yaml").write_text(
     """
-input: {kind: scene, scene: orbit, width: 192, height: 96}
+input: {kind: scene, scene: orbit, width: 160, height: 80}
 flow: {source: truth}
-segmentation: {superpixels: 16, neighbours: 6}
+segmentation: {superpixels: 12, neighbours: 4}
 energy: {pixel_samples: 4}
 """
 )

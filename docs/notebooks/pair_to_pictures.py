@@ -33,7 +33,7 @@ import soup_nlp
 settings = {
     "input": {"kind": "scene", "scene": "street", "seed": 0, "width": 256, "height": 112},
     "flow": {"source": "truth"},
-    "segmentation": {"superpixels": 100},
+    "segmentation": {"superpixels": 50},
     "refine": {"rounds": 2},
 }
 problem = soup_nlp.make_problem(settings)

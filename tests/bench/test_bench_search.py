@@ -64,13 +64,13 @@ def test_search_finds_the_minimum_and_can_be_continued(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr(searching, "measure_pair", lambda cell: calls.append(cell) or fake(cell))
     path = tmp_path / "rows.jsonl"
-    frame = search(SPACE, items(0)[:2], path, trials=40)
+    frame = search(SPACE, items(0)[:2], path, trials=20)
     losses = frame.groupby("variant")["loss"].mean()
-    assert len(losses) == 41
+    assert len(losses) == 21
     assert losses[DEFAULT] == pytest.approx(math.log(0.02 * (1 + 2 + 0.8) / 0.4))
     assert losses.min() < losses[DEFAULT] - 0.6
     before = len(calls)
-    again = search(SPACE, items(0)[:2], path, trials=40)
+    again = search(SPACE, items(0)[:2], path, trials=20)
     assert len(calls) == before
     assert again["overrides"].tolist() == frame["overrides"].tolist()
     text = search_page(frame, TEXTS, "soup-nlp bench search")
