@@ -72,16 +72,6 @@ def test_the_check_of_names_can_fail():
     assert "1-rays" in headings("# Title\n### 1. Rays\n```text\n# none\n```")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=ids)
-def test_files_that_are_named_exist(page):
-    text = page.read_text(encoding="utf-8")
-    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
-    for name in re.findall(
-        r"`((?:soup_nlp|tests|results|benchmarks|docs|problems)/[\w./]+)`", prose
-    ):
-        assert (ROOT / name).exists(), name
-
-
 def keys(model: type[BaseModel], prefix: str = "") -> set[str]:
     """Every key of a problem file, and its sections."""
     out = set()
@@ -92,21 +82,6 @@ def keys(model: type[BaseModel], prefix: str = "") -> set[str]:
     return out
 
 
-SECTIONS = "segmentation|flow|start|energy|formulation|solver|refine|expected|output"
-
-
-@pytest.mark.parametrize("page", PAGES, ids=ids)
-def test_keys_that_are_named_exist(page):
-    known = keys(Problem)
-    assert "energy.weights.orient" in known
-    text = page.read_text(encoding="utf-8")
-    for key in re.findall(rf"`((?:{SECTIONS})\.[a-z_.]+)(?=[`:= ])", text):
-        # a picture flow.png is none
-        assert key in known or key.endswith(".png"), key
-    for key in re.findall(rf"--set ((?:{SECTIONS})\.[a-z_.]+)=", text):
-        assert key in known, key
-
-
 def commands() -> set[str]:
     """Every command and subcommand of the command line."""
     group = typer.main.get_command(app)
@@ -114,11 +89,22 @@ def commands() -> set[str]:
     return out | {f"bench {name}" for name in group.commands["bench"].commands}
 
 
+SECTIONS = "segmentation|flow|start|energy|formulation|solver|refine|expected|output"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=ids)
-def test_commands_that_are_named_exist(page):
+def test_files_keys_and_commands_that_are_named_exist(page):
+    text = page.read_text(encoding="utf-8")
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    for name in re.findall(r"`((?:soup_nlp|tests|results|docs|problems)/[\w./]+)`", prose):
+        assert (ROOT / name).exists(), name
+    known = keys(Problem)
+    assert "energy.weights.orient" in known
+    for key in re.findall(rf"(?:`|--set )((?:{SECTIONS})\.[a-z_.]+)(?=[`:= ])", text):
+        # a picture flow.png is none
+        assert key in known or key.endswith(".png"), key
     known = commands()
     assert {"solve", "bench speed"} <= known
-    text = page.read_text(encoding="utf-8")
     for command in re.findall(r"soup-nlp (bench [a-z][a-z-]+|[a-z]+)\b", text):
         assert command in known, command
 

@@ -1,13 +1,12 @@
 """Declared studies and departures of the paper's page, and the numbers that the paper prints."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
 from soup_nlp.bench.study import Overrides
-from soup_nlp.config.presets import overrides_of
+from soup_nlp.config.presets import as_override, overrides_of
 from soup_nlp.config.problem import make_problem
 
 SOURCE = "Superpixel Soup (Kumar, Dai, Li, TPAMI), table of the performance comparison"
@@ -127,9 +126,7 @@ def default(key: str) -> Any:
 
 
 def _defaults(*keys: str) -> Overrides:
-    values = {key: default(key) for key in keys}
-    texts = {k: ".inf" if v == float("inf") else json.dumps(v) for k, v in values.items()}
-    return tuple(f"{key}={text}" for key, text in texts.items())
+    return tuple(as_override(key, default(key)) for key in keys)
 
 
 _IN_PIXELS = (

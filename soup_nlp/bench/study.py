@@ -128,13 +128,9 @@ def measure_cells(
     path: Path,
     measure_rows: MeasureRows = measure_all,
 ) -> pd.DataFrame:
-    """Measure cells and return the frame of their rows.
+    """The frame of the rows of cells, which a JSON-lines file holds or which are measured.
 
-    Args:
-        cells: Cells, without duplicates.
-        measure: Makes the row of a cell.
-        path: JSON-lines file of rows.
-        measure_rows: `storage.rows.measure_all` with its options.
+    `measure_rows` is `storage.rows.measure_all` with its options.
     """
     return frame_of(measure_rows([cell.job(measure) for cell in cells], path))
 
@@ -145,11 +141,6 @@ def frame_of(rows: Sequence[Row]) -> pd.DataFrame:
     `mre` and `constant` are the mean relative errors of the solution and of a constant depth.
     """
     frame = pd.json_normalize(list(rows))
-    # columns that every reader expects come first, and are always there
-    expected = ["ok", "error", "code", "cpu_seconds"]
-    frame = frame.reindex(columns=list(dict.fromkeys([*expected, *frame.columns])))
-    if "pair" not in frame:
-        return frame
     suites = frame.groupby("pair")["suite"].transform("nunique")
     name = np.where(suites > 1, frame["suite"] + " " + frame["pair"], frame["pair"])
     frame["title"] = [f"{pair}, {flow}" for pair, flow in zip(name, frame["flow"], strict=True)]

@@ -54,10 +54,7 @@ def _run(
     Args:
         page: The page; its rows are in a .jsonl beside it.
         measured: Measures the rows into a file and returns their frame.
-        write: Writes the page of a frame, and its pictures beside it.
-        quiet: Print no progress.
-        overwrite: Also over files of the user.
-        files: Further files that `write` may write.
+        write: Writes the page of a frame, and further `files` beside it.
         line: Text of a row for the progress line.
         running: Further options of `measure_all`.
     """

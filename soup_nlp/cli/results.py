@@ -35,7 +35,7 @@ from soup_nlp.sequence.folder import (
 )
 from soup_nlp.sequence.frames import depth_files
 from soup_nlp.sequence.score import score, score_lines
-from soup_nlp.storage.files import is_file, is_folder
+from soup_nlp.storage.files import is_folder
 
 
 def check(
@@ -45,13 +45,7 @@ def check(
     ] = None,
 ) -> int:
     """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
-    if is_file(folder) and folder.suffix != ".sol":
-        raise DataError(
-            "nothing that can be checked",
-            where=folder,
-            expected="the folder of a result, an export's answer (.sol)",
-        )
-    elif is_folder(folder) or folder.suffix != ".sol":
+    if is_folder(folder) or folder.suffix != ".sol":
         report = check_chain(folder) if is_chain(folder) else check_folder(folder)
         print(report)
         good, claim = report.ok, "claim"

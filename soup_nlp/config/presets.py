@@ -108,8 +108,8 @@ def leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def overrides_of(name: str) -> tuple[str, ...]:
-    """The options of a preset as `a.b=value`, as `--set` takes them."""
-    return tuple(f"{key}={_text(value)}" for key, value in leaves(PRESETS[name]))
+    """The options of a preset as `--set` takes them."""
+    return tuple(as_override(key, value) for key, value in leaves(PRESETS[name]))
 
 
 def dump_preset(name: str) -> str:
@@ -117,5 +117,6 @@ def dump_preset(name: str) -> str:
     return yaml.safe_dump(PRESETS[name], sort_keys=False)
 
 
-def _text(value: Any) -> str:
-    return ".inf" if value == _INF else json.dumps(value)
+def as_override(key: str, value: Any) -> str:
+    """An option as `a.b=value`, as `--set` takes it."""
+    return f"{key}={'.inf' if value == _INF else json.dumps(value)}"

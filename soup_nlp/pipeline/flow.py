@@ -26,11 +26,7 @@ def with_flow(
 ) -> tuple[Pair, Pair | None]:
     """A pair with its flow, and that pair without a still layer before the scene, if it has one.
 
-    Args:
-        problem: The merged problem.
-        full: The pair at its own size.
-        pair: The pair at the size that is solved.
-        log: Called with a line if there is such a layer.
+    `full` is the pair at its own size; `log` is called with a line if there is such a layer.
     """
     flow = pair.flow
     if flow is None and pair is not full and problem.flow.is_file():

@@ -147,13 +147,7 @@ def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
 
 
 def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> Run:
-    """Reconstruct and score a solution: a whole run except its times.
-
-    Args:
-        case: The problem before the solve.
-        solution: Result of the constrained NLP.
-        refined: Result of the refinement, if there is one.
-    """
+    """Reconstruct and score a solution and its refinement: a whole run except its times."""
     pair, labels = case.pair, case.segmentation.labels
     size = pair.image_next.shape[0], pair.image_next.shape[1]
 

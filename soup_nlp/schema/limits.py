@@ -22,13 +22,9 @@ LEAST, MOST = 1e-9, 1e9
 
 
 def check_image_size(width: int, height: int, what: str, where: object) -> None:
-    """Raise DataError unless an image of this size is within the limits.
+    """Raise DataError unless an image of `width` x `height` pixels is within the limits.
 
-    Args:
-        width: Columns, pixels.
-        height: Rows, pixels.
-        what: Name of the image for the message.
-        where: File or array of the image.
+    `what` and `where` name the image and its file or array in the message.
     """
     size = f"{width} x {height} (width x height)"
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):

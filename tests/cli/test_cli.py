@@ -169,7 +169,7 @@ def test_little_to_see_is_a_result(flow, most, own, images, tmp_path):
         ("chain scene:stret", "did you mean street"),
         ("chain scene:street --set solver.maxiter=3", "did you mean max_iter"),
         ("check missing", "summary.json is missing"),
-        (f"check {__file__}", "nothing that can be checked"),
+        (f"check {__file__}", "test_cli.py/summary.json"),
     ],
 )
 def test_arguments_that_are_no_pair_and_no_result_are_refused(

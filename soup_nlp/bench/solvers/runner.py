@@ -157,13 +157,7 @@ def run_row(make: Callable[[], Task], label: Label, solver: str, folder: Path) -
     """Run a solver in a process of its own, verify its answer, and make the row.
 
     An exception, of `make` for example, becomes a row with "error", which no later run takes as
-    measured.
-
-    Args:
-        make: Makes the task.
-        label: Entries that identify the task, and "energy_limit".
-        solver: Name of the solver.
-        folder: Empty scratch folder.
+    measured. `label` has the entries that identify the task, and "energy_limit"; `folder` is empty.
     """
     row: Row = {
         **label,
