@@ -1,4 +1,4 @@
-"""Ground plane: superpixels below it are raised, and regions that float above it are lowered.
+"""Ground plane: what stands on it, lies below it or floats above it.
 
 A superpixel without usable flow (it leaves the image, is dark or moves too fast) borrows its depth
 from its neighbours, and a component without a known support is scaled by its outline. Both may come
@@ -8,6 +8,9 @@ which almost nothing lies bounds the depth of everything seen below the horizon.
 The camera's motion also explains an object that moves along the epipolar lines, such as an oncoming
 car, but at a depth that is too small. Such an object floats: the ground that is visible along its
 lower border is far behind it.
+
+In a traffic jam a group of vehicles may be larger than the road. The static scene is then known by
+what stands on it, and by its level ground.
 """
 
 from dataclasses import replace
@@ -53,8 +56,8 @@ depth: a larger one may be a table, which does not stand on the floor below its 
 MOST_CLIMB = 0.1
 """Largest share of its displacement that is across the ground, of what moves along it. Vehicles
 have up to 0.07, boxes that swing and limbs 0.22 to 0.44."""
-IN_FRONT, VISIBLE = 0.6, 0.6
-"""Least share of its outline behind a region that floats, and of ground along a lower border."""
+VISIBLE = 0.6
+"""Least share of ground along the lower border of a region."""
 FACES_DOWN = 0.7
 """Cosine between the normal of a superpixel and the vertical downwards from which it fills the gap
 between a region and the ground below: it contains pixels of both."""
@@ -152,7 +155,6 @@ class Region(NamedTuple):
         ground: Log ratio of the depth of the plane of the ground to that of the region, along the
             lower border.
         step: The same ratio with the depth of the superpixels on the ground there.
-        behind: Share of the outline across which the depth grows by more than `STEP`.
         climb: Share of its displacement in the scene that is across the ground, at the depth of the
             ground.
     """
@@ -160,7 +162,6 @@ class Region(NamedTuple):
     members: Mask
     ground: float
     step: float
-    behind: float
     climb: float
 
 
@@ -199,8 +200,8 @@ def regions(
     fills = down[seg.pairs[across].T.ravel()]
     out = []
     for c in range(1, int(region.max()) + 1):
-        mine, edge = region == c, around.component == c
-        low = edge & around.below
+        mine = region == c
+        low = (around.component == c) & around.below
         on = low & on_ground[around.neighbour]
         visible = on.any() and around.weight[on].sum() >= VISIBLE * around.weight[low].sum()
         if mine.sum() < FEWEST or not visible:
@@ -212,25 +213,24 @@ def regions(
         own = level + np.log(np.median(mu[body])) if body.any() else rise
         values = np.where(fills, own, rise), gap
         above, off = (quantile(v[on], around.weight[on], GROUND) for v in values)
-        behind = around.contact[edge & (gap > STEP)].sum() / around.contact[edge].sum()
         point, t = (np.exp(above) * v[mine] for v in (soup.points(ray), soup.translation))
         moved = np.einsum("nij,nj->ni", soup.R[mine], point) + t - soup.translation[first]
         way = np.median(moved @ soup.R[first] - point, axis=0)
         climb = abs(way @ plane) / max(np.linalg.norm(way) * np.linalg.norm(plane), 1e-12)
-        out.append(Region(mine, above, off, float(behind), float(climb)))
+        out.append(Region(mine, above, off, float(climb)))
     return out
 
 
 def floating(flow: FlowFit, soup: Soup, floor: Float, component: Int) -> list[Region]:
     """The regions that float above the ground; the arguments are those of `regions`.
 
-    A region floats if it is in front of most of its surroundings, the ground along its lower border
-    is clearly farther, and it moves along the ground there: what hangs in the air does not.
+    A region floats if the ground along its lower border is clearly farther, and it moves along the
+    ground there: what hangs in the air does not.
     """
     return [
         r
         for r in regions(flow, soup, floor, component, (1 - BELOW, RISES))
-        if r.climb < MOST_CLIMB and r.behind > IN_FRONT and r.ground > FLOATS and r.step > STEP
+        if r.climb < MOST_CLIMB and r.ground > FLOATS and r.step > STEP
     ]
 
 
@@ -287,3 +287,40 @@ def on_ground(
         component[region.members] = component.max() + 1
         tie[region.members] = TIES.index("contact below")
     return replace(soup, lam=lam), numbered(component), tie, floor
+
+
+def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Mask) -> Int:
+    """(N,) indices of the components (N,), that of the static scene first, see `SCENE`.
+
+    The scene is the largest component. In a traffic jam that may be a group of vehicles: if it
+    stands on a component with a level ground that stands on nothing, that one is the scene.
+
+    Args:
+        flow: The flow of every superpixel.
+        soup: Planes, every motion in its own scale.
+        reliable: (N,) True where the depth is reliable.
+        label: (N,) index of the component.
+        fixed: (N,) True in components that are fixed in the image.
+    """
+    scene, image = int(np.argmax(np.bincount(label, ~fixed))), label[flow.seg.labels]
+    below = stands_on(image, scene)
+    own = reliable & ~fixed & (label == below)
+    mu = 1 / soup.depth_at(flow.views.anchor)
+    if own.any() and stands_on(image, below) < 0 and ground(flow, mu, own).any():
+        scene = below
+    return numbered(np.where(label == scene, -1, label))
+
+
+def stands_on(image: Int, component: int) -> int:
+    """The component below the lower end of another one on most of its width; -1 for the border.
+
+    Args:
+        image: (H, W) component of every pixel.
+        component: Index of the one that stands on it.
+    """
+    mine = image == component
+    seen, under = mine.any(axis=0), len(image) - np.argmax(mine[::-1], axis=0)
+    border = seen & (under == len(image))
+    columns = np.flatnonzero(seen & ~border)
+    count = np.bincount(image[under[columns], columns], minlength=1)
+    return -1 if border.sum() >= count.max() else int(np.argmax(count))

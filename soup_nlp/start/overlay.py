@@ -7,12 +7,10 @@ one, to infinity.
 """
 
 import numpy as np
-from scipy.spatial import Delaunay
 
 from soup_nlp.arrays import Float, Mask
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.start.choice import PIECE_SIZE, dominant
-from soup_nlp.start.components import connected_labels, connected_pieces
+from soup_nlp.start.components import connected_labels
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.ground import BELOW, ground
 from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
@@ -50,8 +48,8 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     continuous = flow.jump < flow.options.discontinuity_px
     piece = connected_labels(moves[seg.pairs].all(axis=1) & continuous, seg)
     count, still_count = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
-    core = may & ((still_count >= PIECE_SIZE) & (still_count >= LEAST_SHARE * count))[piece]
-    return core | (moves & towards_border(core, seg)), shift
+    mostly = (still_count >= PIECE_SIZE) & (still_count >= LEAST_SHARE * count)
+    return may & mostly[piece], shift
 
 
 def _error_under(flow: FlowFit, camera: Motion, reliable: Mask) -> Float:
@@ -67,33 +65,3 @@ def _error_under(flow: FlowFit, camera: Motion, reliable: Mask) -> Float:
     least = (1 - BELOW) * floor
     moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t
     return np.where(mu < least, np.maximum(error, views.distance(moved)), error)
-
-
-def towards_border(core: Mask, seg: Segmentation) -> Mask:
-    """(N,) True between the image border and the regions of `core` that touch it.
-
-    A bonnet reflects moving things, so that only parts of it stand still. The others lie in the
-    convex hull of the still parts and the border, for each side of the image by itself.
-
-    Args:
-        core: (N,) True where the image certainly stands still.
-        seg: Superpixels and graphs.
-    """
-    height, width = seg.labels.shape
-    region = connected_pieces(core, seg)
-    x, y = seg.anchors.T
-    left, top, right, bottom = away = np.stack([x, y, width - 1 - x, height - 1 - y])
-    rows, columns = seg.labels, seg.labels.T
-    sides = (columns[0], y, left), (rows[0], x, top), (columns[-1], y, right), (rows[-1], x, bottom)
-    inside = np.zeros(len(seg), bool)
-    for line, along, depth in sides:
-        reach = core & (depth == away.min(axis=0)) & np.isin(region, region[line[core[line]]])
-        if reach.sum() < PIECE_SIZE:
-            continue
-        position = np.column_stack([along, depth])
-        # joggled, because the points may lie on one line
-        hull = Delaunay(
-            np.concatenate([position[reach], position[reach] * [1, 0]]), qhull_options="QJ"
-        )
-        inside |= hull.find_simplex(position) >= 0
-    return inside

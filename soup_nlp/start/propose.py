@@ -25,12 +25,11 @@ from soup_nlp.start.components import (
     numbered,
 )
 from soup_nlp.start.epipolar import Motion, stacked
-from soup_nlp.start.ground import on_ground
+from soup_nlp.start.ground import on_ground, scene_first
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import SMALL, earned, gather, unexplained, unmoved
-from soup_nlp.start.overlay import STILL_PX, fixed_to_camera
+from soup_nlp.start.overlay import fixed_to_camera
 from soup_nlp.start.pace import nearer_where_fast, order_in_front
-from soup_nlp.start.scene import scene_first
 from soup_nlp.start.settle import settle
 from soup_nlp.start.views import LEAST_PARALLAX_PX, USABLE, FlowFit, Views
 
@@ -191,7 +190,7 @@ def propose(flow: FlowFit) -> Start:
         grounded=weak & (floor > 0),
         bends=bends,
         unexplained=jumping | unexplained(rigid, error, component, noise),
-        wrong=(wrong | fixed & (shift > STILL_PX)) & ~bends,
+        wrong=wrong & ~bends,
         noise=noise,
         order=order_in_front(flow, soup, component, tie),
     )
@@ -209,9 +208,6 @@ def _with_depth(flow: FlowFit, choice: Choice, wrong: Mask) -> tuple[Soup, Mask]
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
     weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | (fit.cost[:, 0] > CLIP) | flow.poor | wrong
     weak |= views.weight.sum(axis=1) < 2.0
-    if weak.all():
-        # where all parallax is little, it is used as long as it exceeds rounding
-        weak = ~np.isfinite(mu) | (mu <= 0) | (parallax < 0.02)
     if weak.all():
         # no depth is known: all depths are one, with translations that move the image as before
         length = np.where(mu > 0, mu, 0.0)

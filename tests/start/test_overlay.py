@@ -7,7 +7,6 @@ from helpers_start import squares
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.start.components import FIXED
-from soup_nlp.start.overlay import towards_border
 from soup_nlp.start.propose import propose
 from soup_nlp.start.views import FlowFit
 
@@ -93,13 +92,3 @@ def test_what_moves_or_is_far_is_not_fixed(seg, what):
     else:
         flow[50:80, 50:100] = [3.0, -2.0]
     assert not (start_of(seg, flow).tie == FIXED).any()
-
-
-def test_still_parts_reach_to_the_border(seg):
-    x, y = seg.anchors.T
-    core = (y > 90) & ((x < 40) | (x > 110)) & (x > 15) & (x < 145)
-    inside = towards_border(core, seg)
-    assert inside[(y > 100) & (x > 30) & (x < 130)].all()
-    assert not inside[y < 80].any()
-    # a region that does not touch the border is not extended
-    assert not towards_border((np.abs(y - 60) < 12) & (np.abs(x - 80) < 20), seg).any()
