@@ -63,7 +63,6 @@ def solve_trws(
     gap: float = 1e-6,
     stagnation: float = 1e-7,
     patience: int = 10,
-    dtype: type | np.dtype = np.float64,
     init_labels: np.ndarray | None = None,
     callback: Callback | None = None,
 ) -> TRWSResult:
@@ -72,14 +71,14 @@ def solve_trws(
     Args:
         unary: (N, L) costs. A cost of +inf forbids a label; every node needs a finite one.
         edges: (E, 2) node numbers.
-        pairwise: (E, L, L) finite tables, axis 1 for ``edges[e, 0]``. A C-contiguous array of the
-            working type is read in place: it must not change during the call.
+        pairwise: (E, L, L) finite tables, axis 1 for ``edges[e, 0]``. Their type is the working
+            type: float64, or float32 for half the memory; the bound is then exact to that rounding.
+            They are read in place and must not change during the call.
         max_iter: Most iterations.
         gap: Stop once best energy - bound <= ``gap * max(1, |best energy|)``; negative: never.
         stagnation: Stop once, over ``patience`` iterations, the best energy did not fall and the
             bound rose by at most ``stagnation * max(1, |bound|)``; negative: never.
         patience: See ``stagnation``.
-        dtype: float64, or float32 for half the memory; the bound is then exact to that rounding.
         init_labels: (N,) labels whose energy the result does not exceed; they guide no message.
         callback: Called after every iteration as ``callback(iteration, bound, energy, best
             energy)``, numbers of the working type; a true return value, or a KeyboardInterrupt at
@@ -89,9 +88,7 @@ def solve_trws(
         ModelError: A cost is not finite in the working type.
     """
     costs, begin = np.asarray(unary, np.float64), init_labels
-    with np.errstate(over="ignore"):
-        table = np.ascontiguousarray(pairwise, dtype)
-    solver = _Passes(costs, plan_levels(colours(len(costs), edges), edges), table)
+    solver = _Passes(costs, plan_levels(colours(len(costs), edges), edges), pairwise)
     first = math.inf if begin is None else mrf_energy(begin, unary, edges, pairwise)
     best = (first, costs.argmin(axis=1) if begin is None else begin, 0)
     rows: list[tuple[float, float, float]] = []

@@ -257,7 +257,6 @@ class Rounds:
             pairwise,
             max_iter=TRWS_ITERATIONS,
             gap=TRWS_GAP,
-            dtype=pairwise.dtype,
             init_labels=np.zeros(len(unary), np.int64),
             callback=partial(follow, mark),
         )

@@ -137,9 +137,7 @@ def fit_robustly(
 def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
     """Rotation of the turn that explains a flow best, and (N,) mean error of that turn, pixels.
 
-    Args:
-        views: The flow.
-        size: Number of parameters of `turned` that are free.
+    The first `size` parameters of `turned` are free.
     """
     ray, target, weight, _ = views.matches(FIT_PIXELS)
     scale = np.sqrt(weight)[:, None] * views.focal

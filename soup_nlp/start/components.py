@@ -206,12 +206,8 @@ def depth_from_inside(flow: FlowFit, soup: Soup, label: Int) -> Float:
 
     The flow is blurred across an outline, which falsifies the planes of the superpixels along it.
     The depth is therefore the median over their inner neighbours, whose planes are extended to the
-    boundary; without inner neighbours the superpixel's own plane is used.
-
-    Args:
-        flow: The flow of every superpixel.
-        soup: Planes.
-        label: (N,) index of the component.
+    boundary; without inner neighbours the superpixel's own plane is used. `label` (N,) gives the
+    components.
     """
     seg, across = flow.seg, flow.seg.across(label)
     pairs, ray = seg.pairs[across], flow.middle[across]

@@ -113,15 +113,8 @@ def _shaped(
 ) -> tuple[Soup, Mask]:
     """Soup with the planes and the motion of a rigid component by flow and prior.
 
-    Where any depth explains the flow, it takes the motion that fits the depths of the prior.
-
-    Args:
-        seen: The start and its flow.
-        soup: Planes and motions so far.
-        c: The component.
-        prior: (N,) log depth.
-        sigma: Its standard deviation.
-        determined: Whether the flow determines the depth of the component.
+    Unless the flow has determined the depth of component `c`, it takes the motion that fits the log
+    depth (N,) of the prior, whose standard deviation is sigma.
 
     Returns:
         The soup, and (N,) True for members of the component whose depth the flow determines.
@@ -158,13 +151,8 @@ def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:
 def _local(seg: Segmentation, known: Mask, residual: Float, sigma: float) -> tuple[Float, Float]:
     """(N,) correction of a prior's log depth by known depths near it, and its standard deviation.
 
-    A Gaussian window averages the residuals and their squares, beside `HELD` of none and sigma^2.
-
-    Args:
-        seg: Superpixels.
-        known: (N,) True where the depth is known.
-        residual: (N,) log ratio of known depths to the prior's.
-        sigma: Standard deviation in the whole image.
+    A Gaussian window averages the residuals (N,), log ratios of depths that are known (N,) to the
+    prior's, and their squares, beside `HELD` of none and sigma^2, that of the whole image.
     """
     area = seg.labels.size
     squared = cdist(seg.anchors, seg.anchors[known], "sqeuclidean")

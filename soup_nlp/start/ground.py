@@ -68,12 +68,8 @@ TRIALS = 500
 def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
     """(N,) inverse depth of the ground at the anchors; 0 above the horizon and without a ground.
 
-    None is sought unless the options `upright` and `ground` are set.
-
-    Args:
-        flow: The flow of every superpixel.
-        mu: (N,) inverse depth at the anchors.
-        reliable: (N,) True where the depth is reliable.
+    It follows from the inverse depth mu (N,) of the anchors where that is reliable (N,). None is
+    sought unless the options `upright` and `ground` are set.
     """
     none, at = np.zeros(len(mu)), np.flatnonzero(reliable)
     ray, weight, o = flow.views.anchor, flow.seg.sizes.astype(float), flow.options
@@ -312,11 +308,9 @@ def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Ma
 
 
 def stands_on(image: Int, component: int) -> int:
-    """The component below the lower end of another one on most of its width; -1 for the border.
+    """The component below the lower end of another one in an image (H, W) of components.
 
-    Args:
-        image: (H, W) component of every pixel.
-        component: Index of the one that stands on it.
+    It is below on most of the width; -1 for the border.
     """
     mine = image == component
     seen, under = mine.any(axis=0), len(image) - np.argmax(mine[::-1], axis=0)

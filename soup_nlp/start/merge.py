@@ -130,13 +130,8 @@ def unexplained(flow: FlowFit, error: Float, component: Int, noise: float) -> Ma
     """(N,) True in pieces of components (N,) whose flow is affine, but not that of the motion.
 
     They may move by themselves, along the epipolar lines: then the depth that fits best is wrong.
-    Superpixels with the flows of two surfaces are not affine.
-
-    Args:
-        flow: The flow of every superpixel.
-        error: (N,) error under the motion of the component, pixels.
-        component: (N,) rigid component of every superpixel.
-        noise: Noise of the flow, pixels.
+    Superpixels with the flows of two surfaces are not affine. The errors (N,) under the motions of
+    the components and the noise of the flow are in pixels.
     """
     bad = error - flow.residual > UNEXPLAINED * noise
     bad &= flow.views.weight.mean(axis=1) > LEAST_CONFIDENCE

@@ -61,10 +61,6 @@ def covering(pair: Pair, flow: FlowFit) -> Float:
         v < -1 px:  c_k - c_i   with  c = mean over y in G of min over x in S |I_next(y) - I_ref(x)|
 
     where G is the area of the next frame between the boundary moved by u_i and moved by u_k.
-
-    Args:
-        pair: Images and cameras.
-        flow: The flow of its superpixels.
     """
     seg, out = flow.seg, np.zeros(len(flow.seg.pairs))
     rows = np.flatnonzero(flow.jump >= CLOSING_PX)

@@ -64,13 +64,7 @@ def order_in_front(flow: FlowFit, soup: Soup, label: Int, tie: Int) -> Float | N
     """(P,) order along the outlines of components that contact makes too fast, see `Start.order`.
 
     It holds their steps of depth, which the energy would close otherwise, since nothing else gives
-    them a scale. None without such components.
-
-    Args:
-        flow: The flow of every superpixel.
-        soup: Start, its components placed.
-        label: (N,) index of the component.
-        tie: (N,) origin of its scale, an index of `TIES`.
+    them a scale. None without such components among those of `label` (N,), with ties (N,).
     """
     pairs, near = flow.seg.pairs, (tie == TOO_FAST)[flow.seg.pairs]
     if not near.any():
@@ -86,12 +80,8 @@ def without_support(flow: FlowFit, label: Int, fixed: Mask) -> tuple[Int, Mask]:
 
     The lower end is hidden if the lower image border cuts it off, or if the superpixels below it
     have no flow, so that they may belong to the component. Components that touch are one group,
-    since a person may be cut into pieces; the scene, and those fixed in the image, are alone.
-
-    Args:
-        flow: The flow of every superpixel.
-        label: (N,) index of the component.
-        fixed: (N,) True in components that are fixed in the image.
+    since a person may be cut into pieces; the scene, and those `fixed` (N,) in the image, are
+    alone.
     """
     seg, separate = flow.seg, fixed | (label == SCENE)
     ends = label[seg.pairs]

@@ -153,13 +153,7 @@ class Seen(NamedTuple):
         """Soup with planes and motion of a rigid component by its flow, near a prior's depths.
 
         Of the motions that explain the flow about as well, it has the one that agrees with the
-        prior.
-
-        Args:
-            soup: Planes and motions.
-            c: The component.
-            prior: (N,) log depth.
-            sigma: Its standard deviation.
+        log depth (N,) of the prior, whose standard deviation is sigma.
 
         Returns:
             The soup, and (N,) True for members of the component whose depth the flow determines.

@@ -199,10 +199,7 @@ def propose(flow: FlowFit) -> Start:
 def _with_depth(flow: FlowFit, choice: Choice, wrong: Mask) -> tuple[Soup, Mask]:
     """Planes under the chosen motions, and (N,) True where they are borrowed from neighbours.
 
-    Args:
-        flow: The flow of every superpixel.
-        choice: Motion and plane of every superpixel.
-        wrong: (N,) True where the motion does not explain the flow.
+    Where the motion does not explain the flow, `wrong` (N,) is True.
     """
     fit, parallax, views = choice.fit, choice.parallax, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]

@@ -7,7 +7,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import yaml
 from helpers_files import sets
 
 from soup_nlp.cli.main import main
@@ -83,16 +82,6 @@ def test_the_verdict_tells_energy_gap_and_both_depths(result):
     told = " ".join(text.split())
     assert f"the images contradict the flow at {r['contradicted']} superpixels" in told
     assert (result / "log.txt").read_text().count("refine ") >= 3
-
-
-def test_without_refinement_the_nlps_soup_is_delivered(tmp_path):
-    code, summary = solve(tmp_path, "--no-refine")
-    assert code == 0
-    assert summary["refinement"] is None
-    assert summary["energy"]["nlp"] == summary["energy"]["solution"]
-    assert "nlp" not in summary["metrics"]
-    assert yaml.safe_load((tmp_path / "config.yaml").read_text())["refine"]["enabled"] is False
-    assert check_folder(tmp_path).ok
 
 
 @pytest.fixture(scope="module")
