@@ -59,24 +59,23 @@ class PriorOptions(Section):
 
         Raises:
             ConfigError: see `require_prior`.
-            DataError: the file is damaged, or its map has another shape than the image.
+            DataError: see `pair_with_prior`.
         """
         self.require_prior(pair.depth_prior is not None)
         if self.source is None:
             return pair
         name = str(path(self.source))
         network = is_network(name)
-        prior = prior_of(learned_map(name, pair.image_ref) if network else name)
-        return replace(pair, depth_prior=resized_prior(prior, pair, name))
+        return pair_with_prior(pair, learned_map(name, pair.image_ref) if network else name, name)
 
 
-def resized_prior(prior: Float, pair: Pair, where: str) -> Float:
-    """A prior (H, W) resized to the reference image.
+def pair_with_prior(pair: Pair, source: object, where: str) -> Pair:
+    """The pair with a depth prior, a map (h, w) or its file, resized to the reference image.
 
     Raises:
-        DataError: its aspect ratio differs from that of the image, or nothing is known.
+        DataError: it is no map, its aspect ratio is not that of the image, or nothing is known.
     """
-    height, width = pair.size
+    prior, (height, width) = prior_of(source), pair.size
     if abs(np.log(prior.shape[1] * height / (prior.shape[0] * width))) > SAME_SHAPE:
         raise DataError(
             "depth prior and reference image differ in shape",
@@ -86,9 +85,9 @@ def resized_prior(prior: Float, pair: Pair, where: str) -> Float:
         )
     if not np.isfinite(prior).any():
         raise DataError("depth prior is unknown everywhere", where=where)
-    if prior.shape == pair.size:
-        return prior
-    return np.asarray(cv2.resize(prior, (width, height), interpolation=cv2.INTER_NEAREST_EXACT))
+    if prior.shape != pair.size:
+        prior = cv2.resize(prior, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+    return replace(pair, depth_prior=prior)
 
 
 Camera = Annotated[list[Finite], Field(min_length=4, max_length=4)]

@@ -19,11 +19,10 @@ from soup_nlp.config.problem import (
     make_problem,
     title,
 )
-from soup_nlp.data.accept import prior_of
 from soup_nlp.data.flow.consistency import check_flow
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.formats.cameras import check_cameras
-from soup_nlp.data.inputs import PriorOptions, pair_hash, resized_prior
+from soup_nlp.data.inputs import PriorOptions, pair_hash, pair_with_prior
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, StoppedError, expect
 from soup_nlp.evaluate.confidence import confidence
@@ -255,8 +254,7 @@ def solve_pair(
     """
     expect(pair, Pair, "pair", PAIR)
     if prior_ref is not None:
-        prior = resized_prior(prior_of(prior_ref), pair, "prior_ref")
-        pair = replace(pair, depth_prior=prior)
+        pair = pair_with_prior(pair, prior_ref, "prior_ref")
     images, names = (pair.image_ref, pair.image_next), ("K_ref", "K_next")
     check_cameras((pair.K_ref, pair.K_next), images, names, cropped)
     if pair.flow is not None:

@@ -9,7 +9,7 @@ from helpers_start import fitted, rendered
 
 import soup_nlp
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.inputs import PriorOptions, resized_prior
+from soup_nlp.data.inputs import PriorOptions, pair_with_prior
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.graph import Segmentation
@@ -280,9 +280,9 @@ def test_a_prior_of_another_size_is_brought_to_the_image(tmp_path, swing):
 
 def test_a_prior_that_cannot_be_one_is_refused(swing):
     with pytest.raises(DataError, match="differ in shape"):
-        resized_prior(swing.depth[:, :100], swing.pair, "a file")
+        pair_with_prior(swing.pair, swing.depth[:, :100], "a file")
     with pytest.raises(DataError, match="unknown everywhere"):
-        resized_prior(np.full((24, 32), np.nan), swing.pair, "a file")
+        pair_with_prior(swing.pair, np.full((24, 32), np.nan), "a file")
     with pytest.raises(ConfigError, match="no source"):
         soup_nlp.solve_pair(swing.pair, depth_prior={"kind": "inverse"})
     with pytest.raises(DataError, match="wrong shape"):
