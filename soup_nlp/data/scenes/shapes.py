@@ -6,6 +6,7 @@ shape.
 """
 
 from abc import ABC, abstractmethod
+from functools import reduce
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,7 +46,7 @@ class Shape(ABC):
 
 def _first_hit(*roots: Float) -> Float:
     """The smallest root > NEAR of each ray; NaN and inf are misses."""
-    return np.minimum.reduce([np.where(root > NEAR, root, np.inf) for root in roots])
+    return reduce(np.minimum, [np.where(root > NEAR, root, np.inf) for root in roots])
 
 
 class Plane(Shape):
@@ -73,8 +74,8 @@ class Box(Shape):
             # one contiguous row for each axis is much faster than reducing over rows of three
             a, b = ((sign * self.half - origin)[:, None] / rays.T for sign in (-1, 1))
         # for a ray within a face (0/0), fmin and fmax use the other axes
-        enter = np.fmax.reduce(np.fmin(a, b))
-        leave = np.fmin.reduce(np.fmax(a, b))
+        enter = reduce(np.fmax, np.fmin(a, b))
+        leave = reduce(np.fmin, np.fmax(a, b))
         return np.where(enter <= leave, _first_hit(enter, leave), np.inf)
 
     def _face(self, points: Float) -> Int:
