@@ -44,24 +44,20 @@ def check_intrinsics(matrix: NDArray[Any], where: object) -> Float:
         DataError: it is not a finite, upper-triangular 3x3 matrix with positive focal lengths.
     """
     K = np.array(matrix, dtype=np.float64)
-    if K.shape != (3, 3):
-        raise DataError("intrinsics must be 3x3", where=where, found=K.shape, expected="(3, 3)")
-    if not np.isfinite(K).all():
-        raise DataError("intrinsics are not finite", where=where, found=K.tolist())
-    if not (K[0, 0] > 0 and K[1, 1] > 0):
+    if not (
+        K.shape == (3, 3)
+        and np.isfinite(K).all()
+        and (K.diagonal() > 0).all()
+        and (K[np.tril_indices(3, -1)] == 0).all()
+        and K[2, 2] == 1
+    ):
+        up = K.shape == (3, 3) and K[1, 1] < 0 < K[0, 0]
         raise DataError(
-            "focal lengths must be positive",
-            where=where,
-            found=f"fx {K[0, 0]:g}, fy {K[1, 1]:g}",
-            expected="fx > 0 and fy > 0, in pixels",
-            hint="of a camera whose y axis points up (ICL-NUIM), give fy without its sign",
-        )
-    if np.any(np.tril(K, -1)) or K[2, 2] != 1:
-        raise DataError(
-            "intrinsics must be upper triangular with K[2, 2] = 1",
+            "intrinsics are no camera matrix",
             where=where,
             found=K.tolist(),
-            expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]",
+            expected="finite numbers [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy",
+            hint="give fy without its sign, if the y axis points up (ICL-NUIM)" if up else None,
         )
     return K
 

@@ -241,10 +241,6 @@ def read_pfm(path: PathLike) -> Float:
     The sign of the scale in the header is the byte order; its magnitude is ignored.
     """
     content = read_bytes(path, "PFM file")
-    if content[:2] == b"PF":
-        raise DataError(
-            "PFM file is in colour", where=path, found="'PF'", expected="'Pf' (grey, one channel)"
-        )
     number = rb"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
     gap = rb"\s+(?:#[^\n]*\n\s*)*"
     pattern = gap.join([rb"Pf", rb"(-?\d+)", rb"(-?\d+)", number]) + rb"[ \t]*\r?\n"
@@ -255,7 +251,7 @@ def read_pfm(path: PathLike) -> Float:
             "PFM file has a damaged header",
             where=path,
             found=repr(content[:24]),
-            expected="'Pf', width height, scale (negative: little endian)",
+            expected="'Pf' (grey), width height, scale (negative: little endian)",
         )
     size = int(header.group(2)), int(header.group(1))
     order = "<" if scale < 0 else ">"
