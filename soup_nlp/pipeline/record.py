@@ -9,11 +9,11 @@ import numpy as np
 from soup_nlp.arrays import Float, FloatMap
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.pair import Pair
+from soup_nlp.data.working_size import full_depth
 from soup_nlp.evaluate.confidence import Confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.components import Components, find_components
-from soup_nlp.geometry.full_size import full_depth
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers_photos import load, photo, photos, said, texture
+from helpers_photos import load, photo, said, texture
 from PIL import Image, features
 
 from soup_nlp.config.problem import make_problem
@@ -29,7 +29,9 @@ MIDDLE = (47.5, 31.5)
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    return photos(tmp_path)
+    for k, name in enumerate("ab"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), texture(seed=k))
+    return tmp_path
 
 
 # --- bytes behind the end of a picture -----------------------------------------------------------

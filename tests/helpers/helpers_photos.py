@@ -42,10 +42,3 @@ def said(*args: object, **keys: object) -> tuple[Pair, str]:
         pair = load(*args, **keys)
     assert {w.category for w in caught} <= {DataWarning}
     return pair, "\n".join(str(w.message) for w in caught)
-
-
-def photos(folder: Path) -> Path:
-    """The folder with two pictures a.png and b.png."""
-    for k, name in enumerate("ab"):
-        cv2.imwrite(str(folder / f"{name}.png"), texture(seed=k))
-    return folder

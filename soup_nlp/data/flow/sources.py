@@ -139,9 +139,8 @@ class FlowOptions(Section):
         source = str(path(self.source)) if is_path(self.source) else self.source
         if self.backward or self.confidence:
             return self._with_confidence(pair, source, path)
-        if self.is_file() or source.startswith("truth"):
-            return resolve_flow(pair, source)
-        near = at_common_focal(pair)
+        given = self.is_file() or source.startswith("truth")
+        near = pair if given else at_common_focal(pair)
         flow = resolve_flow(near, source, self.consistency)
         if near is pair:
             return flow

@@ -7,9 +7,8 @@ import pytest
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.data.working_size import working_size
+from soup_nlp.data.working_size import full_depth, working_size
 from soup_nlp.geometry.camera import intrinsics, pixel_grid, project, rays
-from soup_nlp.geometry.full_size import full_depth
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.report.verdict import facts
