@@ -261,17 +261,14 @@ def test_png_round_trip(tmp_path):
         write_png(tmp_path / "no" / "a.png", rgb)
 
 
-def test_depth_png(tmp_path):
-    path = tmp_path / "d.png"
-    z = np.array([[1.0, 2.5, np.nan], [1e-9, 1e9, -1.0]])
-    assert write_clipped_depth_png16(path, z, 1000) == 1000.0
-    back = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e5])
+def test_depth_png(tmp_path, unit):
+    z = unit * np.array([[1.0, 2.5, np.nan], [1e-9, 1e9, -1.0]])
+    assert write_clipped_depth_png16(tmp_path / "d.png", z, 1000 / unit) == 1000 / unit
+    back = cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED)
     assert back.dtype == np.uint16
     np.testing.assert_array_equal(back, [[1000, 2500, 0], [1, 65535, 0]])
-
-
-@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e5])
-def test_depth_png_chooses_a_scale(tmp_path, unit):
+    # a scale of its own
     z = unit * np.random.default_rng(0).uniform(1, 10, (20, 30))
     scale = write_clipped_depth_png16(tmp_path / "d.png", z)
     back = cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED)
