@@ -72,10 +72,8 @@ def at_jumps(right: Mask, below: Mask) -> Mask:
     return out
 
 
-def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Int:
-    """(M, 3) triangles of pixels v W + u, counter-clockwise as the camera sees them.
-
-    Every cell of `step` pixels that no break of the surface crosses is split into two triangles.
+def whole_cells(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Mask:
+    """((H - 1) / step, (W - 1) / step) cells of `step` pixels that no break of the surface crosses.
 
     Args:
         right: (H, W - 1) whether the surface continues to the right, see `joined`.
@@ -85,7 +83,7 @@ def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Int:
     """
     height, width = keep.shape
     if min(height, width) <= step:
-        return np.zeros((0, 3), np.int64)
+        return np.zeros(((height - 1) // step, (width - 1) // step), bool)
 
     def full(mask: Mask, tall: int, wide: int) -> Mask:
         """(h, w) whether a mask is True in the whole tall x wide window of every cell."""
@@ -93,8 +91,15 @@ def triangles(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Int:
         return np.asarray(cells.all(axis=(2, 3)))
 
     whole = full(keep, step + 1, step + 1)
-    whole &= full(right, step + 1, step) & full(below, step, step + 1)
-    v, u = np.nonzero(whole)
+    return whole & full(right, step + 1, step) & full(below, step, step + 1)
+
+
+def triangles(cells: Mask, width: int, step: int = 1) -> Int:
+    """(M, 3) two triangles of every cell, counter-clockwise as the camera sees them.
+
+    A pixel has the number v `width` + u in an image of that width; see `whole_cells`.
+    """
+    v, u = np.nonzero(cells)
     a = (v * width + u) * step
     b, c = a + step, a + step * width
     d = c + step

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from soup_nlp.arrays import Float, Image, Int, Mask
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.motion import RigidMotion
-from soup_nlp.geometry.surface import triangles
+from soup_nlp.geometry.surface import triangles, whole_cells
 from soup_nlp.report.figures import write_png
 from soup_nlp.report.result import Result
 from soup_nlp.storage.files import PathLike, write_bytes, write_text
@@ -119,7 +119,7 @@ def surface_mesh(result: Result, frame: int) -> tuple[Float, Int, Float]:
     known = np.isfinite(points).all(axis=2) & (points[..., 2] > 0)
     height, width = known.shape
     step = int(np.ceil(np.sqrt(height * width / CELLS)))
-    faces = triangles(*result.surface, known, step)
+    faces = triangles(whole_cells(*result.surface, known, step), width, step)
     used, faces = np.unique(faces, return_inverse=True)
     pixels = np.stack([used % width, used // width], axis=1).astype(float)
     return points.reshape(-1, 3)[used], faces.reshape(-1, 3), pixels

@@ -18,7 +18,7 @@ from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import log, nearest
-from soup_nlp.geometry.surface import hidden, triangles
+from soup_nlp.geometry.surface import hidden, whole_cells
 from soup_nlp.report.colour import component_colours
 from soup_nlp.report.findings import ORIGINS, guess_line, limits
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
@@ -284,14 +284,7 @@ def _single(values: Float) -> NDArray[np.float32]:
 
 def surface_cells(result: Result, step: int) -> Mask:
     """(h - 1, w - 1) cells of four shown pixels without a jump of the depth."""
-    rec = result.reconstruction
-    height, width = rec.labels.shape
-    faces = triangles(*result.surface, np.isfinite(rec.depth_ref), step)
-    # every cell has two triangles; the first begins at its upper left pixel
-    v, u = np.divmod(faces[: len(faces) // 2, 0], width)
-    out = np.zeros(((height - 1) // step, (width - 1) // step), bool)
-    out[v // step, u // step] = True
-    return out
+    return whole_cells(*result.surface, np.isfinite(result.reconstruction.depth_ref), step)
 
 
 def _sigma(result: Result) -> NDArray[np.uint8]:

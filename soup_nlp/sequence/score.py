@@ -33,34 +33,24 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     true = {k: z for k, z in given if z is not None and MEDIAN.counts(z)}
     if not true:
         return None
-    depths, ratios = {k: chain.depth(k) for k in true}, []
-    for k, z in depths.items():
-        if z.shape != true[k].shape:
-            raise DataError(
-                "truth and frame differ in size",
-                where=f"frame {k}",
-                found=true[k].shape,
-                expected=z.shape,
-            )
-        compared = MEDIAN.mask(true[k]) & (z > 0)
-        ratios.append(true[k][compared] / z[compared])
+    depths = {k: chain.depth(k) for k in true}
+    separate = {k: depth_metrics(z, true[k]) for k, z in depths.items()}
+    compared = {k: MEDIAN.mask(true[k]) & (z > 0) for k, z in depths.items()}
+    ratios = [true[k][mask] / depths[k][mask] for k, mask in compared.items()]
     scale = float(np.median(np.concatenate(ratios)))
-    frames = []
-    for k, z in depths.items():
-        separate = depth_metrics(z, true[k])
-        common = depth_metrics(scale * z, true[k], UNSCALED)
-        frames.append(
-            {
-                "frame": k,
-                "mre_own_scale": separate.mre,
-                "mre_one_scale": common.mre,
-                "own_scale": separate.scale,
-                "coverage": separate.coverage,
-            }
-        )
+    frames = [
+        {
+            "frame": k,
+            "mre_own_scale": own.mre,
+            "mre_one_scale": depth_metrics(scale * depths[k], true[k], UNSCALED).mre,
+            "own_scale": own.scale,
+            "coverage": own.coverage,
+        }
+        for k, own in separate.items()
+    ]
     averaged = "mre_own_scale", "mre_one_scale"
     mre = {key: float(np.mean([f[key] for f in frames])) for key in averaged}
-    own_scale = {f["frame"]: f["own_scale"] for f in frames}
+    own_scale = {k: own.scale for k, own in separate.items()}
     # the true ratio is that of the pairs' own depths, without the scales of the chain
     ratio = chain.scales[1:] / chain.scales[:-1]
     links = [

@@ -1,4 +1,4 @@
-"""Files that readers are tested with, written by hand; a reader of PLY files; overrides."""
+"""Files that readers are tested with, written by hand; overrides."""
 
 import struct
 from collections.abc import Sequence
@@ -40,24 +40,6 @@ def write_kitti_flow(path: Path, flow: np.ndarray) -> None:
     code = np.rint(np.where(valid[..., None], flow, 0.0) * 64.0 + 2.0**15) * valid[..., None]
     bgr = np.dstack([valid, code[..., 1], code[..., 0]]).astype(np.uint16)
     put(path, cv2.imencode(".png", bgr)[1].tobytes())
-
-
-def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """(M, 3) positions, (M, 3) colours, and (M, 3) normals or None, after the file's own header."""
-    header, body = path.read_bytes().split(b"end_header\n", 1)
-    lines = [line.split() for line in header.decode("ascii").splitlines()]
-    lines = [line for line in lines if line[0] != "comment"]
-    assert lines[:2] == [["ply"], ["format", "binary_little_endian", "1.0"]]
-    assert lines[2][:2] == ["element", "vertex"]
-    types = {"float": "<f4", "uchar": "u1"}
-    table = np.frombuffer(body, [(name, types[kind]) for _, kind, name in lines[3:]])
-    assert len(table) == int(lines[2][2])
-
-    def columns(*names: str) -> np.ndarray:
-        return np.stack([table[name] for name in names], axis=1)
-
-    normals = columns("nx", "ny", "nz") if "nx" in table.dtype.names else None
-    return columns("x", "y", "z"), columns("red", "green", "blue"), normals
 
 
 def sets(text: str) -> list[str]:

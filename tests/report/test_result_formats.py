@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from helpers_files import read_ply
 from helpers_result import BOARD, BOARD_Z, CAMERA, WALL_Z, K, board, small_result
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -213,10 +212,7 @@ def test_unknown_points_of_a_map_are_dropped(tmp_path):
     xyz[1, 1, 0] = 1e300  # not a float32
     rgb = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
     assert write_ply(tmp_path / "a.ply", xyz, rgb) == 3
-    _, colours, _ = read_ply(tmp_path / "a.ply")
-    np.testing.assert_array_equal(colours[:, 0], [0, 6, 9])
-
-
-def test_a_cloud_without_points_is_a_file(tmp_path):
+    np.testing.assert_array_equal(trimesh.load(tmp_path / "a.ply").colors[:, 0], [0, 6, 9])
+    # a cloud without points is a file
     assert write_ply(tmp_path / "a.ply", np.zeros((0, 3)), np.zeros((0, 3), np.uint8)) == 0
-    assert read_ply(tmp_path / "a.ply")[0].shape == (0, 3)
+    assert (tmp_path / "a.ply").read_bytes().endswith(b"\nend_header\n")
