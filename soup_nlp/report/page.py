@@ -3,16 +3,18 @@
 import base64
 import json
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from html import escape
 from importlib.resources import files
+from io import BytesIO
 from string import Template
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL.Image import fromarray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.geometry.motion import RigidMotion
@@ -95,21 +97,22 @@ def packed(array: NDArray[Any]) -> str:
     return base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
 
 
-def encoded(image: Image, kind: str, options: Sequence[int] = (), most: int = SIDE) -> str:
+def encoded(image: Image, kind: str, most: int = SIDE, **options: Any) -> str:
     """A picture (H, W, 3) as a data URI.
 
     Args:
         image: The picture.
         kind: "jpeg", "png" or "webp".
-        options: Those of OpenCV's encoder.
         most: Largest side, pixels; larger pictures are resized.
+        options: Those of Pillow's encoder.
     """
     side = max(image.shape[:2])
     if side > most:
         size = [round(x * most / side) for x in image.shape[1::-1]]
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    _, data = cv2.imencode(f".{kind}", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), list(options))
-    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+    data = BytesIO()
+    fromarray(image).save(data, kind, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode('ascii')}"
 
 
 def _legend(picture: Picture) -> str:
@@ -146,11 +149,12 @@ def _css(colour: Any) -> str:
 
 def _figure(picture: Picture) -> str:
     """A picture with its title and legend in HTML; those with a legend are stored without loss."""
-    # a quality of WebP above 100 is lossless
-    kind, options = "webp", [cv2.IMWRITE_WEBP_QUALITY, 101]
     if picture.legend is None:
-        kind, options = "jpeg", [cv2.IMWRITE_JPEG_QUALITY, 90]
-    source, title = encoded(picture.image, kind, options), escape(picture.title)
+        source = encoded(picture.image, "jpeg", quality=90)
+    else:
+        # the least effort takes a fifth of the time; files are half as large again
+        source = encoded(picture.image, "webp", lossless=True, method=0, quality=50)
+    title = escape(picture.title)
     return (
         f'<figure><figcaption>{title}</figcaption><img data-name="{picture.name}" alt="{title}"'
         f' src="{source}">{_legend(picture)}</figure>'

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,11 +56,10 @@ def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
     pictures, (near, far) = depth_pictures(chain)
     # long sequences have smaller pictures
     width = WIDTH if len(chain) <= MANY else WIDTH // 2
-    quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     scene = _scene(chain)
     data = {
         "frames": [
-            [encoded(image, "jpeg", quality, width) for image in (chain.image(k), picture)]
+            [encoded(one, "jpeg", width, quality=QUALITY) for one in (chain.image(k), picture)]
             for k, picture in enumerate(pictures)
         ],
         "guess": [float(guess_of(chain, k).mean()) for k in range(len(chain))],
