@@ -233,6 +233,6 @@ def suffixes_of(nlp: NLP) -> tuple[dict[str, list[str]], list[Suffix]]:
     for group in nlp.groups:
         if group.kernel.name == "ridge":
             factor = np.ones(nlp.nx)
-            factor[group.table.index[:, 0]] = np.sqrt(group.table.data[:, 0])
+            factor[group.index[:, 0]] = np.sqrt(group.data[:, 0])
             out.append(Suffix("scaling_factor", "variables", factor))
     return kinds, out

@@ -56,7 +56,7 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
     stamped = []
     linear: list[tuple[Float, Int, Int]] = []
     for group in groups:
-        table, parts = group.table, split(group, theta)
+        parts = split(group, theta)
         template = make_template(parts.nonlinear, group, theta)
         for values in (*template.numbers.values(), parts.coefficient):
             if not np.isfinite(values).all():
@@ -65,16 +65,16 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
                     where=group.kernel.name,
                     hint="a kernel divides by a column that is 0 somewhere",
                 )
-        goal = np.full((group.size, int(parts.objective)), OBJECTIVE)
+        goal = np.full((len(group), int(parts.objective)), OBJECTIVE)
         if group.kernel.nc:
-            goal = np.concatenate([goal, table.rows], axis=1)
-        stamped.append((template, table.index, goal))
-        row, column = goal[:, parts.row], table.index[:, parts.column]
+            goal = np.concatenate([goal, group.rows], axis=1)
+        stamped.append((template, group.index, goal))
+        row, column = goal[:, parts.row], group.index[:, parts.column]
         linear.append((parts.coefficient.ravel(), row.ravel(), column.ravel()))
         for k in range(parts.nonlinear.numel()):
-            variables = table.index[:, parts.column[(parts.row == k) & ~parts.is_linear]]
+            variables = group.index[:, parts.column[(parts.row == k) & ~parts.is_linear]]
             curved = template.roots[k] is not None
-            constant = np.broadcast_to(template.constants[k], group.size)
+            constant = np.broadcast_to(template.constants[k], len(group))
             if parts.objective and k == 0:
                 in_objective[variables] = True
                 curved_objective |= curved
@@ -147,7 +147,7 @@ def split(group: Group, theta: Float) -> Split:
     Raises:
         ExportError: an operation has no opcode.
     """
-    kernel, table = group.kernel, group.table
+    kernel = group.kernel
     given = [part for part in (kernel.objective, kernel.constraints) if part is not None]
     out = ca.densify(ca.vertcat(*given))
     # before the split, since a piecewise constant part such as sign(a) has a zero derivative and
@@ -159,8 +159,8 @@ def split(group: Group, theta: Float) -> Split:
     entries = ca.vertcat(*jacobian.nonzeros()) if len(row) else ca.SX(0, 1)
     linear = ~np.asarray(ca.which_depends(entries, kernel.x, 1, True), bool)
     function = ca.Function("c", [kernel.x, kernel.row, kernel.theta], [entries])
-    shared = np.repeat(np.asarray(theta, float)[:, None], group.size, axis=1)
-    value = function.map(group.size)(np.zeros((kernel.nx, group.size)), table.data.T, shared)
+    shared = np.repeat(np.asarray(theta, float)[:, None], len(group), axis=1)
+    value = function.map(len(group))(np.zeros((kernel.nx, len(group))), group.data.T, shared)
     # nonlinear entries are not constant, and may be NaN at 0
     coefficient = np.where(linear, np.asarray(value).T, 0.0)
     parts = []

@@ -81,7 +81,7 @@ def trace(outputs: ca.SX, group: Group, theta: Float) -> _Graph:
     Raises:
         ExportError: an operation has no opcode.
     """
-    kernel, table = group.kernel, group.table
+    kernel = group.kernel
     function = ca.Function("f", [kernel.x, kernel.row, kernel.theta], [ca.densify(outputs)])
     graph = _Graph(roots=[-1] * outputs.numel())
     work: dict[int, int] = {}
@@ -95,7 +95,7 @@ def trace(outputs: ca.SX, group: Group, theta: Float) -> _Graph:
             graph.variable[work[target]] = inputs[1]
         elif op == ca.OP_INPUT:
             which, nonzero = inputs
-            values = table.data[:, nonzero] if which == 1 else np.asarray(theta[nonzero])
+            values = group.data[:, nonzero] if which == 1 else np.asarray(theta[nonzero])
             work[target] = graph.constant((which, nonzero), values)
         elif op in OPERATIONS and OPERATIONS[op].nl:
             work[target] = graph.apply(op, tuple(work[a] for a in inputs))
@@ -156,7 +156,7 @@ def _defined(graph: _Graph, group: Group) -> set[int]:
             if a in parents:
                 parents[a].append(node)
     uses = {n: len(parents[n]) + graph.roots.count(n) for n in nodes}
-    common = _common(graph, nodes, group) if group.size > 1 else set()
+    common = _common(graph, nodes, group) if len(group) > 1 else set()
     size: dict[int, int] = {}
     names = set()
     for node in nodes:
@@ -176,7 +176,7 @@ def _common(graph: _Graph, nodes: list[int], group: Group) -> set[int]:
     def leaf(node: int) -> frozenset[int]:
         """The node itself, if its value depends on the element."""
         if node in graph.variable:
-            column = group.table.index[:, graph.variable[node]].astype(np.int64)
+            column = group.index[:, graph.variable[node]].astype(np.int64)
         elif np.ndim(graph.number[node]):
             column = np.ascontiguousarray(graph.number[node]).view(np.int64)
         else:
@@ -194,7 +194,7 @@ def _common(graph: _Graph, nodes: list[int], group: Group) -> set[int]:
         support[node] = leaves
         if leaves not in distinct:
             distinct[leaves] = len(np.unique(np.sum([mixed[a] for a in leaves], axis=0)))
-        if distinct[leaves] <= SHARED_BELOW * group.size:
+        if distinct[leaves] <= SHARED_BELOW * len(group):
             common.add(node)
     return common
 

@@ -45,7 +45,7 @@ def classes(nlp: NLP) -> dict[str, Any]:
         if kernel.objective is not None:
             objective = max(objective, degree(kernel.objective, kernel.x))
         if kernel.constraints is not None:
-            places = np.unique(group.table.rows)
+            places = np.unique(group.rows)
             equal = bool((nlp.lbg[places] == nlp.ubg[places]).all())
             rows[kernel.name if group.kernel.objective is None else f"epigraph_{kernel.name}"] = {
                 "rows": len(places),

@@ -221,10 +221,7 @@ def _program(case: Case, record: Frozen, soup: Soup, form: Formulation) -> tuple
     base = TangentLayout(*about, exact_chart(data))
     nlp, layout = build_tangent_nlp(soup, data, case.weights, form, layout=base)
     unit = [
-        replace(g, table=replace(g.table, data=rounded(g.table.data)))
-        if g.kernel.name == "t_simplex"
-        else g
-        for g in nlp.groups
+        replace(g, data=rounded(g.data)) if g.kernel.name == "t_simplex" else g for g in nlp.groups
     ]
     return replace(nlp, groups=tuple(unit)), layout
 

@@ -12,7 +12,7 @@ import numpy as np
 from soup_nlp.arrays import Float, Int
 from soup_nlp.model.elements import Element, Norms
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.kernel import Group, Kernel, Table
+from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import NormForm, solver_form
@@ -100,10 +100,8 @@ class Builder:
             row = Block(f"epigraph_{norm}", 0.0, np.inf, element.superpixels)
             rows.append(_added(self.rows, row))
         data = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
-        table = Table(
-            np.concatenate(index, axis=1), data, np.array(rows, np.int64).reshape(-1, size).T
-        )
-        self.groups.append(Group(kernel, table))
+        own = np.concatenate(index, axis=1), data, np.array(rows, np.int64).reshape(-1, size).T
+        self.groups.append(Group(kernel, *own))
 
     def add_constraint(
         self,
@@ -137,8 +135,8 @@ class Builder:
         rows = np.broadcast_to(_added(self.rows, block).reshape(-1, count), (size, count))
         symbols = ca.SX.sym("none", 0) if row is None else row
         kernel = Kernel(name, x, symbols, _SYMBOLS, constraints=body)
-        table = Table(index, np.zeros((size, 0)) if data is None else data, rows)
-        self.groups.append(Group(kernel, table))
+        data = np.zeros((size, 0)) if data is None else data
+        self.groups.append(Group(kernel, index, data, rows))
 
     def add_ridge(self, metric: Float) -> None:
         """Zero objective whose majorant is ridge x metric on the diagonal.
@@ -149,7 +147,7 @@ class Builder:
         x, m = ca.SX.sym("x"), ca.SX.sym("metric")
         kernel = Kernel("ridge", x, m, _SYMBOLS, objective=0 * x, curvature=_SYMBOLS[3] * m)
         index, none = np.arange(len(metric))[:, None], np.zeros((len(metric), 0), np.int64)
-        self.groups.append(Group(kernel, Table(index, metric[:, None], none)))
+        self.groups.append(Group(kernel, index, metric[:, None], none))
 
     def finish(self, name: str, x0: Float, lbx: Float, ubx: Float) -> NLP:
         """The NLP of everything that was added, its slack variables at their best values.
@@ -171,7 +169,7 @@ class Builder:
         f = self.form
         nlp = NLP(
             name,
-            tuple(g for g in self.groups if g.size),
+            tuple(g for g in self.groups if len(g)),
             x0=np.clip(np.concatenate([x0, 0.0 * lower]), lbx, ubx),
             lbx=lbx,
             ubx=ubx,

@@ -126,30 +126,6 @@ Blocks = tuple[NDArray[np.integer], Float, NDArray[np.integer]]
 """(B, nx, width) variables, (B, np, width) data and (B, nc, width) constraint rows."""
 
 
-@dataclass(frozen=True)
-class Table:
-    """Elements of one kernel.
-
-    Attributes:
-        index: (E, nx) global variable of every local one.
-        data: (E, np) data rows.
-        rows: (E, nc) global constraint row of every local one; rows may repeat (sums);
-            (E, 0) without constraints.
-    """
-
-    index: Int
-    data: Float
-    rows: Int
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-    def blocks(self, width: int, dtype: type = np.int64) -> Blocks:
-        """Index, data and rows in blocks of elements, the indices of a type; see `in_blocks`."""
-        index, rows = (in_blocks(part, width, dtype) for part in (self.index, self.rows))
-        return index, in_blocks(self.data, width, np.float64), rows
-
-
 def in_blocks(
     table: NDArray[Any], width: int, dtype: type, fill: int | None = None
 ) -> NDArray[Any]:
@@ -163,19 +139,28 @@ def in_blocks(
 
 @dataclass(frozen=True)
 class Group:
-    """A kernel with its table.
+    """A kernel with its table: the elements of one kind.
+
+    Attributes:
+        kernel: Of one element.
+        index: (E, nx) global variable of every local one.
+        data: (E, np) data rows.
+        rows: (E, nc) global constraint row of every local one; rows may repeat (sums);
+            (E, 0) without constraints.
 
     Raises:
         ModelError: table and kernel do not fit, or data is not finite.
     """
 
     kernel: Kernel
-    table: Table
+    index: Int
+    data: Float
+    rows: Int
 
     def __post_init__(self) -> None:
-        k, t = self.kernel, self.table
-        expected = [(len(t), width) for width in (k.nx, k.row.numel(), k.nc)]
-        shapes = [a.shape for a in (t.index, t.data, t.rows)]
+        k = self.kernel
+        expected = [(len(self), width) for width in (k.nx, k.row.numel(), k.nc)]
+        shapes = [a.shape for a in (self.index, self.data, self.rows)]
         if shapes != expected:
             raise ModelError(
                 "table does not fit its kernel",
@@ -183,10 +168,13 @@ class Group:
                 found=f"index, data, rows {shapes}",
                 expected=f"index, data, rows {expected}",
             )
-        if not np.isfinite(t.data).all():
+        if not np.isfinite(self.data).all():
             raise ModelError("table has NaN or infinite data", where=k.name)
 
-    @cached_property
-    def size(self) -> int:
-        """Number of elements."""
-        return len(self.table)
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def blocks(self, width: int, dtype: type = np.int64) -> Blocks:
+        """Index, data and rows in blocks of elements, the indices of a type; see `in_blocks`."""
+        index, rows = (in_blocks(part, width, dtype) for part in (self.index, self.rows))
+        return index, in_blocks(self.data, width, np.float64), rows

@@ -87,7 +87,7 @@ class NLP:
         """f, its gradient, g, its Jacobian."""
         sizes = {"f": 1, "grad": self.nx, "con": self.ng, "jac": self.nnzj}
         targets = [
-            {"f": np.zeros((g.size, 1), int), "grad": g.table.index, "con": g.table.rows, "jac": p}
+            {"f": np.zeros((len(g), 1), int), "grad": g.index, "con": g.rows, "jac": p}
             for g, p in zip(self.groups, self.jacobian_pattern.places)
         ]
         functions = [g.kernel.first_order() for g in self.groups]
@@ -155,9 +155,7 @@ class NLP:
             names = [group.kernel.x[k].name() for k in range(group.kernel.nx)]
             local = [k for k, name in enumerate(names) if name.startswith("s_")]
             if local:
-                pairs.append(
-                    np.array([group.table.index[:, local], group.table.rows]).reshape(2, -1)
-                )
+                pairs.append(np.array([group.index[:, local], group.rows]).reshape(2, -1))
         variables, rows = np.concatenate(pairs, axis=1)
         return variables, rows
 
@@ -182,7 +180,7 @@ class NLP:
             share = nnz / cells if cells else 0.0
             lines.append(f"  {label:<11} {nnz:>9} nonzeros, {share:.3%} of {cells}")
         lines.append(f"  Hessian kind: {self.hessian_kind}")
-        lines += [f"  {g.kernel.name:<12} {g.size:>7} x {g.kernel}" for g in self.groups]
+        lines += [f"  {g.kernel.name:<12} {len(g):>7} x {g.kernel}" for g in self.groups]
         return "\n".join(lines)
 
     __repr__ = __str__

@@ -69,13 +69,13 @@ def jacobian_entries(groups: Sequence[Group]) -> Iterator[Entries]:
     """Nonzeros of g's Jacobian; one set for every group."""
     for group in groups:
         r, c = nonzeros(group.kernel.first_order().get("jac"))
-        yield group.table.rows[:, r], group.table.index[:, c]
+        yield group.rows[:, r], group.index[:, c]
 
 
 def hessian_entries(groups: Sequence[Group], hessian: str) -> Iterator[Entries]:
     """Nonzeros of the upper triangle of the Lagrangian's Hessian; one set for every group."""
     for group in groups:
         # half the bytes sort in half the time
-        index = group.table.index.astype(np.int32)
+        index = group.index.astype(np.int32)
         one, two = (index[:, k] for k in nonzeros(group.kernel.second_order(hessian).get("hess")))
         yield np.minimum(one, two), np.maximum(one, two)

@@ -92,12 +92,12 @@ def summed(
                     " longer (a C compiler on the PATH, gcc or clang, is used)"
                 )
             else:
-                blocks = group.table.blocks(LANES, np.int32)
+                blocks = group.blocks(LANES, np.int32)
         for key, f in own_functions.items():
             target, size = own_targets[key], sizes[key]
             sums[key].terms.append(
                 Summed(library, f, blocks, target, size)
                 if library and blocks
-                else Vectors(f, group.table, target, size)
+                else Vectors(f, group, target, size)
             )
     return sums

@@ -24,7 +24,7 @@ class Graph:
 
     def __init__(self, nlp: NLP) -> None:
         self._nlp, self._first = nlp, [g.kernel.first_order() for g in nlp.groups]
-        self.p = np.concatenate([nlp.thetas(), *(g.table.data.ravel() for g in nlp.groups)])
+        self.p = np.concatenate([nlp.thetas(), *(g.data.ravel() for g in nlp.groups)])
         sizes = {"x": nlp.nx, "p": len(self.p), "lam_g": nlp.ng, "lam_f": 1}
         self._x, self._p, self._lam_g, self._lam_f = (ca.MX.sym(*size) for size in sizes.items())
 
@@ -37,7 +37,7 @@ class Graph:
     def grad_f(self) -> ca.Function:
         """(x, p) -> f, gradient."""
         local = self._local("grad", self._first)
-        places = [g.table.index for g, v in zip(self._nlp.groups, self._first) if "grad" in v]
+        places = [g.index for g, v in zip(self._nlp.groups, self._first) if "grad" in v]
         return self._function(
             "nlp_grad_f", {"f": self._f, "grad_f_x": _sum(self._x.numel(), places, local)}
         )
@@ -64,7 +64,7 @@ class Graph:
 
     @cached_property
     def _g(self) -> ca.MX:
-        places = [g.table.rows for g, v in zip(self._nlp.groups, self._first) if "con" in v]
+        places = [g.rows for g, v in zip(self._nlp.groups, self._first) if "con" in v]
         return _sum(self._lam_g.numel(), places, self._local("con", self._first))
 
     def _function(self, name: str, outputs: Mapping[str, ca.MX]) -> ca.Function:
@@ -77,15 +77,15 @@ class Graph:
         at, out = len(self._nlp.theta), []
         theta = self._p[:at]
         for group, own_functions in zip(self._nlp.groups, functions):
-            size, width = group.table.data.shape
+            size, width = group.data.shape
             data = ca.reshape(self._p[at : at + size * width], width, size)
             at += size * width
             if key not in own_functions:
                 continue
-            x = ca.reshape(self._x[_list(group.table.index)], group.kernel.nx, size)
+            x = ca.reshape(self._x[_list(group.index)], group.kernel.nx, size)
             given = [x, data, ca.repmat(theta, 1, size)]
             if key == "hess":
-                rows = _list(group.table.rows)
+                rows = _list(group.rows)
                 lam_c = ca.reshape(self._lam_g[rows], -1, size) if rows else ca.MX(0, size)
                 given += [ca.repmat(self._lam_f, 1, size), lam_c]
             out.append(ca.vec(own_functions[key].map(size)(*given).nz[:]))

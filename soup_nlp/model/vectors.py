@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
-from soup_nlp.model.kernel import Table, in_blocks
+from soup_nlp.model.kernel import Group, in_blocks
 from soup_nlp.model.operations import input_sizes, instructions, operation
 
 BLOCK = 2048
@@ -25,23 +25,23 @@ class Vectors:
     """One function of a kernel, summed over the kernel's table."""
 
     def __init__(
-        self, function: ca.Function, table: Table, target: NDArray[np.integer], sums: int
+        self, function: ca.Function, group: Group, target: NDArray[np.integer], sums: int
     ) -> None:
         """Translate the function.
 
         Args:
             function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,).
-            table: The kernel's table, E elements.
+            group: Kernel and table of E elements.
             target: (E, k) where each entry is added.
             sums: Size of the vector; what pads the last block is added behind it.
         """
-        size = max(1, min(BLOCK, len(table)))
+        size = max(1, min(BLOCK, len(group)))
         count = input_sizes(function)
         self._x, self._data = np.empty((count[0], size)), np.empty((count[1], size))
         self._theta, self._lam_f = np.empty(count[2]), np.empty(1)
         self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
         self._function = function
-        self._blocks = list(zip(*table.blocks(size), in_blocks(target, size, np.int64, fill=sums)))
+        self._blocks = list(zip(*group.blocks(size), in_blocks(target, size, np.int64, fill=sums)))
 
     @cached_property
     def _calls(self) -> list[tuple[Callable[..., Any], Any]]:

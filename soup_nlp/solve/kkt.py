@@ -122,7 +122,7 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, 
     """
     lam_g = np.zeros(nlp.ng)
     facing = -np.einsum("nc,nc->n", soup.n, data.anchor_ray)
-    visible = next(g for g in nlp.groups if g.kernel.name == "visible").table.rows
+    visible = next(g for g in nlp.groups if g.kernel.name == "visible").rows
     lam_g[visible[:, 1:]] = -rim / facing[:, None]
     gradient = nlp.gradient(nlp.x0)
     slack, row = nlp.slacks()

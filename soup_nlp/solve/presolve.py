@@ -247,6 +247,6 @@ class _Program:
 
 def _rim(program: _Program) -> Float:
     """(N, V) multipliers of rim visibility, its rows divided by the facing of the anchor."""
-    rows = next(g for g in program.nlp.groups if g.kernel.name == "t_visible").table.rows
+    rows = next(g for g in program.nlp.groups if g.kernel.name == "t_visible").rows
     multipliers = -program.lam_g[rows]
     return multipliers if program.layout.chart == "depth" else multipliers * program.x[::9, None]

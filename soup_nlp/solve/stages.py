@@ -257,5 +257,5 @@ def multipliers(nlp: NLP, stage: Stage) -> dict[str, Float]:
     out = {"lam_x": stage.lam_x}
     for group in nlp.groups:
         if group.kernel.nc:
-            out[f"lam_g_{group.kernel.name}"] = stage.lam_g[np.unique(group.table.rows)]
+            out[f"lam_g_{group.kernel.name}"] = stage.lam_g[np.unique(group.rows)]
     return out

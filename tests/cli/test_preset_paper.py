@@ -203,7 +203,7 @@ def test_a_pixel_of_smoothing_is_a_length_and_an_angle(case):
 def test_slanted_planes_do_not_lengthen_the_unit(case):
     """The presolve's row of the length unit adds up the distances of the slanted planes."""
     nlp, layout = build_tangent_nlp(case.soup, case.data, case.weights, case.formulation())
-    row = next(g for g in nlp.groups if g.kernel.name == "t_simplex").table.rows[0, 0]
+    row = next(g for g in nlp.groups if g.kernel.name == "t_simplex").rows[0, 0]
     x = nlp.x0 + 1e-2 * np.random.default_rng(0).normal(size=nlp.nx)
     lam, slope = x[::9], x.reshape(-1, 9)[:, 1:3]
     across = layout.radius - np.sum(slope * layout.anchor[:, :2], axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from soup_nlp.export.nl import NLFile, write_nl
-from soup_nlp.model.kernel import Group, Kernel, Table
+from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.nlp import NLP
 
 
@@ -19,7 +19,7 @@ def plain_nlp(name: str, groups: Sequence[Group], x0: ArrayLike, **given: object
     Bounds may be single numbers; names may be lists.
     """
     x0 = np.asarray(x0, float)
-    rows = max((int(g.table.rows.max(initial=-1)) + 1 for g in groups), default=0)
+    rows = max((int(g.rows.max(initial=-1)) + 1 for g in groups), default=0)
     free = {"lbx": -np.inf, "ubx": np.inf, "lbg": -np.inf, "ubg": np.inf}
     bounds = {}
     for side, bound in free.items():
@@ -39,8 +39,7 @@ def write_sx_nl(path: Path, problem: dict[str, ca.SX], **given: object) -> NLFil
     x, f, g = problem["x"], problem["f"], problem.get("g", ca.SX(0, 1))
     n, m, none = x.numel(), g.numel(), ca.SX(0, 1)
     kernel = Kernel("nlp", x, none, none, objective=f, constraints=g if m else None)
-    table = Table(np.arange(n)[None], np.zeros((1, 0)), np.arange(m)[None])
-    groups = [Group(kernel, table)]
+    groups = [Group(kernel, np.arange(n)[None], np.zeros((1, 0)), np.arange(m)[None])]
     return write_nl(path, plain_nlp("plain", groups, **{"x0": np.zeros(n), **given}))
 
 

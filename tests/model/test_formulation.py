@@ -24,7 +24,6 @@ from hypothesis import strategies as st
 from soup_nlp.errors import ModelError
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import TERMS
-from soup_nlp.model.kernel import Group, Kernel, Table
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.pattern import Pattern
 from soup_nlp.model.symbolic import Graph
@@ -164,16 +163,15 @@ def test_the_print_shows_sizes_and_sparsity():
 def test_a_table_must_fit_its_kernel_and_be_finite():
     nlp, _ = tiny().nlp(PAPER, form())
     group = next(g for g in nlp.groups if g.kernel.name == "normal")
-    kernel: Kernel = group.kernel
     with pytest.raises(ModelError, match="does not fit"):
-        Group(kernel, replace(group.table, index=group.table.index[:, 1:]))
+        replace(group, index=group.index[:, 1:])
     with pytest.raises(ModelError, match="does not fit"):
-        Group(kernel, replace(group.table, rows=group.table.rows[1:]))
+        replace(group, rows=group.rows[1:])
     arap = next(g for g in nlp.groups if g.kernel.name == "arap")
-    data = arap.table.data.copy()
+    data = arap.data.copy()
     data[1, 2] = np.nan
     with pytest.raises(ModelError, match="NaN"):
-        Group(arap.kernel, Table(arap.table.index, data, arap.table.rows))
+        replace(arap, data=data)
 
 
 @pytest.mark.parametrize("size", [40, 100_000])

@@ -62,12 +62,12 @@ def by_term(nlp: NLP, x: np.ndarray, **theta: float) -> dict[str, float]:
     """Objective by kernel."""
     out = {}
     for group in nlp.groups:
-        k, t = group.kernel, group.table
+        k = group.kernel
         if k.name not in TERMS:
             continue
-        f = ca.Function("f", [k.x, k.row, k.theta], [k.objective]).map(len(t))
-        shared = np.repeat(nlp.thetas(**theta)[:, None], len(t), axis=1)
-        out[k.name] = float(np.asarray(f(x[t.index].T, t.data.T, shared)).sum())
+        f = ca.Function("f", [k.x, k.row, k.theta], [k.objective]).map(len(group))
+        shared = np.repeat(nlp.thetas(**theta)[:, None], len(group), axis=1)
+        out[k.name] = float(np.asarray(f(x[group.index].T, group.data.T, shared)).sum())
     return out
 
 

@@ -12,7 +12,7 @@ from soup_nlp.errors import ModelError
 from soup_nlp.model import compile as compiling
 from soup_nlp.model import vectors
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.kernel import Group, Kernel, Table
+from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.lanes import LANES, Summed, compile_lanes
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
@@ -54,9 +54,9 @@ def squares(elements: int, compiled: bool = True, of=lambda x: x) -> NLP:
     kernel = Kernel("squares", x, row, theta, objective=of(f), constraints=x[0] ** 2 * x[1])
     e = np.arange(elements)
     weight = np.linspace(1.0, 2.0, elements)[:, None]
-    table = Table(np.column_stack([e + 1, 0 * e]), weight, e[:, None])
+    group = Group(kernel, np.column_stack([e + 1, 0 * e]), weight, e[:, None])
     own = {"lbg": 0.0, "theta": {"theta": 3.0}, "compiled": compiled}
-    return plain_nlp("squares", [Group(kernel, table)], np.linspace(0.5, 1.5, elements + 1), **own)
+    return plain_nlp("squares", [group], np.linspace(0.5, 1.5, elements + 1), **own)
 
 
 def assert_same(one: NLP, two: NLP, x: np.ndarray, theta: np.ndarray, rtol: float) -> None:
@@ -153,13 +153,14 @@ def test_every_operation_has_casadis_value(every, block, monkeypatch):
     x, data, width = rng.normal(size=count), rng.normal(size=(count, 1)), every.nnz_out(0)
     # two elements share their places
     place = (np.arange(count)[:, None] // 2) * width + np.arange(width)
-    table = Table(np.arange(count)[:, None], data, np.zeros((count, 0), np.int64))
+    kernel = Kernel("every", ca.SX.sym("a"), ca.SX.sym("b"), ca.SX(0, 1))
+    group = Group(kernel, np.arange(count)[:, None], data, np.zeros((count, 0), np.int64))
     out = np.ones(4 * width + 1)
     if block:
         monkeypatch.setattr(vectors, "BLOCK", block)
-        term = vectors.Vectors(every, table, place, 4 * width)
+        term = vectors.Vectors(every, group, place, 4 * width)
     else:
-        blocks = table.blocks(LANES, np.int32)
+        blocks = group.blocks(LANES, np.int32)
         term = Summed(compile_lanes([every]), every, blocks, place, 4 * width)
     term.add(out, x, np.zeros(0), 1.0, None)
     expected = np.array([np.asarray(every(*pair, [])).ravel() for pair in zip(x, data.ravel())])

@@ -11,7 +11,7 @@ import pytest
 from helpers_nl import plain_nlp
 
 from soup_nlp.errors import SolverError
-from soup_nlp.model.kernel import Group, Kernel, Table
+from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.symbolic import Graph
 from soup_nlp.solve.ipopt import Ipopt, Stage
@@ -42,8 +42,8 @@ def hs071() -> NLP:
     y, weight, two = symbols(1, 1)
     square = Kernel("square", y, weight, two, constraints=weight * y**2)
     groups = [
-        Group(main, Table(np.arange(4)[None], np.zeros((1, 0)), np.array([[0]]))),
-        Group(square, Table(np.arange(4)[:, None], np.ones((4, 1)), np.ones((4, 1), int))),
+        Group(main, np.arange(4)[None], np.zeros((1, 0)), np.array([[0]])),
+        Group(square, np.arange(4)[:, None], np.ones((4, 1)), np.ones((4, 1), int)),
     ]
     return textbook(groups, [1, 5, 5, 1], lbx=1, ubx=5, lbg=[25, 40], ubg=[np.inf, 40])
 
@@ -61,8 +61,8 @@ def rosenbrock(n: int, ubx: float = np.inf) -> NLP:
         "valley", x, row, one, objective=row * (x[0] - x[1] ** 2) ** 2 + (one - x[1]) ** 2
     )
     index = np.stack([np.arange(1, n), np.arange(n - 1)], axis=1)
-    table = Table(index, np.full((n - 1, 1), 100.0), np.zeros((n - 1, 0), int))
-    return textbook([Group(kernel, table)], [0.8] * n, ubx=ubx)
+    group = Group(kernel, index, np.full((n - 1, 1), 100.0), np.zeros((n - 1, 0), int))
+    return textbook([group], [0.8] * n, ubx=ubx)
 
 
 def solve(nlp: NLP, **options) -> Stage:
@@ -104,8 +104,8 @@ def of_one_variable(f, g=None, x0: float = 1.0, **bounds: float) -> NLP:
     x, row, one = symbols(1)
     kernel = Kernel("one", x, row, one, objective=f(x), constraints=None if g is None else g(x))
     rows = np.zeros((1, 0 if g is None else 1), int)
-    table = Table(np.zeros((1, 1), int), np.zeros((1, 0)), rows)
-    return textbook([Group(kernel, table)], [x0], **bounds)
+    group = Group(kernel, np.zeros((1, 1), int), np.zeros((1, 0)), rows)
+    return textbook([group], [x0], **bounds)
 
 
 def test_a_multiplier_of_the_wrong_sign_is_no_optimum():
