@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_model import GAUGES, NORMS, PAPER, TRUNCATED, Tiny, value, wiggle
+from helpers_model import GAUGES, NORMS, PAPER, TRUNCATED, tiny, value, wiggle
 from helpers_nl import ReadBack, close, defined_variables
 
 from soup_nlp.config.problem import make_problem
@@ -53,8 +53,7 @@ def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS, ids=form_id)
 def test_casadi_reads_back_every_formulation(form, tmp_path):
-    tiny = Tiny()
-    nlp, layout = tiny.nlp(TRUNCATED if form.norm == "epigraph" else PAPER, form)
+    nlp, layout = tiny().nlp(TRUNCATED if form.norm == "epigraph" else PAPER, form)
     file = write_nl(tmp_path / "soup.nl", nlp)
     back = ReadBack(file.path)
     for seed, size in ((0, 0.02), (1, 0.2)):
@@ -65,7 +64,7 @@ def test_casadi_reads_back_every_formulation(form, tmp_path):
 
 
 def test_shared_expressions_are_written_once(tmp_path):
-    nlp, layout = Tiny().nlp(PAPER, FORMS[0])
+    nlp, layout = tiny().nlp(PAPER, FORMS[0])
     file = write_nl(tmp_path / "soup.nl", nlp)
     # smooth norms live in the objective alone; lam / (m . r) of an anchor is one of them
     assert defined_variables(file)[:4] == [0, 0, 0, 0]
@@ -77,14 +76,14 @@ def test_shared_expressions_are_written_once(tmp_path):
     depths = [t for t in texts if t.startswith("o3\nv") and int(t.split("\n")[1][1:]) in scales]
     # every anchor once, and one more for each end of each boundary point
     assert len(depths) == 12 + 2 * 2 * 17
-    epigraph, _ = Tiny().nlp(TRUNCATED, Formulation(norm="epigraph", compiled=False))
+    epigraph, _ = tiny().nlp(TRUNCATED, Formulation(norm="epigraph", compiled=False))
     both, *others = defined_variables(write_nl(tmp_path / "e.nl", epigraph))
     assert both == 0
     assert all(others[k] > 0 for k in (0, 2, 3))
 
 
 def test_variables_and_rows_are_ordered_by_class(tmp_path):
-    nlp, _ = Tiny().nlp(PAPER, FORMS[0])
+    nlp, _ = tiny().nlp(PAPER, FORMS[0])
     file = write_nl(tmp_path / "soup.nl", nlp)
     in_rows, in_objective, both = file.counts["nonlinear_variables"].values()
     names = np.array((tmp_path / "soup.col").read_text().split())
@@ -97,7 +96,7 @@ def test_variables_and_rows_are_ordered_by_class(tmp_path):
     curved = file.counts["nonlinear_rows"]
     assert {n.partition("[")[0] for n in rows[:curved]} == {"so3", "normal"}
     assert {n.partition("[")[0] for n in rows[curved:]} == {"visible", "simplex", "E"}
-    slack, _ = Tiny().nlp(PAPER, Formulation(norm="epigraph", compiled=False))
+    slack, _ = tiny().nlp(PAPER, Formulation(norm="epigraph", compiled=False))
     file = write_nl(tmp_path / "e.nl", slack)
     # slacks of untruncated norms are linear in the objective
     assert file.counts["nonlinear_variables"]["both"] < file.counts["nonlinear_variables"]["rows"]
@@ -109,7 +108,7 @@ def test_variables_and_rows_are_ordered_by_class(tmp_path):
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     form = Formulation(gauge="unit-translation", norm="epigraph", compiled=False)
-    nlp, layout = Tiny().nlp(TRUNCATED, form)
+    nlp, layout = tiny().nlp(TRUNCATED, form)
     folder = tmp_path_factory.mktemp("foreign")
     lam_g = np.full(nlp.ng, -1.0)
     return nlp, layout, write_nl(folder / "soup.nl", nlp, lam_g)

@@ -136,7 +136,7 @@ def programs(draw):
 
 
 @pytest.mark.slow
-@settings(max_examples=120)
+@settings(max_examples=80)
 @given(program=programs())
 def test_random_programs_read_back(program, tmp_path_factory):
     problem, at = program
