@@ -5,12 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from soup_nlp.arrays import Int, Mask
-from soup_nlp.export.program import OBJECTIVE, Program
+from soup_nlp.arrays import Int
+from soup_nlp.export.program import Program
 from soup_nlp.export.template import DEFINED, NUMBER, PLUS, SUM, VARIABLE, Template, Text, number
-
-NO_ROW = np.iinfo(np.int64).max
-"""Row of a defined variable that no constraint uses."""
 
 
 @dataclass
@@ -20,7 +17,7 @@ class _Part:
     Attributes:
         template: Texts with holes.
         index: (E, nx) variable of the file for every local variable.
-        goal: (E, m) row of every output, or OBJECTIVE.
+        goal: (E, m) row of the file of every output.
         identity: (E,) numbers of the instances of each defined node.
     """
 
@@ -76,23 +73,22 @@ class NlBody:
             column: (nx,) index in the file of every variable.
             row: (ng,) index in the file of every row.
         """
-        self._program, self._row, self._first = program, row, len(column)
+        # the objective is the last row
+        last, goals = len(row), np.append(row, len(row))
+        self._program, self._row, self._first = program, goals, len(column)
         self._known: dict[str, dict[bytes, int]] = {}
         self._count = 0
         self._nodes: list[tuple[_Part, int, Text, Int]] = []
         self._parts = []
-        # the last entry is for the objective, whose row is -1
-        goals = np.append(row, OBJECTIVE)
         for template, index, goal in program.stamped:
             part = _Part(template, column[index], goals[goal])
             for node, text in template.defined:
                 self._identify(part, node, text)
             self._parts.append(part)
-        low, high, objective = self._users()
-        used = low != NO_ROW
-        kind = np.select([objective & used, used & (low < high), used], [0, 1, 3], 4)
+        low, high = self._users()
+        kind = np.select([low == last, low == high, high == last], [4, 3, 0], 1)
         # a variable with one user is written before its row
-        owner = np.where(kind == 3, low, len(row))
+        owner = np.where(kind < 3, last, low)
         self._order = np.lexsort((np.arange(len(kind)), owner, kind))
         self._owner = owner[self._order]
         self._shared = int((kind < 3).sum())
@@ -115,47 +111,35 @@ class NlBody:
         new, first = np.unique(identity, return_index=True)
         self._nodes.append((part, node, text, first[new >= begin]))
 
-    def _users(self) -> tuple[Int, Int, Mask]:
-        """Smallest and largest row and use in the objective of each defined variable.
-
-        Indirect uses count too. Without a row the smallest is NO_ROW and the largest -1.
-        """
-        low, high = np.full(self._count, NO_ROW), np.full(self._count, -1)
-        objective = np.zeros(self._count, bool)
+    def _users(self) -> tuple[Int, Int]:
+        """First and last row that uses each defined variable, also indirectly."""
+        low, high = np.full(self._count, len(self._row)), np.full(self._count, -1)
         for part in self._parts:
             for k, root in enumerate(part.template.roots):
-                row = part.goal[:, k]
                 for kind, node in root.holes if root else ():
-                    if kind == DEFINED and row[0] == OBJECTIVE:
-                        objective[part.identity[node]] = True
-                    elif kind == DEFINED:
-                        np.minimum.at(low, part.identity[node], row)
-                        np.maximum.at(high, part.identity[node], row)
+                    if kind == DEFINED:
+                        np.minimum.at(low, part.identity[node], part.goal[:, k])
+                        np.maximum.at(high, part.identity[node], part.goal[:, k])
         # a node is visited after everything that uses it
         for part, node, text, _ in reversed(self._nodes):
             parent = part.identity[node]
             for kind, other in text.holes:
                 if kind == DEFINED:
                     child = part.identity[other]
-                    np.logical_or.at(objective, child, objective[parent])
                     np.minimum.at(low, child, low[parent])
                     np.maximum.at(high, child, high[parent])
-        return low, high, objective
+        return low, high
 
     def segments(self) -> Iterator[str]:
         """`V`, `C` and `O` segments; a variable with one user is written right before it."""
         rows: list[list[str]] = [[] for _ in self._row]
-        objective: list[str] = []
         for part in self._parts:
             for k, root in enumerate(part.template.roots):
                 texts = part.write(root, slice(None), self._final) if root else []
-                if part.goal[0, k] == OBJECTIVE:
-                    objective += texts
-                else:
-                    for r, text in zip(part.goal[:, k].tolist(), texts):
-                        rows[r].append(text)
+                for r, text in zip(part.goal[:, k].tolist(), texts):
+                    rows[r].append(text)
         constant = np.zeros(len(rows))
-        constant[self._row] = self._program.row_constant
+        constant[self._row] = self._program.constant
         written = [
             text
             for part, _, pattern, first in self._nodes
@@ -165,14 +149,12 @@ class NlBody:
         for k in range(self._shared):
             yield f"V{self._first + k} 0 0\n{written[order[k]]}"
         k = self._shared
-        # the objective comes after the rows
-        for r in range(len(rows) + 1):
+        for r in range(len(rows)):
             while k < len(owner) and owner[k] == r:
                 yield f"V{self._first + k} 0 {r + 1}\n{written[order[k]]}"
                 k += 1
-            if r < len(rows):
-                yield f"C{r}\n{_total(rows[r], constant[r])}"
-        yield f"O0 0\n{_total(objective, self._program.objective_constant)}"
+            head = f"C{r}" if r < len(rows) - 1 else "O0 0"
+            yield f"{head}\n{_total(rows[r], constant[r])}"
 
 
 def _total(terms: list[str], constant: float) -> str:

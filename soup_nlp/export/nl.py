@@ -9,7 +9,7 @@ Gay, "Writing .nl files" (2005), and the AMPL/MP reader.
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +84,9 @@ def write_nl(
     program = make_program(nlp.groups, nlp.nx, nlp.ng, nlp.thetas())
     variables, rows = orders(program)
     body = NlBody(program, np.argsort(variables), np.argsort(rows))
-    J = program.jacobian[rows][:, variables].tocsr()
-    J.sort_indices()
-    G = program.gradient[:, variables].tocsr()
-    G.sort_indices()
+    # the objective stays the last row
+    entries = program.linear[np.append(rows, nlp.ng)][:, variables].tocsr()
+    entries.sort_indices()
     x0, lbx, ubx = (v[variables] for v in (nlp.x0, nlp.lbx, nlp.ubx))
     lbg, ubg = nlp.lbg[rows], nlp.ubg[rows]
     longest = [max(map(len, n), default=0) for n in (names[1], names[0])]
@@ -100,7 +99,7 @@ def write_nl(
         start(x0),
         bounds("r", lbg, ubg),
         bounds("b", lbx, ubx),
-        linear(J, G),
+        linear(entries),
     )
     data = ("\n".join(lines) + "\n").encode("ascii")
     write_bytes(path, data)
@@ -117,8 +116,8 @@ def write_nl(
         variables=variables,
         rows=rows,
         counts={
-            "gradient_nonzeros": int(G.nnz),
-            "nonlinear_rows": int(program.curved_rows.sum()),
+            "gradient_nonzeros": int(entries[-1].nnz),
+            "nonlinear_rows": int(program.curved[:-1].sum()),
             "nonlinear_variables": {key: int(mask.sum()) for key, mask in nonlinear.items()},
             "defined_variables": sum(body.classes),
         },
@@ -144,17 +143,18 @@ def header(
     # if the objective has variables of its own, its count includes those of the constraints
     in_objective = in_rows + only if only else both
     n, m = len(program.in_rows), len(lower)
+    gradient = program.linear[-1].nnz
     return [
         "g3 1 1 0",
         f" {n} {m} 1 {ranges.sum()} {equations.sum()}"
         "\t# vars, constraints, objectives, ranges, eqns",
-        f" {program.curved_rows.sum()} {int(program.curved_objective)}"
+        f" {program.curved[:-1].sum()} {int(program.curved[-1])}"
         "\t# nonlinear constraints, objectives",
         " 0 0\t# network constraints: nonlinear, linear",
         f" {in_rows} {in_objective} {both}\t# nonlinear vars in constraints, objectives, both",
         " 0 0 0 1\t# linear network variables; functions; arith, flags",
         " 0 0 0 0 0\t# discrete variables: binary, integer, nonlinear (b,c,o)",
-        f" {program.jacobian.nnz} {program.gradient.nnz}\t# nonzeros in Jacobian, gradients",
+        f" {program.linear.nnz - gradient} {gradient}\t# nonzeros in Jacobian, gradients",
         f" {longest[0]} {longest[1]}\t# max name lengths: constraints, variables",
         f" {' '.join(map(str, defined))}\t# common exprs: b,c,o,c1,o1",
     ]
@@ -194,21 +194,19 @@ def bounds(segment: str, lower: Float, upper: Float) -> Iterator[str]:
             yield "3"
 
 
-def linear(J: sparse.csr_matrix, G: sparse.csr_matrix) -> Iterator[str]:
-    """`k` (column counts), `J` and `G` segments; entries of nonlinear variables may be 0."""
-    if J.shape[0]:
-        count = np.bincount(J.indices, minlength=J.shape[1])
-        yield f"k{J.shape[1] - 1}"
-        yield from map(str, np.cumsum(count)[:-1].tolist())
-    for letter, matrix in (("J", J), ("G", G)):
-        at = matrix.indptr.tolist()
-        for k in range(matrix.shape[0]):
-            begin, end = at[k], at[k + 1]
-            if begin == end:
-                continue
-            yield f"{letter}{k} {end - begin}"
-            columns, values = matrix.indices[begin:end].tolist(), matrix.data[begin:end].tolist()
-            yield from (f"{c} {number(v)}" for c, v in zip(columns, values))
+def linear(entries: sparse.csr_matrix) -> Iterator[str]:
+    """`k` (column counts), `J` and, of the last row, `G` segments; nonlinear entries may be 0."""
+    (count, width), at = entries.shape, entries.indptr.tolist()
+    if count > 1:
+        columns = np.bincount(entries.indices[: at[-2]], minlength=width)
+        yield f"k{width - 1}"
+        yield from map(str, np.cumsum(columns)[:-1].tolist())
+    for k, (begin, end) in enumerate(pairwise(at)):
+        if begin == end:
+            continue
+        yield f"{f'J{k}' if k < count - 1 else 'G0'} {end - begin}"
+        places, values = entries.indices[begin:end].tolist(), entries.data[begin:end].tolist()
+        yield from (f"{c} {number(v)}" for c, v in zip(places, values))
 
 
 # --- suffixes ------------------------------------------------------------------------------------

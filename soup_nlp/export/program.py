@@ -13,35 +13,26 @@ from soup_nlp.export.template import Template, make_template, trace
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.nlp import NLP
 
-OBJECTIVE = -1
-"""Row number of the objective."""
-
 
 @dataclass(frozen=True)
 class Program:
-    """Parts of the NLP, with variables and rows in the order of the NLP.
+    """Parts of the NLP, with variables and rows in its order; the objective is row ng.
 
     Attributes:
-        stamped: (template, (E, nx) variables, (E, m) rows or OBJECTIVE of every output).
-        jacobian: (ng, nx) linear coefficients of the rows.
-        gradient: (1, nx) linear coefficients of the objective; both store 0 for nonlinear entries.
-        in_rows: (nx,) variable is nonlinear in some row.
+        stamped: (template, (E, nx) variables, (E, m) row of every output).
+        linear: (ng + 1, nx) linear coefficients; 0 is stored for nonlinear entries.
+        in_rows: (nx,) variable is nonlinear in some constraint.
         in_objective: (nx,) variable is nonlinear in the objective.
-        curved_rows: (ng,) row has an expression or a constant.
-        curved_objective: The objective has an expression with variables.
-        row_constant: (ng,) numbers that are added to the expressions of the rows.
-        objective_constant: The same for the objective.
+        curved: (ng + 1,) row has an expression with variables; a constraint, or a constant.
+        constant: (ng + 1,) numbers that are added to the expressions.
     """
 
     stamped: tuple[tuple[Template, Int, Int], ...]
-    jacobian: sparse.csr_matrix
-    gradient: sparse.csr_matrix
+    linear: sparse.csr_matrix
     in_rows: Mask
     in_objective: Mask
-    curved_rows: Mask
-    curved_objective: bool
-    row_constant: Float
-    objective_constant: float
+    curved: Mask
+    constant: Float
 
 
 def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Program:
@@ -51,8 +42,7 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
         ExportError: an operation has no opcode, or a number is not finite.
     """
     in_rows, in_objective = np.zeros(nx, bool), np.zeros(nx, bool)
-    curved_rows, row_constant = np.zeros(ng, bool), np.zeros(ng)
-    curved_objective, objective_constant = False, 0.0
+    curved, constant = np.zeros(ng + 1, bool), np.zeros(ng + 1)
     stamped = []
     linear: list[tuple[Float, Int, Int]] = []
     for group in groups:
@@ -65,7 +55,7 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
                     where=group.kernel.name,
                     hint="a kernel divides by a column that is 0 somewhere",
                 )
-        goal = np.full((len(group), int(parts.objective)), OBJECTIVE)
+        goal = np.full((len(group), int(parts.objective)), ng)
         if group.kernel.nc:
             goal = np.concatenate([goal, group.rows], axis=1)
         stamped.append((template, group.index, goal))
@@ -73,30 +63,19 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
         linear.append((parts.coefficient.ravel(), row.ravel(), column.ravel()))
         for k in range(parts.nonlinear.numel()):
             variables = group.index[:, parts.column[(parts.row == k) & ~parts.is_linear]]
-            curved = template.roots[k] is not None
-            constant = np.broadcast_to(template.constants[k], len(group))
+            curved[goal[:, k]] |= template.roots[k] is not None
+            values = np.broadcast_to(template.constants[k], len(group))
             if parts.objective and k == 0:
                 in_objective[variables] = True
-                curved_objective |= curved
-                objective_constant += float(constant.sum())
+                constant[ng] += values.sum()
             else:
                 in_rows[variables] = True
-                curved_rows[goal[:, k]] |= curved
-                np.add.at(row_constant, goal[:, k], constant)
+                np.add.at(constant, goal[:, k], values)
+    curved[:ng] |= constant[:ng] != 0
     # sums of triplets keep zeros, so that nonlinear entries stay in the structure
     value, row, column = (np.concatenate(column) for column in zip(*linear))
-    in_f = row == OBJECTIVE
-    return Program(
-        stamped=tuple(stamped),
-        jacobian=sparse.csr_matrix((value[~in_f], (row[~in_f], column[~in_f])), (ng, nx)),
-        gradient=sparse.csr_matrix((value[in_f], (0 * row[in_f], column[in_f])), (1, nx)),
-        in_rows=in_rows,
-        in_objective=in_objective,
-        curved_rows=curved_rows | (row_constant != 0),
-        curved_objective=curved_objective,
-        row_constant=row_constant,
-        objective_constant=objective_constant,
-    )
+    matrix = sparse.csr_matrix((value, (row, column)), (ng + 1, nx))
+    return Program(tuple(stamped), matrix, in_rows, in_objective, curved, constant)
 
 
 def orders(program: Program) -> tuple[Int, Int]:
@@ -111,7 +90,7 @@ def orders(program: Program) -> tuple[Int, Int]:
         np.where(program.in_objective, 2, 3),
     )
     variables = np.argsort(kind, kind="stable")
-    return variables, np.argsort(~program.curved_rows, kind="stable")
+    return variables, np.argsort(~program.curved[:-1], kind="stable")
 
 
 def file_orders(nlp: NLP) -> tuple[Int, Int]:
