@@ -1,6 +1,6 @@
 """The NLP record: kernels, tables, bounds; its functions are made when first asked for."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Self
@@ -11,8 +11,10 @@ from scipy import sparse
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group, Hessian
+from soup_nlp.model.lanes import Summed
 from soup_nlp.model.pattern import Pattern, hessian_entries, jacobian_entries
-from soup_nlp.model.sums import Sum, summed
+from soup_nlp.model.sums import Terms, summed
+from soup_nlp.model.vectors import Vectors
 
 
 @dataclass(frozen=True)
@@ -47,19 +49,19 @@ class NLP:
 
     def value(self, x: Float, theta: Float | None = None) -> float:
         """f at x (nx,); theta (nt,) of another smoothing."""
-        return float(self._first["f"](x, self._theta(theta))[0])
+        return float(self._sum(self._first["f"], 1, x, theta)[0])
 
     def gradient(self, x: Float, theta: Float | None = None) -> Float:
         """Gradient of f (nx,)."""
-        return self._first["grad"](x, self._theta(theta))
+        return self._sum(self._first["grad"], self.nx, x, theta)
 
     def constraints(self, x: Float, theta: Float | None = None) -> Float:
         """g (ng,)."""
-        return self._first["con"](x, self._theta(theta))
+        return self._sum(self._first["con"], self.ng, x, theta)
 
     def jacobian_nonzeros(self, x: Float, theta: Float | None = None) -> Float:
         """Nonzeros of g's Jacobian, in the order of `jacobian_pattern`."""
-        return self._first["jac"](x, self._theta(theta))
+        return self._sum(self._first["jac"], self.nnzj, x, theta)
 
     def jacobian(self, x: Float) -> sparse.csr_matrix:
         """(ng, nx) Jacobian of g."""
@@ -70,7 +72,7 @@ class NLP:
     ) -> Float:
         """Nonzeros of the upper triangle of `lam_f f + lam_g . g`, in the order of
         `hessian_pattern`."""
-        return self._second["hess"](x, self._theta(theta), lam_f, lam_g)
+        return self._sum(self._second["hess"], self.nnzh, x, theta, lam_f, lam_g)
 
     def hessian(
         self, x: Float, lam_g: Float, lam_f: float = 1.0, theta: Float | None = None
@@ -79,11 +81,31 @@ class NLP:
         upper = self.hessian_pattern.filled(self.hessian_nonzeros(x, lam_g, lam_f, theta))
         return sparse.csc_matrix(upper + sparse.triu(upper, 1).T)
 
-    def _theta(self, theta: Float | None) -> Float:
-        return self.thetas() if theta is None else theta
+    def _sum(
+        self,
+        terms: Sequence[Summed | Vectors],
+        size: int,
+        x: Float,
+        theta: Float | None,
+        lam_f: float = 1.0,
+        lam_g: Float | None = None,
+    ) -> Float:
+        """The vector (size,) of the terms at x; the multipliers are for Hessians.
+
+        Raises:
+            ValueError: a vector has another length, which machine code does not see.
+        """
+        theta = self.thetas() if theta is None else theta
+        given = _vector("x", x, self.nx), _vector("theta", theta, len(self.theta))
+        lam_g = lam_g if lam_g is None else _vector("lam_g", lam_g, self.ng)
+        # one entry more, for what fills the last block of lanes
+        out = np.zeros(size + 1)
+        for term in terms:
+            term.add(out, *given, lam_f, lam_g)
+        return out[:-1]
 
     @cached_property
-    def _first(self) -> Mapping[str, Sum]:
+    def _first(self) -> Terms:
         """f, its gradient, g, its Jacobian."""
         sizes = {"f": 1, "grad": self.nx, "con": self.ng, "jac": self.nnzj}
         targets = [
@@ -91,20 +113,15 @@ class NLP:
             for g, p in zip(self.groups, self.jacobian_pattern.places)
         ]
         functions = [g.kernel.first_order() for g in self.groups]
-        return summed(self.groups, functions, targets, self._given, sizes, self.compiled)
+        return summed(self.groups, functions, targets, sizes, self.compiled)
 
     @cached_property
-    def _second(self) -> Mapping[str, Sum]:
+    def _second(self) -> Terms:
         """The Hessian, apart from the rest, since a start at a KKT point does not need it."""
         functions = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
         targets = [{"hess": p} for p in self.hessian_pattern.places]
         sizes = {"hess": self.nnzh}
-        return summed(self.groups, functions, targets, self._given, sizes, self.compiled)
-
-    @property
-    def _given(self) -> tuple[int, int, int]:
-        """Sizes of x, theta and lam_g."""
-        return self.nx, len(self.theta), self.ng
+        return summed(self.groups, functions, targets, sizes, self.compiled)
 
     def evaluated(self) -> Self:
         """The same, with all its functions made now, so that later timings exclude it."""
@@ -184,3 +201,10 @@ class NLP:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def _vector(name: str, values: Float, size: int) -> Float:
+    """A contiguous vector of a length."""
+    if len(values) != size:
+        raise ValueError(f"{name} has {len(values)} entries, expected {size}")
+    return np.ascontiguousarray(values, dtype=float)

@@ -168,16 +168,14 @@ class _Solve:
         candidates["constrained NLP"] = layout.unpack(stage.x)
         ends = {k: s.normalised(self.data.share).retracted() for k, s in candidates.items()}
         admissible = self.admissible(ends)
+
+        def rank(name: str) -> float:
+            energy = self.energy(admissible[name])
+            # energies at one minimum differ by what the smoothing hides
+            return energy / SAME if stage.converged and name == "constrained NLP" else energy
+
         # the later one of equals
-        delivered = min(reversed(admissible), key=lambda k: self.energy(admissible[k]))
-        last = admissible.get("constrained NLP")
-        # energies at one minimum differ by what the smoothing hides
-        if (
-            stage.converged
-            and last
-            and self.energy(last) <= SAME * self.energy(admissible[delivered])
-        ):
-            delivered = "constrained NLP"
+        delivered = min(reversed(admissible), key=rank)
         final = admissible[delivered]
         # a reported success counts only where the constraints hold
         broken = stage.converged and "constrained NLP" not in admissible

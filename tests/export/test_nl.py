@@ -135,28 +135,25 @@ def test_ampls_own_library_agrees(written):
     assert stats["no. of nonzeros in constraints' Jacobian"] == nlp.nnzj
     cols = stub.with_suffix(".col").read_text().split()
     rows = stub.with_suffix(".row").read_text().split()
-    J = nlp.jacobian(nlp.x0).toarray()[np.ix_(file.rows, file.variables)]
-    grad = nlp.gradient(nlp.x0)[file.variables]
-    found = np.zeros_like(J)
-    place = {f"{r}_{c}": (i, j) for i, r in enumerate(rows[:-1]) for j, c in enumerate(cols)}
-    flat = _section(said, "constraints' jacobian")
-    for key, v in flat.items():
-        found[place[key]] = v
-    np.testing.assert_allclose(found, J, rtol=1e-10, atol=1e-10)
-    g = np.zeros(nlp.nx)
-    for key, v in _section(said, "gradient").items():
-        g[cols.index(key.removeprefix("E_"))] = v
-    np.testing.assert_allclose(g, grad, rtol=1e-10, atol=1e-10)
+
+    def matrix(section: str, down: list[str]) -> np.ndarray:
+        """Entries whose names are those of a row and of a variable."""
+        place = {f"{r}_{c}": (i, j) for i, r in enumerate(down) for j, c in enumerate(cols)}
+        out = np.zeros((len(down), len(cols)))
+        for key, number in _section(said, section).items():
+            out[place[key]] = number
+        return out
+
+    v, r = file.variables, file.rows
+    J = nlp.jacobian(nlp.x0).toarray()[np.ix_(r, v)]
+    np.testing.assert_allclose(matrix("constraints' jacobian", rows[:-1]), J, 1e-10, 1e-10)
+    gradient = nlp.gradient(nlp.x0)[None, v]
+    np.testing.assert_allclose(matrix("gradient", ["E"]), gradient, 1e-10, 1e-10)
     # the Hessian of f + y g at the duals of the file
     assert said["supplied starting points"]["dual"] == dict.fromkeys(rows[:-1], 1)
-    H = np.zeros((nlp.nx, nlp.nx))
-    places = {f"{a}_{b}": (i, j) for i, a in enumerate(cols) for j, b in enumerate(cols)}
-    for key, v in _section(said, "lagrangian hessian").items():
-        i, j = places[key]
-        H[i, j] = H[j, i] = v
-    expected = nlp.hessian(nlp.x0, np.ones(nlp.ng)).toarray()[
-        np.ix_(file.variables, file.variables)
-    ]
+    H = matrix("lagrangian hessian", cols)
+    H = np.where(H, H, H.T)
+    expected = nlp.hessian(nlp.x0, np.ones(nlp.ng)).toarray()[np.ix_(v, v)]
     np.testing.assert_allclose(H, expected, rtol=1e-8, atol=1e-8)
 
 

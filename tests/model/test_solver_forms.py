@@ -109,13 +109,10 @@ def test_the_smooth_truncation_stays_near_the_exact_energy(units):
 
 def optimal_slacks(nlp: NLP) -> np.ndarray:
     """x0 with the smallest feasible slack variables."""
-    x = nlp.x0.copy()
-    slacks = {name[2:]: i for i, name in enumerate(nlp.x_names()) if name.startswith("s_")}
-    x[list(slacks.values())] = 0.0
-    g = dict(zip(nlp.g_names(), nlp.constraints(x)))
-    for name, i in slacks.items():
-        # s^2 - |v|^2 - eps^2 at s = 0
-        x[i] = np.sqrt(max(0.0, -g[f"epigraph_{name}"]))
+    x, (slack, row) = nlp.x0.copy(), nlp.slacks()
+    x[slack] = 0.0
+    # s^2 - |v|^2 - eps^2 at s = 0
+    x[slack] = np.sqrt(np.maximum(0.0, -nlp.constraints(x)[row]))
     return x
 
 
