@@ -89,12 +89,9 @@ class BlockCholesky:
 
 def _coupled(matrix: sparse.csr_matrix, block: int) -> sparse.csr_matrix:
     """(N, N) pattern of the blocks of a matrix."""
-    entries = matrix.tocoo()
-    pattern = sparse.coo_matrix(
-        (np.ones(entries.nnz, np.int8), (entries.row // block, entries.col // block)),
-        (matrix.shape[0] // block,) * 2,
-    )
-    return pattern.tocsr()
+    blocks = matrix.tobsr((block, block))
+    ones = np.ones(len(blocks.indices), bool)
+    return sparse.csr_matrix((ones, blocks.indices, blocks.indptr))
 
 
 def layers(coupled: sparse.csr_matrix, position: Float) -> list[Int]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_model import GAUGES, NORMS, PAPER, TRUNCATED, tiny, value, wiggle
+from helpers_model import GAUGES, NORMS, PAPER, TRUNCATED, tiny, wiggle
 from helpers_nl import ReadBack, close, defined_variables
 
 from soup_nlp.config.problem import make_problem
@@ -35,7 +35,7 @@ def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> 
     for name in ("lbg", "ubg"):
         assert np.array_equal(getattr(back, name), getattr(nlp, name)[r]), name
     f, g, grad, J = back.values(x[v])
-    f0, g0 = value(nlp, x)
+    f0, g0 = nlp.value(x), nlp.constraints(x)
     close(f, f0)
     close(g, g0[r])
     close(grad, nlp.gradient(x)[v])
@@ -177,7 +177,7 @@ def pounce_agrees(nlp: NLP, file: NLFile, x: np.ndarray) -> None:
     v, r = file.variables, file.rows
     assert (back.n, back.m, back.nnz_jac) == (nlp.nx, nlp.ng, nlp.nnzj)
     assert np.array_equal(back.x0, nlp.x0[v])
-    f, g = value(nlp, x)
+    f, g = nlp.value(x), nlp.constraints(x)
     close(back.objective(x[v]), f)
     close(np.array(back.constraints(x[v])), g[r])
     close(np.array(back.gradient(x[v])), nlp.gradient(x)[v])
@@ -255,5 +255,5 @@ def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, norm, tmp_pat
         less = replace(data, **{f"{term}_weight": np.zeros_like(weight)})
         other = build_matrix_nlp(swinging.soup, less, swinging.weights, form)[0]
         within = eps * getattr(swinging.weights, term) * np.abs(weight).sum()
-        assert exact[term] - within <= f - value(other, other.x0)[0] <= exact[term] + 1e-9
+        assert exact[term] - within <= f - other.value(other.x0) <= exact[term] + 1e-9
         assert exact[term] > 2 * within

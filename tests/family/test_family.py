@@ -18,11 +18,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.family.describe import check_sol, degree, rank
-from soup_nlp.family.frozen import (
-    decoded,
-    load_frozen,
-    read_frozen,
-)
+from soup_nlp.family.frozen import decoded, load_frozen, read_frozen
 from soup_nlp.family.instances import (
     BITS,
     SCENES,

@@ -136,11 +136,6 @@ class Tiny:
 # --- values and finite differences of an NLP ---------------------------------------------------
 
 
-def value(nlp: NLP, x: Float, theta: Float | None = None) -> tuple[float, Float]:
-    """f and g."""
-    return nlp.value(x, theta), nlp.constraints(x, theta)
-
-
 def lagrangian_gradient(nlp: NLP, x: Float, lam_f: float, lam_g: Float) -> Float:
     return lam_f * nlp.gradient(x) + nlp.jacobian(x).T @ lam_g
 

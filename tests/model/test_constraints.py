@@ -31,7 +31,6 @@ from helpers_model import (
     form,
     random_soup,
     tiny,
-    value,
     weights_for,
     wiggle,
     world,
@@ -125,7 +124,7 @@ def violations(nlp: NLP, x: np.ndarray, data: EnergyData, f: Formulation) -> dic
     """Largest violation by kind of a raw vector, bounds and the sign of det R among them."""
     out = {"det": float(np.abs(np.linalg.det(numbers(nlp, x).R) - 1).max())}
     found = bodies(nlp, x, data, f.depth_ratio)
-    found["epigraph"] = value(nlp, x)[1][rows(nlp, "epigraph")]
+    found["epigraph"] = nlp.constraints(x)[rows(nlp, "epigraph")]
     for kind, body in found.items():
         lower, upper = limits(kind, f.min_facing)
         out[kind] = float(np.maximum(lower - body, body - upper).max(initial=0.0))
@@ -152,7 +151,7 @@ def test_every_row_and_every_bound_is_the_specified_one(gauge, norm):
     assert max(found.values()) <= 1e-9, found
     # off the manifold, where no entry of any row is 0
     x = wiggle(nlp, layout.size, 1, 0.3)
-    spec, g = bodies(nlp, x, data, 4.0), value(nlp, x)[1]
+    spec, g = bodies(nlp, x, data, 4.0), nlp.constraints(x)
     kinds = {kind_of(name) for name in nlp.g_names()}
     assert kinds == spec.keys() | ({"epigraph"} if norm == "epigraph" else set())
     for kind, body in spec.items():
@@ -178,12 +177,12 @@ def test_slack_variables_on_their_epigraph_are_the_smooth_norms(gauge):
     own = [name for name in epigraph.g_names() if kind_of(name) == "epigraph"]
     bound = [names.index(name.replace("epigraph_", "s_")) for name in own]
     assert sorted(bound) == list(np.flatnonzero(slack))
-    row = value(epigraph, x)[1][rows(epigraph, "epigraph")]
+    row = epigraph.constraints(x)[rows(epigraph, "epigraph")]
     x[bound] = np.sqrt(x[bound] ** 2 - row)
-    np.testing.assert_allclose(value(epigraph, x)[1][rows(epigraph, "epigraph")], 0, atol=1e-9)
-    assert value(epigraph, x)[0] == pytest.approx(value(smooth, x[~slack])[0], rel=1e-12)
+    np.testing.assert_allclose(epigraph.constraints(x)[rows(epigraph, "epigraph")], 0, atol=1e-9)
+    assert epigraph.value(x) == pytest.approx(smooth.value(x[~slack]), rel=1e-12)
     # and they start on it
-    start = value(epigraph, epigraph.x0)[1][rows(epigraph, "epigraph")]
+    start = epigraph.constraints(epigraph.x0)[rows(epigraph, "epigraph")]
     np.testing.assert_allclose(start, 0, atol=1e-9)
 
 
@@ -196,7 +195,7 @@ def test_the_presolve_constrains_scale_and_visibility_only(chart, units):
     assert {kind_of(name) for name in nlp.g_names()} == {"simplex", "visible"}
     rng = np.random.default_rng(0)
     x = (nlp.x0.reshape(-1, 9) * rng.uniform(0.9, 1.1, (12, 9))).ravel()
-    a, g = x.reshape(-1, 9), value(nlp, x)[1]
+    a, g = x.reshape(-1, 9), nlp.constraints(x)
     scale = a[:, 0] if chart == "depth" else 1 / a[:, 0]
     # planes of the coordinates, and the visibility of the constrained NLP in units of the facing
     m = np.column_stack([a[:, 1:3] / layout.radius[:, None], np.zeros(12)])
@@ -227,7 +226,7 @@ def test_the_start_of_the_presolve_is_feasible(chart):
     problem = tiny("pixels")
     own = problem.data, weights_for("pixels"), form()
     nlp, base = build_tangent_nlp(problem.soup, *own, chart)
-    g = value(nlp, nlp.x0)[1]
+    g = nlp.constraints(nlp.x0)
     assert g[nlp.g_names().index("simplex")] == pytest.approx(1.0, abs=1e-12)
     assert np.maximum(nlp.lbg - g, g - nlp.ubg).max() <= 1e-9
     assert ((nlp.lbx <= nlp.x0) & (nlp.x0 <= nlp.ubx)).all()
@@ -235,7 +234,7 @@ def test_the_start_of_the_presolve_is_feasible(chart):
     steep = np.random.default_rng(0).uniform([0.5, 2, 2, *[0] * 6], [2, 4, 4, *[0] * 6], (12, 9))
     nlp, _ = build_tangent_nlp(base.unpack(steep), *own, layout=base)
     rho = nlp.x0[::9] if chart == "inverse-depth" else np.ones(12)
-    least = value(nlp, nlp.x0)[1][rows(nlp, "visible")].reshape(12, -1).min(axis=1) / rho
+    least = nlp.constraints(nlp.x0)[rows(nlp, "visible")].reshape(12, -1).min(axis=1) / rho
     assert 0 <= least.min() <= least.max() <= 0.1
 
 
@@ -268,7 +267,7 @@ def test_visibility_bounds_the_depth_over_a_superpixel(ratio):
 def unseen(nlp: NLP, x: np.ndarray) -> np.ndarray:
     """(N,) whether any visibility row of a superpixel is violated."""
     visible = rows(nlp, "visible")
-    return (value(nlp, x)[1] < nlp.lbg)[visible].reshape(12, -1).any(axis=1)
+    return (nlp.constraints(x) < nlp.lbg)[visible].reshape(12, -1).any(axis=1)
 
 
 # --- the raw answer of Ipopt --------------------------------------------------------------------
@@ -307,7 +306,7 @@ def test_the_raw_answer_keeps_every_constraint(gauge, name, ratio):
     found = violations(nlp, x, data, f)
     assert max(found.values()) <= RAW, found
     # so narrow a visibility holds planes back that slant
-    facing = value(nlp, x)[1][rows(nlp, "visible")] - f.min_facing
+    facing = nlp.constraints(x)[rows(nlp, "visible")] - f.min_facing
     assert (facing.min() < 1e-4) == (ratio == 1.05)
     # what is delivered is the answer itself: the retraction moves it by no more
     soup = layout.unpack(x)
@@ -340,13 +339,13 @@ def test_ipopt_gets_every_kind_of_bound(side):
     else:
         k = int(np.flatnonzero(rows(nlp, "visible"))[10])
         free, rest = (
-            value(nlp, x)[1][k],
+            nlp.constraints(x)[k],
             replace(nlp, ubg=np.where(nlp.lbg < nlp.ubg, 2.0, nlp.ubg)),
         )
     bound = getattr(rest, side).copy()
     bound[k] = free + sign * 0.01
     stage = Ipopt(replace(rest, **{side: bound}))(x0=x, tol=1e-3)
-    found = stage.x[k] if side.endswith("x") else value(nlp, stage.x)[1][k]
+    found = stage.x[k] if side.endswith("x") else nlp.constraints(stage.x)[k]
     assert stage.converged, stage
     assert found == pytest.approx(bound[k], abs=1e-3)
     assert sign * (found - bound[k]) >= -RAW

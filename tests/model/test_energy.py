@@ -15,7 +15,6 @@ from helpers_model import (
     form,
     random_soup,
     tiny,
-    value,
     weights_for,
     world,
 )
@@ -262,7 +261,7 @@ def test_superpixels_without_flow_take_no_pixels_and_have_no_projection(blind):
     error = oracle.values("proj", problem.soup, data, PAPER)
     assert (error[none] == 0).all()
     nlp, _ = build_matrix_nlp(problem.soup, data, PAPER, form())
-    assert np.isfinite(value(nlp, nlp.x0)[0])
+    assert np.isfinite(nlp.value(nlp.x0))
 
 
 def test_one_superpixel_is_a_valid_problem():
@@ -276,8 +275,8 @@ def test_one_superpixel_is_a_valid_problem():
         nlp, _ = build_matrix_nlp(soup, data, PAPER, form(gauge=gauge))
         e = oracle.energy(soup, data, PAPER)
         assert e["arap"] == e["cont"] == e["orient"] == 0
-        assert value(nlp, nlp.x0)[0] == pytest.approx(e["total"], rel=0.1)
-        assert value(nlp, nlp.x0)[1][: 6 + 1] == pytest.approx(0, abs=1e-12)
+        assert nlp.value(nlp.x0) == pytest.approx(e["total"], rel=0.1)
+        assert nlp.constraints(nlp.x0)[: 6 + 1] == pytest.approx(0, abs=1e-12)
 
 
 def test_prior_is_the_relative_slope_of_inverse_depth():

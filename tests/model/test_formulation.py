@@ -14,7 +14,6 @@ from helpers_model import (
     form,
     random_soup,
     tiny,
-    value,
     weights_for,
     world,
 )
@@ -199,7 +198,7 @@ def test_the_same_soup_has_the_same_objective_in_all_variables(norm, units):
     problem, weights = tiny(units), weights_for(units)
     nlps = [problem.nlp(weights, form(gauge=gauge, norm=norm))[0] for gauge in GAUGES]
     nlps.append(build_tangent_nlp(problem.soup, problem.data, weights, form(norm=norm))[0])
-    found = [value(nlp, nlp.x0)[0] for nlp in nlps]
+    found = [nlp.value(nlp.x0) for nlp in nlps]
     assert found[0] > 0
     np.testing.assert_allclose(found[:-1], found[0], rtol=1e-12)
     assert found[-1] == pytest.approx(found[0], rel=1e-11)
