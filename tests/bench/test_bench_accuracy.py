@@ -20,8 +20,8 @@ from soup_nlp.storage.rows import Row
 pytestmark = pytest.mark.slow
 
 QUICK = (
-    "segmentation.superpixels=40",
-    "segmentation.neighbours=6",
+    "segmentation.superpixels=20",
+    "segmentation.neighbours=4",
     "solver.presolve=false",
     "solver.max_iter=5",
     "refine.rounds=1",

@@ -23,7 +23,7 @@ from soup_nlp.storage.rows import Row
 
 pytestmark = pytest.mark.slow
 
-TINY = ("segmentation.superpixels=40", "segmentation.neighbours=6")
+TINY = ("segmentation.superpixels=20", "segmentation.neighbours=4")
 QUICK = (*TINY, "solver.exact_iterations=0", "solver.max_iter=1", "refine.rounds=1")
 
 

@@ -115,12 +115,12 @@ def test_a_real_run_and_its_table(tmp_path, monkeypatch):
 
     # `test_rows.py` measures rows in new processes
     monkeypatch.setattr(bench, "measure_all", here)
-    size = ["--scenes", "street", "--sizes", "24", "--neighbours", "4", "--seeds", "0"]
+    size = ["--scenes", "street", "--sizes", "12", "--neighbours", "4", "--seeds", "0"]
     small = sets(
         "formulation.compiled=false solver.presolve_eps=[0.3] solver.presolve_iterations=3"
         " solver.exact_iterations=0 solver.max_iter=1"
     )
-    small += ["--width", "128"]
+    small += ["--width", "64"]
     words = ["bench", "speed", *size, *small, "--quiet", "--out", str(out)]
     assert main(words) == 0
     (row,) = read_rows(out / "table.jsonl")
@@ -131,4 +131,4 @@ def test_a_real_run_and_its_table(tmp_path, monkeypatch):
     assert row["stages"]["output"] > 0
     assert row["cpu"]["nlp"] <= 1.2 * row["stages"]["nlp"]
     assert {"load", "flow", "segmentation", "start", "output"} <= set(row["cpu"])
-    assert "| street-s0-128x54 |" in (out / "table.md").read_text()
+    assert "| street-s0-64x48 |" in (out / "table.md").read_text()

@@ -86,7 +86,7 @@ def test_evaluate_scores_against_a_file(solved, tmp_path, capsys):
 
 
 def test_a_solve_that_stops_early_is_a_result(tmp_path):
-    limit = sets("solver.max_iter=0 solver.presolve=false")
+    limit = sets("solver.max_iter=0 solver.presolve=false refine.rounds=1")
     assert main(["solve", "street", "--out", str(tmp_path), *SMALL, *limit, "-q"]) == 1
     for name in FILES:
         assert (tmp_path / name).exists(), name
