@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ def ids(path: Path) -> str:
     return path.name
 
 
+@cache
 def headings(text: str) -> set[str]:
     """Anchors of a page's headings, as Markdown renderers make them."""
     prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
@@ -31,6 +33,7 @@ def headings(text: str) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", h).strip().lower().replace(" ", "-") for h in found}
 
 
+@cache
 def definitions(path: Path) -> set[str]:
     """Names that a module defines: functions, classes, their members, constants."""
     out = set()
@@ -72,6 +75,7 @@ def test_the_check_of_names_can_fail():
     assert "1-rays" in headings("# Title\n### 1. Rays\n```text\n# none\n```")
 
 
+@cache
 def keys(model: type[BaseModel], prefix: str = "") -> set[str]:
     """Every key of a problem file, and its sections."""
     out = set()
@@ -82,6 +86,7 @@ def keys(model: type[BaseModel], prefix: str = "") -> set[str]:
     return out
 
 
+@cache
 def commands() -> set[str]:
     """Every command and subcommand of the command line."""
     group = typer.main.get_command(app)

@@ -4,7 +4,7 @@ from importlib.util import find_spec
 
 from soup_nlp.errors import ConfigError
 
-if find_spec("pandas") is None:
+if not all(map(find_spec, ("pandas", "matplotlib", "optuna"))):
     raise ConfigError(
-        "benchmarks need pandas", where="soup-nlp bench", hint="pip install 'soup-nlp[bench]'"
+        "benchmarks need pandas, matplotlib and optuna", hint="pip install 'soup-nlp[bench]'"
     )

@@ -60,7 +60,7 @@ def write_paper(
     folder = page.parent
     rows = plan.join(frame.set_index("key").drop(columns="variant"), on="key")
     of_section = dict(list(rows.groupby("section", sort=False)))
-    compared = of_section.get("comparison", rows.iloc[:0])
+    compared = of_section["comparison"]
     head = [
         "# The paper, row by row",
         f"Made by `{command}`. {provenance(frame)}. Flow by OpenCV DIS unless named."
@@ -70,10 +70,9 @@ def write_paper(
     ]
     blocks = [*head, *_comparison(folder, compared), *_pictures(folder, compared)]
     for name in STUDIES:
-        if name in of_section:
-            blocks += _study(folder, name, of_section[name])
+        blocks += _study(folder, name, of_section[name])
     blocks += [*_convergence(folder, compared), *_time(compared)]
-    blocks += _departures(folder, of_section.get("departures", rows.iloc[:0]))
+    blocks += _departures(folder, of_section["departures"])
     page.write_text(page_text([*blocks, *_missing(set(plan["dataset"]))], frame), encoding="utf-8")
 
 

@@ -6,7 +6,6 @@ import os
 import platform
 import resource
 import signal
-import sys
 import time
 import traceback
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from typing import Any
 
 import psutil
 
-from soup_nlp.errors import SolverError, SoupError
+from soup_nlp.errors import SoupError
 from soup_nlp.storage.rows import one_thread
 from soup_nlp.storage.system import end_with_parent
 from soup_nlp.storage.versions import code_version, versions
@@ -63,14 +62,7 @@ def isolated(
         seconds: Limit of the wall time.
         memory: Bytes that the process may have in addition to those of this one.
         cpu_seconds: Limit of the CPU time of the process and of each of its children, or None.
-
-    Raises:
-        SolverError: the system cannot fork.
     """
-    if "fork" not in multiprocessing.get_all_start_methods():
-        raise SolverError(
-            "comparing needs a system that forks processes", found=sys.platform, expected="POSIX"
-        )
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     begin = time.perf_counter()
     context = multiprocessing.get_context("fork")

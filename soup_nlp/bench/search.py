@@ -58,13 +58,10 @@ def parse_space(texts: Sequence[str]) -> Space:
     """Optuna's distributions of KEY=log|linear|int:LOW:HIGH, by key.
 
     Raises:
-        ConfigError: a text does not have this form, or Optuna is not installed.
+        ConfigError: a text does not have this form.
     """
-    try:
-        from optuna.distributions import FloatDistribution, IntDistribution
-    except ImportError as error:
-        hint = "pip install 'soup-nlp[bench]'"
-        raise ConfigError("bench search needs optuna", hint=hint) from error
+    from optuna.distributions import FloatDistribution, IntDistribution
+
     makers = {
         "log": lambda a, b: FloatDistribution(float(a), float(b), log=True),
         "linear": lambda a, b: FloatDistribution(float(a), float(b)),

@@ -29,8 +29,9 @@ SMALL = {"superpixels": 12, "neighbours": 4}
 @pytest.fixture(scope="module")
 def run() -> soup_nlp.Run:
     pair = render_scene("orbit", 0, 96, 72)
-    none = {"enabled": False}
-    return soup_nlp.solve_pair(pair, segmentation=SMALL, flow={"source": "truth"}, refine=none)
+    options = {"segmentation": SMALL, "flow": {"source": "truth"}, "refine": {"enabled": False}}
+    short = {"presolve_eps": [0.3], "presolve_iterations": 3, "max_iter": 2}
+    return soup_nlp.solve_pair(pair, **options, solver=short)
 
 
 @pytest.fixture(scope="module")
