@@ -125,7 +125,7 @@ def solve_files(images: Path, out: Path, **changes: str) -> int:
         ({"ref": "missing.png"}, "missing.png"),
         ({"intrinsics": "0.9,0.9,0.5,0.5"}, "normalised"),
         ({"intrinsics": "a.png,b.png"}, "existing file"),
-        ({"intrinsics": "0,0,79.5,59.5"}, "focal"),
+        ({"intrinsics": "0,0,79.5,59.5"}, "positive fx and fy"),
         ({"intrinsics": "nan,9,1,1"}, "finite"),
         ({"intrinsics": "1,2,3"}, "four numbers"),
         ({"flow": "cut.flo"}, "cut.flo"),
