@@ -135,9 +135,6 @@ def at_outlines(depth: Float) -> Float:
 
     A pixel beside a step may belong to the surface on its other side. With range(r) the range of
     log depth within r pixels, the step is `2 range(r) - range(2 r)`, 0 on a constant slope.
-
-    Args:
-        depth: (H, W) depth.
     """
     log_depth = _log(depth)
     reach = max(1, round(OUTLINE_REACH * max(depth.shape)))
@@ -230,11 +227,8 @@ def by_start(rec: Reconstruction, start: Start, anchor_ray: Float) -> Float:
 def by_ground(off_ground: Float) -> Float:
     """(N,) standard deviation of log depth because regions may stand on the ground, or not.
 
-    The depth of a region is its own or that of the ground below it: the log ratio of both counts,
-    in squares without what regions with the right depth have.
-
-    Args:
-        off_ground: (N,) log ratio of both depths (`start.ground.off_ground`).
+    The depth of a region is its own or that of the ground below it: the log ratio (N,) of both
+    (`start.ground.off_ground`) counts, in squares without what regions with the right depth have.
     """
     return np.sqrt(np.maximum(off_ground**2 - STANDS**2, 0.0))
 

@@ -135,13 +135,10 @@ def evidence(
 
 def _camera(data: EnergyData, at: Mask) -> tuple[Float, str | None]:
     """Errors of the camera by the flow of superpixels, see `camera_errors`."""
-    ray, pixel = data.pixel_ray[at].reshape(-1, 3), data.pixel_target[at].reshape(-1, 2)
-    weight = data.pixel_weight[at].ravel()
-    use = np.flatnonzero((weight > 0) & np.isfinite(pixel).all(axis=1))
-    use = use[:: max(1, len(use) // PIXELS)]
-    target = rays(data.K_next, pixel[use])
-    weight = weight[use] / weight.max()
-    return camera_errors(Matches(ray[use], target, weight, data.K_next[0, 0]))
+    ray, target = data.pixel_ray[at], rays(data.K_next, data.pixel_target[at])
+    weight = data.pixel_weight[at].ravel() / data.pixel_weight[at].max()
+    matches = Matches(ray.reshape(-1, 3), target.reshape(-1, 3), weight, data.K_next[0, 0])
+    return camera_errors(matches.confident(PIXELS))
 
 
 def _error(pixel: Float, data: EnergyData, at: Int | slice = slice(None)) -> Float:

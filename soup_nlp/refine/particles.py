@@ -98,11 +98,9 @@ def from_anchor(Z: Float, g: Float, R: Float, T: Float, anchor_ray: Float) -> Pa
 
 
 def neighbours(edges: Int, anchor_ray: Float) -> Int:
-    """(N, K) neighbours of every superpixel on a graph, nearest first. K is the smallest degree.
+    """(N, K) neighbours of every superpixel on a graph (E, 2), nearest anchors (N, 3) first.
 
-    Args:
-        edges: (E, 2) undirected edges.
-        anchor_ray: (N, 3).
+    K is the smallest degree.
     """
     n = len(anchor_ray)
     if not len(edges):

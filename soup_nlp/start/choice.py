@@ -182,9 +182,7 @@ class Choice:
 def rigid_choice(flow: FlowFit, motions: list[Motion]) -> Choice:
     """One of few rigid motions for every superpixel.
 
-    Args:
-        flow: The flow of every superpixel.
-        motions: Candidates for the whole image; those of unexplained pieces are added.
+    To the candidates for the whole image those of unexplained pieces are added.
     """
     with_flow = flow.views.weight.any(axis=1)
     for extend in range(ROUNDS + 1):

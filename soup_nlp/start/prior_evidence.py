@@ -257,12 +257,7 @@ def as_log_depth(kind: Kind, value: Float, shift: float = 0.0) -> Callable[[Floa
 
 
 def follows_edges(values: Float, image: Image) -> bool:
-    """Whether a map follows the superpixels and the edges of its image better than by chance.
-
-    Args:
-        values: (H, W) log depth or any other map without gaps.
-        image: (H, W, 3) the image.
-    """
+    """Whether a map (H, W) follows superpixels and edges of its image better than by chance."""
     rows, columns = (max(8, round(n * SIDE / max(values.shape))) for n in values.shape)
 
     def resized(values: Any) -> Any:

@@ -237,12 +237,8 @@ def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
 
     A part that leaves the image or is hidden has the same wrong flow over several superpixels. As a
     component of its own it gets a better depth than from its neighbours, but it need not move.
-    Beside a piece that does move it is taken to be part of that piece.
-
-    Args:
-        flow: The flow of every superpixel.
-        component: (N,) rigid component of every superpixel.
-        kept: (N,) True in components that stay.
+    Beside a piece that does move it is taken to be part of that piece. Components that are `kept`
+    (N,) stay.
     """
     across = flow.seg.across(component)
     piece = connected_labels(~across, flow.seg)

@@ -39,6 +39,7 @@ PAPER = {
     "energy.arap_scene": 0.0,
     "energy.cont_occluded": 1.0,
     "energy.weights.prior": 0.0,
+    "energy.weights.order": 0.0,
     "energy.weights.sigma_arap": np.inf,
     "energy.weights.sigma_proj": np.inf,
     "energy.weights.sigma_cont_ref": np.inf,

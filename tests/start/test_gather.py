@@ -125,11 +125,6 @@ def test_neighbours_agree_unless_the_flow_jumps(world):
         assert mrf_energy(other, cost, seg.pairs, tables) >= best - 1e-9
 
 
-def test_one_label_is_the_only_choice(world):
-    flow = world[0]
-    assert (smooth_choice(flow, np.ones((len(flow.seg), 1)), 1.0) == 0).all()
-
-
 def test_a_motion_without_known_depth_borrows_from_another(world):
     seg = world[0].seg
     label = np.arange(len(seg)) % 2

@@ -1,5 +1,7 @@
 """Which side of an outline covers the other, and what is placed in that order."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from helpers_start import fitted, rendered, squares
@@ -10,9 +12,9 @@ from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
+from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
-from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start import occlusion
 from soup_nlp.start.components import TIES
 from soup_nlp.start.occlusion import IN_FRONT, SURE, covering, in_order, vote
@@ -30,6 +32,7 @@ def textured(seed: int) -> np.ndarray:
     return (60 + 90 * (seed % 2) + rng.integers(0, 60, (HEIGHT, WIDTH, 3))).astype(np.uint8)
 
 
+@cache
 def sliding(covers: bool) -> tuple[Pair, Segmentation]:
     """Two parts of 3 x 2 cells that approach each other before a wall, or behind holes in it."""
     wall, inside = textured(0), textured(1)
@@ -42,6 +45,12 @@ def sliding(covers: bool) -> tuple[Pair, Segmentation]:
         after[seen] = np.roll(inside, shift, axis=1)[seen]
     pair = Pair(before, after, K, K).with_flow(Flow(uv))
     return pair, squares(HEIGHT // CELL, WIDTH // CELL, CELL, neighbours=15)
+
+
+@cache
+def begun(covers: bool) -> Start:
+    """The start of `sliding` before its parts are ordered."""
+    return propose(fitted(*sliding(covers)))
 
 
 def ordered(before: Start, seg: Segmentation, pair: Pair) -> Start:
@@ -85,8 +94,7 @@ def test_a_vote_needs_several_strips_and_agreement():
 @pytest.mark.slow
 @pytest.mark.parametrize("covers", [True, False])
 def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
-    pair, seg = sliding(covers)
-    before = propose(fitted(pair, seg))
+    (pair, seg), before = sliding(covers), begun(covers)
     start = ordered(before, seg, pair)
     assert before.at_rest
     z = np.log(start.soup.depth_at(camera.rays(K, seg.anchors)))
@@ -107,7 +115,7 @@ def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
 def test_what_moves_before_a_resting_camera_is_a_part_without_an_order_too():
     pair, seg = sliding(True)
     moves = (pair.flow.uv[..., 0] != 0).ravel()[np.unique(seg.labels, return_index=True)[1]]
-    start = propose(fitted(pair, seg))
+    start = begun(True)
     assert start.at_rest
     assert not start.component.any()
     np.testing.assert_array_equal(start.part > 0, moves)
@@ -167,8 +175,7 @@ def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
 
 
 def test_small_pieces_have_no_order(monkeypatch):
-    pair, seg = sliding(True)
-    before = propose(fitted(pair, seg))
+    (pair, seg), before = sliding(True), begun(True)
     monkeypatch.setattr(occlusion, "SMALL", 5 / len(seg))
     assert ordered(before, seg, pair) is not before
     monkeypatch.setattr(occlusion, "SMALL", 6 / len(seg))
@@ -212,14 +219,4 @@ def test_without_its_weight_nothing_is_placed_in_order():
     case = prepare(problem, pair=pair)
     assert case.start.order is None
     assert not case.data.order_weight.any()
-    answer = solve_soup(case.start.soup, case.data, case.weights, case.formulation(), case.options)
-    assert "order" not in answer.energy
-
-
-def test_the_preset_of_the_paper_has_no_order():
-    problem = make_problem(
-        {"name": "p", "preset": "paper", "input": {"kind": "scene", "scene": "swing"}},
-        [],
-        where="t",
-    )
-    assert problem.energy.weights.order == 0
+    assert "order" not in oracle.energy(case.soup, case.data, case.weights)
