@@ -7,9 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
-from pydantic_core import to_jsonable_python
 
 from soup_nlp.errors import DataError, SoupError, printable
 
@@ -281,12 +279,15 @@ def plain(obj: object) -> Any:
     Raises:
         DataError: a type that JSON does not have.
     """
+    # imported on use, as NumPy is: processes that only move files need neither
+    from pydantic_core import to_jsonable_python
+
     return to_jsonable_python(obj, inf_nan_mode="null", fallback=_builtin)
 
 
 def _builtin(obj: object) -> Any:
     """An object of a type that pydantic does not know as one that it knows."""
-    if isinstance(obj, np.generic | np.ndarray):
+    if hasattr(obj, "tolist"):
         return obj.tolist()
     if isinstance(obj, Mapping):
         return dict(obj)

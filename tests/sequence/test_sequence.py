@@ -25,7 +25,7 @@ from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
 from soup_nlp.sequence.frames import Frames
 from soup_nlp.sequence.fused import fuse
-from soup_nlp.sequence.page import depth_pictures, guess_of
+from soup_nlp.sequence.page import depth_pictures, guess_of, write_animation
 from soup_nlp.sequence.score import chain_exit_code, chain_lines, link_table
 from soup_nlp.sequence.solve import one_camera
 
@@ -61,6 +61,14 @@ def test_a_chain_is_written(tmp_path):
     assert b"property float track" in head
     poses = np.loadtxt(tmp_path / "trajectory.tum")
     np.testing.assert_allclose(poses[1, 1:4], CAMERA.centre, atol=1e-8)
+    write_animation(tmp_path / "scene.glb", chain, told)
+    head = (tmp_path / "scene.glb").read_bytes()
+    tree = json.loads(head[20 : 20 + int.from_bytes(head[12:16], "little")])
+    assert [node["name"] for node in tree["nodes"]] == ["static scene", "track 1", "camera"]
+    # two channels for the track and two for the camera, each with a key for every frame
+    assert [k["target"]["node"] for k in tree["animations"][0]["channels"]] == [1, 1, 2, 2]
+    keys = [tree["accessors"][k["output"]]["count"] for k in tree["animations"][0]["samplers"]]
+    assert keys == [3] * 4
 
 
 def test_a_chain_says_which_depth_is_a_guess(tmp_path):
