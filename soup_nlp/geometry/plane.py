@@ -46,8 +46,8 @@ def about_anchor(Z: Float, g: Float, anchor_ray: Float) -> Float:
 def tilt_to_camera(soup: Soup, anchor_ray: Float, visibility_ray: Float, min_facing: float) -> Soup:
     """The soup with planes that break visibility tilted about their anchors until they satisfy it.
 
-    The depth at the anchor is kept; a negative one becomes the median of the others. A plane
-    parallel to the image satisfies every row.
+    The depth at the anchor, which is positive, is kept. A plane parallel to the image satisfies
+    every row.
 
     Args:
         soup: State.
@@ -56,16 +56,11 @@ def tilt_to_camera(soup: Soup, anchor_ray: Float, visibility_ray: Float, min_fac
         min_facing: Least cosine, times the length of v.
     """
     Z, g = at_anchor(inverse_depth(soup.n, soup.distance), anchor_ray)
-    behind = Z <= 0
-    if behind.any():
-        Z = np.where(behind, np.median(Z[~behind]) if (~behind).any() else 1.0, Z)
-        g = np.where(behind[:, None], 0.0, g)
     share = np.ones(len(soup))
     n, D = soup.n.copy(), soup.distance.copy()
     for _ in range(60):
         facing = -np.einsum("nc,nvc->nv", n, visibility_ray).max(axis=1)
-        bad = (facing < min_facing - TOLERANCE) | behind
-        behind = np.zeros(len(soup), bool)
+        bad = facing < min_facing - TOLERANCE
         if not bad.any():
             break
         share = np.where(bad, 0.8 * share, share)
