@@ -42,8 +42,6 @@ class TRWSResult:
         lower_bound: Largest bound so far, at most ``energy``; -inf if no iteration ended.
         iterations: Number of iterations, each one forward and one backward pass.
         status: ``"gap"``, ``"stagnation"``, ``"iterations"`` or ``"interrupted"``.
-        ties: Nodes whose label was a tie, to rounding, when ``labels`` were decoded; 0 if they
-            are ``init_labels``.
     """
 
     labels: np.ndarray
@@ -51,7 +49,6 @@ class TRWSResult:
     lower_bound: float
     iterations: int
     status: str
-    ties: int
 
 
 def solve_trws(
@@ -90,15 +87,15 @@ def solve_trws(
     costs, begin = np.asarray(unary, np.float64), init_labels
     solver = _Passes(costs, plan_levels(colours(len(costs), edges), edges), pairwise)
     first = math.inf if begin is None else mrf_energy(begin, unary, edges, pairwise)
-    best = (first, costs.argmin(axis=1) if begin is None else begin, 0)
+    best = (first, costs.argmin(axis=1) if begin is None else begin)
     rows: list[tuple[float, float, float]] = []
     status = "iterations"
     try:
         for k in range(max_iter):
             bound = solver.sweep()
-            energy, labels, ties = solver.decode()
+            energy, labels = solver.decode()
             if energy < best[0]:
-                best = (energy, labels, ties)
+                best = (energy, labels)
             rows.append((bound, energy, best[0]))
             if callback is not None and callback(k + 1, bound, energy, best[0]):
                 status = "interrupted"
@@ -111,12 +108,12 @@ def solve_trws(
                 break
     except KeyboardInterrupt:
         status = "interrupted"
-    _, labels, ties = best
+    labels = best[1]
     energy = mrf_energy(labels, unary, edges, pairwise)
     if begin is not None and first < energy:
-        energy, labels, ties = first, begin, 0  # float32 ranked a worse labelling as better
+        energy, labels = first, begin  # float32 ranked a worse labelling as better
     bound = min(max((row[0] for row in rows), default=-math.inf), energy)
-    return TRWSResult(labels, energy, bound, len(rows), status, ties)
+    return TRWSResult(labels, energy, bound, len(rows), status)
 
 
 def mrf_energy(
@@ -210,11 +207,9 @@ class _Passes:
             out[at] = self.table[rows, :, fixed[at]] if axis == 1 else self.table[rows, fixed[at]]
         return out
 
-    def decode(self) -> tuple[float, np.ndarray, int]:
-        """Energy, (N,) labels and the number of ties of the decoding in order."""
-        labels = np.zeros(len(self.costs), np.int64)
-        energy, ties = 0.0, 0
-        rounding = 1e3 * float(np.finfo(self.costs.dtype).eps)
+    def decode(self) -> tuple[float, np.ndarray]:
+        """Energy and (N,) labels of the decoding in order."""
+        labels, energy = np.zeros(len(self.costs), np.int64), 0.0
         for level in self.plan:
             exact = self.costs[level.nodes]
             level.down.add(exact, self._lines(level.down, labels))
@@ -223,7 +218,4 @@ class _Passes:
             best = total.argmin(axis=1)
             labels[level.nodes] = best
             energy += float(exact[np.arange(len(best)), best].sum(dtype=np.float64))
-            limit = total.min(axis=1, keepdims=True)
-            limit = limit + rounding * np.maximum(1, np.abs(limit))
-            ties += int(((total <= limit).sum(axis=1) > 1).sum())
-        return energy, labels, ties
+        return energy, labels

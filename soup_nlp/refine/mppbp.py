@@ -273,7 +273,6 @@ class Rounds:
             bound=result.lower_bound,
             iterations=result.iterations,
             status=result.status,
-            ties=result.ties,
             taken=taken,
             moved=int((labels > 0).sum()),
             proposed=_by_kind(number, np.isfinite(unary).sum(axis=0)),

@@ -43,7 +43,6 @@ class Round:
         bound: TRW-S's lower bound on every choice among these particles.
         iterations: Iterations of TRW-S.
         status: Status of TRW-S.
-        ties: Superpixels whose label was a tie when decoded.
         taken: Whether the choice lowered E; if not, the belief stays.
         moved: Superpixels that left their current belief.
         proposed: Feasible particles by kind.
@@ -56,7 +55,6 @@ class Round:
     bound: float
     iterations: int
     status: str
-    ties: int
     taken: bool
     moved: int
     proposed: Mapping[str, int] = field(repr=False)
@@ -66,8 +64,7 @@ class Round:
     def __str__(self) -> str:
         return (
             f"E {self.energy['total']:.6g}, bound {self.bound:.6g}, gap {self.gap:.3g},"
-            f" {self.moved} moved, {self.ties} ties, {self.iterations} iterations,"
-            f" {self.seconds:.1f} s"
+            f" {self.moved} moved, {self.iterations} iterations, {self.seconds:.1f} s"
         )
 
     __repr__ = __str__

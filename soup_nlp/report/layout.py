@@ -91,7 +91,6 @@ refine/mrf_energy         1     T       energy of the chosen labels in the MRF o
 refine/bound              1     T       TRW-S's lower bound on every choice among the particles
 refine/gap                1     T       largest excess over the best choice among the particles
 refine/moved              1     T       superpixels that left their belief
-refine/ties               1     T       superpixels whose label was a tie when decoded
 refine/iterations         1     T       iterations of TRW-S
 refine/taken              1     T       whether the choice lowered the exact E
 refine/seconds            s     T       wall time

@@ -15,7 +15,7 @@ from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.storage.versions import versions
 
 _ROUND = (
-    *("energy", "mrf_energy", "bound", "gap", "taken", "moved", "ties", "iterations", "status"),
+    *("energy", "mrf_energy", "bound", "gap", "taken", "moved", "iterations", "status"),
     *("seconds", "proposed", "accepted"),
 )
 """Entries of a round of the refinement in summary.json."""

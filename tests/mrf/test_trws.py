@@ -95,7 +95,6 @@ def test_binary_bound_reaches_the_relaxation_of_a_frustrated_cycle():
     assert result.lower_bound == pytest.approx(0.0)
     assert result.energy == pytest.approx(1.0)
     assert result.status == "stagnation"
-    assert result.ties >= 1
 
 
 def test_larger_problem_float32_follows_float64():
@@ -175,7 +174,7 @@ def test_no_edges_lone_nodes_and_single_labels():
     alone = solve_trws(*padded(unary, NO_EDGES, []))
     assert (alone.energy, alone.lower_bound, alone.status) == (4.5, 4.5, "gap")
     assert alone.labels.tolist() == [1, 0, 0]
-    assert (alone.iterations, alone.ties) == (1, 1)
+    assert alone.iterations == 1
     joined = solve_trws(*padded(unary, np.array([[1, 0]]), [np.array([[5.0, 7.0]])]))
     assert joined.energy == pytest.approx(10.5)
     assert joined.lower_bound == pytest.approx(10.5)
@@ -216,7 +215,6 @@ def test_initial_labels_return_where_rounding_misled():
     result = solve_trws(unary, NO_EDGES, none, init_labels=np.array([1]))
     assert result.energy == 1e8 + 3.0
     assert result.labels.tolist() == [1]
-    assert result.ties == 0
     # where float32 distinguishes the costs, the best label is chosen
     result = solve_trws(unary - 1e8, NO_EDGES, none, init_labels=np.array([2]))
     assert (result.energy, result.labels.tolist()) == (3.0, [1])

@@ -7,8 +7,9 @@ import pytest
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
+from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
-from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline import case
 from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.focal_length import focal_length
 
@@ -48,10 +49,14 @@ def test_only_a_guess_is_corrected():
     problem = make_problem(raw)
     right = problem.load_pair()
     wrong = right.with_focal(1.3, 0.0)
-    kept = prepare(problem, pair=wrong).pair
+
+    def observed(pair: Pair) -> Pair:
+        return case._observed(problem, pair, None, lambda *_: None)[1]
+
+    kept = observed(wrong)
     np.testing.assert_array_equal(kept.K_ref, wrong.K_ref)
     assert kept.focal_sigma == 0
-    corrected = prepare(problem, pair=replace(wrong, focal_sigma=GUESS_SIGMA)).pair
+    corrected = observed(replace(wrong, focal_sigma=GUESS_SIGMA))
     np.testing.assert_allclose(corrected.K_ref, right.K_ref, rtol=0.08)
     np.testing.assert_array_equal(corrected.K_ref[:2, 2], right.K_ref[:2, 2])
     assert corrected.focal_sigma < 0.15
