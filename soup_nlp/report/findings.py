@@ -4,10 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from soup_nlp.arrays import AnyFloat, Float
+from soup_nlp.arrays import Float
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.result import Result
 
 SHARES = {
     "flow": "by flow and parallax",
@@ -182,23 +181,11 @@ def flow_words(run: Run) -> list[str]:
     return lines
 
 
-def hints(
-    uv: AnyFloat,
-    confidence: AnyFloat,
-    shares: Mapping[str, float],
-    focal_sigma: float = 0.0,
-    camera: str | None = None,
-) -> list[str]:
-    """What would give a better depth.
-
-    Args:
-        uv: (H, W, 2) flow, pixels.
-        confidence: (H, W) of the flow; 0 is unusable.
-        shares: Those of `certainty`.
-        focal_sigma: Standard deviation of the log focal length; 0 where it is given.
-        camera: Error of the given camera that the flow shows, one of `evaluate.camera.KINDS`.
-    """
-    usable, out = confidence > 0, []
+def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
+    """What would give a better depth; `shares` are those of `certainty`."""
+    assert run.pair.flow is not None
+    uv, usable, out = run.pair.flow.uv, run.pair.flow.confidence > 0, list[str]()
+    camera = run.confidence.evidence.camera
     length = float(np.median(np.linalg.norm(uv, axis=-1)[usable])) if usable.any() else 0.0
     if _unmatched(float(usable.mean()), shares["guess"]):
         # what the little flow suggests (no parallax, a wrong camera) is no cause
@@ -216,25 +203,22 @@ def hints(
         out.append(
             f"undistorted images and exact intrinsics: the flow suggests an error of {camera}"
         )
-    if focal_sigma > UNSURE_FOCAL and shares["weak"] >= SHARE:
+    if run.pair.focal_sigma > UNSURE_FOCAL and shares["weak"] >= SHARE:
         out.append("the focal length of the camera (--fov or --intrinsics)")
     if shares["scale"] + shares.get("unexplained", 0.0) >= SHARE:
         out.append("a depth from elsewhere (--depth-prior) for what moves")
     return ["; ".join(out)] if out else []
 
 
-def limits(result: Result) -> list[str]:
+def limits(run: Run, shares: Mapping[str, float]) -> list[str]:
     """What limits a result and what to try, in the words of the verdict; at least one sentence."""
-    s, shares = result.summary, result.summary["certainty"]
-    lines = []
-    if not s["converged"] and s["status"] != "Skipped":
-        lines.append(f"The NLP did not converge ({s['status']}): try a larger solver.max_iter.")
+    lines, s = [], run.solution
+    if not s.converged and s.status != "Skipped":
+        lines.append(f"The NLP did not converge ({s.status}): try a larger solver.max_iter.")
     if shares["guess"] >= SHARE:
         lines.append(f"{guess_words(shares, ' of the image')}.")
-    if result.bends.any():
-        share = float(result.bends[result.labels].mean())
+    if run.start.bends.any():
+        share = float(run.start.bends[run.segmentation.labels].mean())
         lines.append(f"{share:.0%} of the image bends: its relief is weakly determined.")
-    by_camera = s["focal_sigma"], s["camera_error"]
-    told = hints(result.flow, result.flow_confidence, shares, *by_camera)
-    lines += [f"Try {text}." for text in told]
+    lines += [f"Try {text}." for text in hints(run, shares)]
     return lines or ["Nothing stands out: flow, parallax and convergence are good."]

@@ -22,7 +22,7 @@ from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, whole_cells
 from soup_nlp.report.colour import component_colours
-from soup_nlp.report.findings import ORIGINS, guess_line, limits
+from soup_nlp.report.findings import ORIGINS, guess_line
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.report.result import Result
 from soup_nlp.start.components import TIES
@@ -67,7 +67,7 @@ def page(result: Result, drawn: Mapping[str, Picture]) -> str:
         "style": web_file("page.css"),
         "summary": _summary(result),
         "gallery": "\n".join(_figure(picture) for picture in drawn.values()),
-        "limits": "\n".join(f"<li>{escape(line)}</li>" for line in limits(result)),
+        "limits": "\n".join(f"<li>{escape(line)}</li>" for line in result.summary["limits"]),
         "components": _components(result),
         "verdict": escape(result.verdict) or "not recorded",
     }

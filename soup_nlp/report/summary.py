@@ -9,7 +9,7 @@ from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.evaluate.metrics import component_overlaps, skill
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import DETERMINED, ORIGINS
+from soup_nlp.report.findings import DETERMINED, ORIGINS, limits
 from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.storage.versions import versions
@@ -27,6 +27,7 @@ def summary(run: Run) -> dict[str, Any]:
     constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
     facing = run.problem.formulation.min_facing
     components: dict[str, Any] = {"count": len(run.components)}
+    shares = certainty(run)
     if truth is not None and truth.components is not None:
         overlaps = component_overlaps(run.components.of_pixel, truth.components)
         components["truth"] = {
@@ -84,7 +85,8 @@ def summary(run: Run) -> dict[str, Any]:
             "borrowed": int(run.start.borrowed.sum()),
             "median_error_px": float(np.median(run.start.error)),
         },
-        "certainty": certainty(run),
+        "certainty": shares,
+        "limits": limits(run, shares),
         "evidence": run.confidence.evidence.rows(),
         **({} if run.given is None else {"depth_prior": run.given.as_dict()}),
         "flow": str(run.pair.flow),

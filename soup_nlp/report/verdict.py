@@ -85,16 +85,14 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
         limit: Largest MRE that the problem file expects.
         details: Add what concerns the flow and the solver: iterations, energies, residuals.
     """
-    shares, flow = certainty(run), run.pair.flow
-    by_camera = run.pair.focal_sigma, run.confidence.evidence.camera
-    assert flow is not None
+    shares = certainty(run)
     whole = {k: v for k, v in run.seconds.items() if not k.startswith("nlp_")}
     inner = {k[4:]: v for k, v in run.seconds.items() if k.startswith("nlp_")}
     sections = {
         "status": _status(run),
         "found": found_words(run),
         "certainty": certainty_lines(shares),
-        "try": hints(flow.uv, flow.confidence, shares, *by_camera),
+        "try": hints(run, shares),
         "accuracy": accuracy(run.metrics),
         "expected": [f"MRE at most {limit:g}: {'missed' if missed(run) else 'met'}"]
         if limit is not None and "solution" in run.metrics

@@ -72,9 +72,7 @@ def started(pair: Pair):
     raw = {"input": ORBIT, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
     case = prepare(make_problem(raw), pair=pair)
     done = make_run(case, skipped(case))
-    shares, flow = certainty(done), done.pair.flow
-    camera = done.confidence.evidence.camera
-    return done, "; ".join(hints(flow.uv, flow.confidence, shares, 0.0, camera))
+    return done, "; ".join(hints(done, certainty(done)))
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report import page as page_module
-from soup_nlp.report.findings import SHARES, limits
+from soup_nlp.report.findings import SHARES
 from soup_nlp.report.folder import _title, write_folder
 from soup_nlp.report.page import MODES, make_scene, page, surface_cells
 from soup_nlp.report.pictures import _enlarged, pictures
@@ -31,12 +31,6 @@ def shown(small_run):
 @pytest.fixture(scope="module")
 def text(shown):
     return page(shown, pictures(shown))
-
-
-def with_array(shown, place, values):
-    """The tree of a result with another array."""
-    group, name = place.split("/")
-    return {**shown.tree, group: {**shown.tree[group], name: values}}
 
 
 def data_of(text):
@@ -204,23 +198,6 @@ def test_page_pictures_and_overview_begin_with_the_guess(guess, said, shown):
     assert pale[0].mean() == pytest.approx(guess, abs=0.05)
     assert (f"<p><strong>{sentence}</strong> &middot; " in header) == bool(said)
     assert _title(one) == (f"{one.name}: {sentence}" if said else one.name)
-
-
-def test_limits_name_what_is_wrong(shown):
-    good = " ".join(limits(shown))
-    assert "did not converge" not in good
-    tree = with_array(shown, "input/confidence", np.zeros_like(shown.flow_confidence))
-    shares = {"guess": 0.3, "unseen": 0.2, "rest": 0.004, "flat": 0.06, "weak": 0.036, "scale": 0}
-    told = {
-        **shown.summary, "status": "Time_Limit", "converged": False, "certainty": shares
-    }  # fmt: skip
-    found = limits(replace(shown, tree=tree, summary=told))
-    assert found == [
-        "The NLP did not converge (Time_Limit): try a larger solver.max_iter.",
-        "30% of the image is a guess (sigma above 25%): 20% no usable flow, 6% a turn alone or a"
-        " constant depth explains the flow nearly as well, 4% little information.",
-        "Try a better flow (--flow); frames farther apart in time.",
-    ]
 
 
 def test_sparse_truth_is_drawn_larger():

@@ -61,40 +61,59 @@ def test_a_shift_has_a_length_and_a_direction(vector, way, small_run):
     assert findings._shift(bare, np.array(vector)) == expected
 
 
+def seen(run, confidence=None, focal=0.0, camera=None):
+    """A run with another confidence of the flow, an unsure focal length, an error of the camera."""
+    flow, sure = run.pair.flow, run.confidence
+    flow = flow if confidence is None else replace(flow, confidence=confidence)
+    evidence = replace(sure.evidence, camera=camera)
+    pair = replace(run.pair, flow=flow, focal_sigma=focal)
+    return replace(run, pair=pair, confidence=replace(sure, evidence=evidence))
+
+
 def test_hints_name_what_would_help(small_run):
     shares = {**certainty(small_run), "rest": 0.0, "flat": 0.1, "scale": 0.1}
-    flow = small_run.pair.flow.uv, small_run.pair.flow.confidence
-    (told,) = findings.hints(*flow, shares)
+    (told,) = findings.hints(small_run, shares)
     assert "frames farther apart in time" in told
     assert "--depth-prior" in told
-    (told,) = findings.hints(*flow, {**shares, "rest": 0.9})
+    (told,) = findings.hints(small_run, {**shares, "rest": 0.9})
     assert "moves aside" in told
-    assert findings.hints(*flow, dict.fromkeys(shares, 0.0)) == []
+    assert findings.hints(small_run, dict.fromkeys(shares, 0.0)) == []
     weak = {**dict.fromkeys(shares, 0.0), "weak": 0.4}
-    assert findings.hints(*flow, weak, 0.1) == []
-    (told,) = findings.hints(*flow, weak, 0.3)
+    assert findings.hints(seen(small_run, focal=0.1), weak) == []
+    (told,) = findings.hints(seen(small_run, focal=0.3), weak)
     assert "--fov" in told
 
 
 def test_frames_without_a_common_scene_are_told_nothing_else(small_run):
     """Where hardly any flow is usable, its parallax, camera and motion are no evidence."""
     guess = {**certainty(small_run), "guess": 1.0, "flat": 0.1, "scale": 0.1}
-    flow = small_run.pair.flow
-    few = np.zeros_like(flow.confidence)
+    few = np.zeros_like(small_run.pair.flow.confidence)
     few[:5] = 1.0
     for camera in (None, "zoom between the frames"):
-        (told,) = findings.hints(flow.uv, few, guess, 0.4, camera)
+        (told,) = findings.hints(seen(small_run, few, 0.4, camera), guess)
         assert told.endswith("closer in time: hardly anything is in both")
-    assert "farther apart" in findings.hints(flow.uv, np.ones_like(few), guess)[0]
+    assert "farther apart" in findings.hints(seen(small_run, np.ones_like(few)), guess)[0]
     unsure = np.full_like(small_run.confidence.sigma, 1.2)
     for confidence, expected in ((few, True), (np.ones_like(few), False)):
-        run = replace(
-            small_run,
-            pair=replace(small_run.pair, flow=replace(flow, confidence=confidence)),
-            confidence=replace(small_run.confidence, sigma=unsure),
-        )
+        run = seen(small_run, confidence)
+        run = replace(run, confidence=replace(run.confidence, sigma=unsure))
         camera = findings.found_words(run)[0]
         assert camera.endswith("(a guess: hardly any flow is usable)") == expected
+
+
+def test_limits_name_what_is_wrong(small_run):
+    good = " ".join(findings.limits(small_run, certainty(small_run)))
+    assert "did not converge" not in good
+    shares = {"guess": 0.3, "unseen": 0.2, "rest": 0.004, "flat": 0.06, "weak": 0.036, "scale": 0}
+    failed = replace(small_run.solution, status="Time_Limit", converged=False)
+    run = replace(small_run, solution=failed)
+    found = findings.limits(seen(run, np.zeros_like(run.pair.flow.confidence)), shares)
+    assert found == [
+        "The NLP did not converge (Time_Limit): try a larger solver.max_iter.",
+        "30% of the image is a guess (sigma above 25%): 20% no usable flow, 6% a turn alone or a"
+        " constant depth explains the flow nearly as well, 4% little information.",
+        "Try a better flow (--flow); frames farther apart in time.",
+    ]
 
 
 def test_the_table_of_energies_ends_with_what_the_refinement_lowers():
