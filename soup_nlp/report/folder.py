@@ -112,7 +112,7 @@ def write_folder(
         folder: Prepared folder.
         run: The run.
         log: Text of the log, or a function that makes it from the names of the other files.
-        verdict: Verdict on the page; None for `facts`.
+        verdict: Verdict for summary.json and the page; None for `facts`.
         ipopt_log: Log file of Ipopt.
         formats: Further formats, see `formats.FORMATS`.
         overwrite: Overwrite files that the program did not make.
@@ -128,8 +128,9 @@ def write_folder(
         if ipopt_log is not None and ipopt_log.is_file():
             shutil.copy(ipopt_log, new / "ipopt.log")
         write_text(new / "config.yaml", config)
-        contents = summary(run)
-        result = result_of(run, contents, facts(run) if verdict is None else verdict)
+        words = facts(run) if verdict is None else verdict
+        contents = {**summary(run), "verdict": words.splitlines()}
+        result = result_of(run, contents)
         drawn, rec = pictures(result), run.reconstruction
         depths: dict[str, AnyFloat] = {"ref": rec.depth_ref, "next": rec.depth_next}
         if run.full is not None:

@@ -69,7 +69,7 @@ def page(result: Result, drawn: Mapping[str, Picture]) -> str:
         "gallery": "\n".join(_figure(picture) for picture in drawn.values()),
         "limits": "\n".join(f"<li>{escape(line)}</li>" for line in result.summary["limits"]),
         "components": _components(result),
-        "verdict": escape(result.verdict) or "not recorded",
+        "verdict": escape("\n".join(result.summary["verdict"])),
     }
     return filled("page", data, parts)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image, Mask
-from soup_nlp.errors import DataError, printable
+from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, MOST_SIGMA, NO_CONFIDENCE
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import DEPTHS
@@ -21,7 +21,7 @@ from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.layout import require_layout, result_tree
-from soup_nlp.storage.files import as_path, is_file, plain, read_json, read_text
+from soup_nlp.storage.files import as_path, plain, read_json
 from soup_nlp.storage.store import ReadTree, read_attrs, read_h5, require
 
 PAGE = "report.html"
@@ -46,7 +46,6 @@ class Result:
         metrics: Scores against the truth, as those of a `Run`.
         metre_unit: Name of the unit of the truth.
         min_confidence: Smallest confidence of points in clouds.
-        verdict: Verdict that was printed at the end of the solve.
     """
 
     tree: ReadTree
@@ -56,7 +55,6 @@ class Result:
     metrics: Mapping[str, DepthMetrics]
     metre_unit: str = "m"
     min_confidence: float = MIN_CONFIDENCE
-    verdict: str = ""
 
     def __str__(self) -> str:
         h, w = self.images[0].shape[:2]
@@ -191,7 +189,7 @@ class Result:
         return known & ~hidden(self.reconstruction) & ~at_jumps(*self.surface)
 
 
-def result_of(run: Run, summary: Mapping[str, Any], verdict: str = "") -> Result:
+def result_of(run: Run, summary: Mapping[str, Any]) -> Result:
     """The result of a run; `summary` has the contents of summary.json."""
     return Result(
         tree=result_tree(run),
@@ -201,7 +199,6 @@ def result_of(run: Run, summary: Mapping[str, Any], verdict: str = "") -> Result
         metrics=run.metrics,
         metre_unit="m" if run.pair.truth is None else run.pair.truth.unit,
         min_confidence=run.problem.output.min_confidence,
-        verdict=verdict,
     )
 
 
@@ -238,20 +235,9 @@ def load(folder: str | Path) -> Result:
             components=find_components(soup, seg, part, K_ref, K_next, borrowed),
             metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
             metre_unit=str(unit),
-            verdict=_ending(folder / "log.txt"),
         )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise DataError("result does not hold together", where=folder, found=error) from error
-
-
-def _ending(log: Path) -> str:
-    """The verdict at the end of a log; "" if there is none."""
-    if not is_file(log):
-        return ""
-    lines = [printable(line) for line in read_text(log, "log.txt").splitlines()]
-    starts = [k for k, line in enumerate(lines) if line.startswith(("status  ", "solver  "))]
-    last = lines[starts[-1] :] if starts else []
-    return "\n".join(line for line in last if not line.startswith(("files  ", "look  ", "next  ")))
 
 
 def _metrics(row: Mapping[str, Any]) -> DepthMetrics:

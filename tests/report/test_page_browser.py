@@ -24,7 +24,7 @@ BACKGROUND = (0x20, 0x26, 0x2E)
 @pytest.fixture(scope="module")
 def opened(small_run, tmp_path_factory):
     """The page of a run, once it is ready."""
-    shown = result_of(small_run, summary(small_run), "verdict")
+    shown = result_of(small_run, {**summary(small_run), "verdict": ["verdict"]})
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(page(shown, pictures(shown)), encoding="utf-8")
     assert CHROMIUM is not None
@@ -160,7 +160,7 @@ def test_a_click_tells_depth_sigma_and_component(browser, small_run):
     assert abs(found // width - v) <= 2
     browser.value(f"soupView.tell({found})")
     said = browser.value("document.getElementById('picked').textContent")
-    shown = result_of(small_run, summary(small_run), "")
+    shown = result_of(small_run, summary(small_run))
     z = shown.scale * small_run.reconstruction.depth_ref[found // width, found % width]
     assert f"depth {z:.4g}"[:9] in said
     assert "sigma" in said
@@ -202,7 +202,7 @@ def test_what_is_shown_is_saved_for_other_viewers(browser, small_run, tmp_path, 
     (tmp_path / "a.glb").write_bytes(base64.b64decode(text))
     (found,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     assert isinstance(found, trimesh.PointCloud if points else trimesh.Trimesh)
-    shown = result_of(small_run, summary(small_run), "")
+    shown = result_of(small_run, summary(small_run))
     own = shown.scale * small_run.reconstruction.points_ref.reshape(-1, 3)
     assert len(found.vertices) > 0.5 * len(own)
     # the scene at time 1 in the reference camera's axes, y up
