@@ -1,20 +1,30 @@
-"""The NLP record: kernels, tables, bounds; its functions are made when first asked for."""
+"""The NLP record: kernels, tables, bounds; its functions are made when first asked for.
 
+A kernel is machine code on vectors of eight elements (`lanes`) where a C compiler is found, else
+its instructions are calls of numpy on blocks of elements (`vectors`).
+"""
+
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Self
 
+import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group, Hessian
-from soup_nlp.model.lanes import Summed
+from soup_nlp.model.lanes import LANES, Summed, compile_lanes
 from soup_nlp.model.pattern import Pattern, hessian_entries, jacobian_entries
-from soup_nlp.model.sums import Terms, summed
 from soup_nlp.model.vectors import Vectors
+
+log = logging.getLogger(__name__)
+Terms = tuple[int, list[Summed | Vectors]]
+"""Size of a vector, and functions of kernels over their tables, whose entries it is the sum of."""
 
 
 @dataclass(frozen=True)
@@ -49,19 +59,19 @@ class NLP:
 
     def value(self, x: Float, theta: Float | None = None) -> float:
         """f at x (nx,); theta (nt,) of another smoothing."""
-        return float(self._sum(self._first["f"], 1, x, theta)[0])
+        return float(self._sum(self._first["f"], x, theta)[0])
 
     def gradient(self, x: Float, theta: Float | None = None) -> Float:
         """Gradient of f (nx,)."""
-        return self._sum(self._first["grad"], self.nx, x, theta)
+        return self._sum(self._first["grad"], x, theta)
 
     def constraints(self, x: Float, theta: Float | None = None) -> Float:
         """g (ng,)."""
-        return self._sum(self._first["con"], self.ng, x, theta)
+        return self._sum(self._first["con"], x, theta)
 
     def jacobian_nonzeros(self, x: Float, theta: Float | None = None) -> Float:
         """Nonzeros of g's Jacobian, in the order of `jacobian_pattern`."""
-        return self._sum(self._first["jac"], self.nnzj, x, theta)
+        return self._sum(self._first["jac"], x, theta)
 
     def jacobian(self, x: Float) -> sparse.csr_matrix:
         """(ng, nx) Jacobian of g."""
@@ -72,7 +82,7 @@ class NLP:
     ) -> Float:
         """Nonzeros of the upper triangle of `lam_f f + lam_g . g`, in the order of
         `hessian_pattern`."""
-        return self._sum(self._second["hess"], self.nnzh, x, theta, lam_f, lam_g)
+        return self._sum(self._second["hess"], x, theta, lam_f, lam_g)
 
     def hessian(
         self, x: Float, lam_g: Float, lam_f: float = 1.0, theta: Float | None = None
@@ -83,14 +93,13 @@ class NLP:
 
     def _sum(
         self,
-        terms: Sequence[Summed | Vectors],
-        size: int,
+        terms: Terms,
         x: Float,
         theta: Float | None,
         lam_f: float = 1.0,
         lam_g: Float | None = None,
     ) -> Float:
-        """The vector (size,) of the terms at x; the multipliers are for Hessians.
+        """The vector of the terms at x; the multipliers are for Hessians.
 
         Raises:
             ValueError: a vector has another length, which machine code does not see.
@@ -99,29 +108,64 @@ class NLP:
         given = _vector("x", x, self.nx), _vector("theta", theta, len(self.theta))
         lam_g = lam_g if lam_g is None else _vector("lam_g", lam_g, self.ng)
         # one entry more, for what fills the last block of lanes
+        size, summands = terms
         out = np.zeros(size + 1)
-        for term in terms:
+        for term in summands:
             term.add(out, *given, lam_f, lam_g)
         return out[:-1]
 
     @cached_property
-    def _first(self) -> Terms:
+    def _first(self) -> Mapping[str, Terms]:
         """f, its gradient, g, its Jacobian."""
-        sizes = {"f": 1, "grad": self.nx, "con": self.ng, "jac": self.nnzj}
-        targets = [
-            {"f": np.zeros((len(g), 1), int), "grad": g.index, "con": g.rows, "jac": p}
-            for g, p in zip(self.groups, self.jacobian_pattern.places)
-        ]
-        functions = [g.kernel.first_order() for g in self.groups]
-        return summed(self.groups, functions, targets, sizes, self.compiled)
+        groups = self.groups
+        places = {
+            "f": (1, [np.zeros((len(g), 1), int) for g in groups]),
+            "grad": (self.nx, [g.index for g in groups]),
+            "con": (self.ng, [g.rows for g in groups]),
+            "jac": (self.nnzj, self.jacobian_pattern.places),
+        }
+        return self._terms([g.kernel.first_order() for g in groups], places)
 
     @cached_property
-    def _second(self) -> Terms:
+    def _second(self) -> Mapping[str, Terms]:
         """The Hessian, apart from the rest, since a start at a KKT point does not need it."""
         functions = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
-        targets = [{"hess": p} for p in self.hessian_pattern.places]
-        sizes = {"hess": self.nnzh}
-        return summed(self.groups, functions, targets, sizes, self.compiled)
+        return self._terms(functions, {"hess": (self.nnzh, self.hessian_pattern.places)})
+
+    def _terms(
+        self,
+        functions: Sequence[Mapping[str, ca.Function]],
+        places: Mapping[str, tuple[int, Sequence[NDArray[np.integer]]]],
+    ) -> Mapping[str, Terms]:
+        """Terms of sums, evaluated by the fastest way there is.
+
+        Args:
+            functions: Of every group, by the sum that they belong to.
+            places: Size of every sum, and where (E, k) the entries of every group are added.
+
+        Raises:
+            ModelError: a kernel has an unknown operation.
+        """
+        out: dict[str, Terms] = {key: (size, []) for key, (size, _) in places.items()}
+        compiled = self.compiled
+        for k, (group, own) in enumerate(zip(self.groups, functions)):
+            # one library per kernel: the cache then still holds the kernels that did not change
+            library = compile_lanes(list(own.values())) if compiled and own else None
+            if compiled and own and library is None:
+                compiled = False
+                log.info(
+                    "no machine code: kernels run in numpy, and a solve takes about a third"
+                    " longer (a C compiler on the PATH, gcc or clang, is used)"
+                )
+            blocks = group.blocks(LANES, np.int32) if library else None
+            for key, f in own.items():
+                size, targets = places[key]
+                out[key][1].append(
+                    Summed(library, f, blocks, targets[k], size)
+                    if library and blocks
+                    else Vectors(f, group, targets[k], size)
+                )
+        return out
 
     def evaluated(self) -> Self:
         """The same, with all its functions made now, so that later timings exclude it."""

@@ -44,7 +44,7 @@ def close(a, b, rtol=1e-9):
 
 def engine(nlp: NLP) -> type:
     """Class of the terms of f."""
-    return type(nlp.evaluated()._first["f"][0])
+    return type(nlp.evaluated()._first["f"][1][0])
 
 
 def squares(elements: int, compiled: bool = True, of=lambda x: x) -> NLP:
