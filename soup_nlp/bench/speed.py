@@ -136,7 +136,7 @@ def measure_speed(cell: Cell) -> Row:
 
 def _parts(wall: float, solution: Solution) -> dict[str, float]:
     """Wall seconds of the parts of the NLP; all time outside the stages counts as building."""
-    functions = sum(sum(s.calls.values()) for s in solution.stages)
+    functions = sum(s.evaluating for s in solution.stages)
     stages = sum(s.seconds for s in solution.stages)
     return {
         "build": max(0.0, wall - stages),

@@ -141,7 +141,7 @@ def foreign_run(
         iterations=0,
         seconds=0.0,
         history={},
-        calls={},
+        evaluating=0.0,
     )
     rest = residuals(nlp, soup, stage, case.data, form.min_facing)
     # a run holds its last iterate in matrices

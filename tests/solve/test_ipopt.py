@@ -157,8 +157,7 @@ def test_history_counts_and_call_times_are_kept():
     assert stage.history.keys() >= {"obj", "inf_pr", "inf_du", "mu"}
     assert all(len(v) == stage.iterations + 1 for v in stage.history.values())
     np.testing.assert_allclose(stage.history["obj"], [p.objective for p in seen])
-    assert stage.calls.keys() == {"f", "grad_f", "g", "jac_g", "hess_lag"}
-    assert 0 <= sum(stage.calls.values()) <= stage.seconds
+    assert 0 < stage.evaluating <= stage.seconds
 
 
 @pytest.mark.parametrize(
