@@ -169,7 +169,7 @@ class Builder:
         f = self.form
         nlp = NLP(
             name,
-            tuple(g for g in self.groups if len(g)),
+            tuple(self.groups),
             x0=np.clip(np.concatenate([x0, 0.0 * lower]), lbx, ubx),
             lbx=lbx,
             ubx=ubx,
