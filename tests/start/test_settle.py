@@ -1,53 +1,58 @@
-"""Motions that the flow leaves open are settled by the least relief; the others are not moved."""
+"""Motions that the flow leaves open are settled; the flow corrects a guessed focal length."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.formats.cameras import GUESS_SIGMA
+from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
+from soup_nlp.pipeline import case
 from soup_nlp.start.epipolar import Matches, Motion
+from soup_nlp.start.focal_length import focal_length
 from soup_nlp.start.settle import MOST_RELIEF, cauchy, most_probable, relief
 
 FOCAL = 500.0
 TRUE = Motion(rotation.exp(np.array([0.004, -0.006, 0.002])), np.array([0.6, 0.0, 0.8]))
 
 
-def flow(shift: float, spread: float = 0.3, bias: float = 0.0, count: int = 400):
-    """Rays of both frames and true log depths; `shift` is |t| over the median depth.
+def flow(shift: float, bias: float = 0.0, count: int = 400) -> tuple[Matches, np.ndarray]:
+    """Correspondences and true log depths; `shift` is |t| over the median depth.
 
     `bias` is a smooth error of the flow, pixels: a radial distortion.
     """
     rng = np.random.default_rng(0)
     r = np.column_stack([rng.uniform(-0.6, 0.6, (count, 2)), np.ones(count)])
-    log_z = spread * rng.standard_normal(count)
+    log_z = 0.3 * rng.standard_normal(count)
     q = np.exp(log_z)[:, None] * r @ TRUE.R.T + shift * TRUE.t
     q = q / q[:, 2:]
     radius = np.sum(r[:, :2] ** 2, axis=1, keepdims=True) / 0.36
     q[:, :2] += bias / FOCAL * radius * r[:, :2] / 0.6
-    return r, q, log_z
+    return Matches(r, q, np.ones(count), FOCAL), log_z
 
 
-def relief_error(motion: Motion, r: np.ndarray, q: np.ndarray, log_z: np.ndarray) -> float:
-    error = relief(motion, r, q) - log_z
-    return float(np.std(error))
+def relief_error(motion: Motion, matches: Matches, log_z: np.ndarray) -> float:
+    return float(np.std(relief(motion, matches.ray, matches.target) - log_z))
 
 
 def test_a_motion_that_parallax_determines_is_kept():
-    r, q, _ = flow(0.3)
-    found = most_probable([TRUE], Matches(r, q, np.ones(len(r)), FOCAL), 0.05)
+    found = most_probable([TRUE], flow(0.3)[0], 0.05)
     np.testing.assert_allclose(found.R, TRUE.R, atol=2e-4)
     np.testing.assert_allclose(found.t, TRUE.t, atol=5e-3)
 
 
 def test_depth_survives_little_parallax_and_biased_flow():
     """The motion of the least residual follows the bias, and distant points recede."""
-    r, q, log_z = flow(0.006, bias=0.4)
-    least = most_probable([TRUE], Matches(r, q, np.ones(len(r)), FOCAL), 1e-4)
-    found = most_probable([least], Matches(r, q, np.ones(len(r)), FOCAL), 0.15)
-    assert relief_error(found, r, q, log_z) < 0.7 * relief_error(least, r, q, log_z)
+    matches, log_z = flow(0.006, bias=0.4)
+    least = most_probable([TRUE], matches, 1e-4)
+    found = most_probable([least], matches, 0.15)
+    assert relief_error(found, matches, log_z) < 0.7 * relief_error(least, matches, log_z)
 
 
 def test_points_behind_the_camera_have_the_largest_relief():
-    r, q, _ = flow(0.3)
+    r, q, _, _ = flow(0.3)[0]
     backwards = Motion(TRUE.R, -TRUE.t)
     np.testing.assert_array_equal(relief(backwards, r, q), MOST_RELIEF)
     assert np.abs(relief(TRUE, r, q)).max() < MOST_RELIEF
@@ -57,3 +62,52 @@ def test_points_behind_the_camera_have_the_largest_relief():
 def test_squares_are_cauchy_losses(scale):
     x = np.array([-2.0, 1e-4, 0.1, 30.0])
     np.testing.assert_allclose(cauchy(x, scale) ** 2, scale**2 * np.log1p((x / scale) ** 2))
+
+
+# --- a guessed focal length -----------------------------------------------------------------------
+
+
+def correspondences(turn, shift, wrong, noise=0.05):
+    """Rays of both frames with a focal length that is `wrong` times too long."""
+    rng = np.random.default_rng(0)
+    r = np.column_stack([rng.uniform(-0.6, 0.6, (800, 2)), np.ones(800)])
+    X = rng.uniform(2, 6, 800)[:, None] * r @ rotation.exp(np.array(turn)).T + np.array(shift)
+    q = X / X[:, 2:]
+    q[:, :2] += noise / FOCAL * rng.standard_normal((800, 2))
+    r, q = (v / [wrong, wrong, 1.0] for v in (r, q))
+    return Matches(r, q, np.ones(800), FOCAL * wrong)
+
+
+@pytest.mark.parametrize("wrong", [0.7, 1.25])
+def test_a_turn_with_parallax_determines_the_focal_length(wrong):
+    matched = correspondences((0.05, 0.1, 0.02), (0.4, 0.1, 0.2), wrong)
+    factor, sigma = focal_length(matched, GUESS_SIGMA)
+    assert abs(np.log(factor * wrong)) < 0.08
+    assert sigma < 0.15
+
+
+def test_a_shift_without_a_turn_keeps_the_focal_length():
+    """A longer lens and as much deeper a scene have the same flow."""
+    factor, sigma = focal_length(correspondences((0, 0, 0), (0.4, 0, 0), 1.25), GUESS_SIGMA)
+    assert factor == pytest.approx(1.0, abs=0.05)
+    assert sigma > 0.85 * GUESS_SIGMA
+
+
+@pytest.mark.slow
+def test_only_a_guess_is_corrected():
+    scene = {"kind": "scene", "scene": "orbit", "width": 480, "height": 204}
+    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 60}}
+    problem = make_problem(raw)
+    right = problem.load_pair()
+    wrong = right.with_focal(1.3, 0.0)
+
+    def observed(pair: Pair) -> Pair:
+        return case._observed(problem, pair, None, lambda *_: None)[1]
+
+    kept = observed(wrong)
+    np.testing.assert_array_equal(kept.K_ref, wrong.K_ref)
+    assert kept.focal_sigma == 0
+    corrected = observed(replace(wrong, focal_sigma=GUESS_SIGMA))
+    np.testing.assert_allclose(corrected.K_ref, right.K_ref, rtol=0.08)
+    np.testing.assert_array_equal(corrected.K_ref[:2, 2], right.K_ref[:2, 2])
+    assert corrected.focal_sigma < 0.15
