@@ -171,8 +171,6 @@ def _attributes(run: Run, config: str) -> dict[str, Any]:
         "delivered": run.delivered,
         "config": config,
         "nlp": run.solution.description,
-        # None is left out
-        "truth_unit": None if run.pair.truth is None else run.pair.truth.unit,
     }
 
 

@@ -22,7 +22,7 @@ from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.layout import require_layout, result_tree
 from soup_nlp.storage.files import as_path, plain, read_json
-from soup_nlp.storage.store import ReadTree, read_attrs, read_h5, require
+from soup_nlp.storage.store import ReadTree, read_h5, require
 
 PAGE = "report.html"
 """Name of the page in a result folder."""
@@ -44,7 +44,6 @@ class Result:
         reconstruction: Dense 3D of both frames.
         components: Rigid components with their motions.
         metrics: Scores against the truth, as those of a `Run`.
-        metre_unit: Name of the unit of the truth.
         min_confidence: Smallest confidence of points in clouds.
     """
 
@@ -53,7 +52,6 @@ class Result:
     reconstruction: Reconstruction
     components: Components
     metrics: Mapping[str, DepthMetrics]
-    metre_unit: str = "m"
     min_confidence: float = MIN_CONFIDENCE
 
     def __str__(self) -> str:
@@ -154,6 +152,11 @@ class Result:
         return 1.0 if self.metre is None else self.metre
 
     @property
+    def metre_unit(self) -> str:
+        """Name of the unit of the truth."""
+        return str(self.summary.get("truth_unit") or "m")
+
+    @property
     def length(self) -> str:
         """Name of the unit of length in which depths are shown."""
         return "units" if self.metre is None else self.metre_unit
@@ -197,7 +200,6 @@ def result_of(run: Run, summary: Mapping[str, Any]) -> Result:
         reconstruction=run.reconstruction,
         components=run.components,
         metrics=run.metrics,
-        metre_unit="m" if run.pair.truth is None else run.pair.truth.unit,
         min_confidence=run.problem.output.min_confidence,
     )
 
@@ -215,8 +217,7 @@ def load(folder: str | Path) -> Result:
     """
     folder = as_path(folder, "result folder")
     path = folder / "result.h5"
-    tree, unit = read_h5(path), read_attrs(path).get("truth_unit", "m")
-    summary = read_json(folder / "summary.json", "summary.json")
+    tree, summary = read_h5(path), read_json(folder / "summary.json", "summary.json")
     require_layout(tree)
     try:
         _, _, K_ref, K_next, _ = (require(tree, f"input/{name}") for name in INPUTS)
@@ -234,7 +235,6 @@ def load(folder: str | Path) -> Result:
             reconstruction=replace(rec, sigma_ref=require(tree, "depth/sigma_ref")),
             components=find_components(soup, seg, part, K_ref, K_next, borrowed),
             metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
-            metre_unit=str(unit),
         )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise DataError("result does not hold together", where=folder, found=error) from error

@@ -61,6 +61,7 @@ def summary(run: Run) -> dict[str, Any]:
             k: vars(m) | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
             for k, m in run.metrics.items()
         },
+        "truth_unit": None if truth is None else truth.unit,
         "components": components,
         "expected": run.problem.expected.model_dump(),
         "seconds": run.seconds,

@@ -224,17 +224,6 @@ def _items(file: h5py.File) -> list[tuple[str, h5py.Group | h5py.Dataset]]:
     return items
 
 
-def read_attrs(path: PathLike) -> dict[str, Any]:
-    """Root attributes of a result file, numbers and texts.
-
-    Raises:
-        DataError: the file is missing or is not HDF5, or is damaged.
-    """
-    with _opened(path) as file:
-        out = {k: v.item() if isinstance(v, np.generic) else v for k, v in file.attrs.items()}
-        return {k: v.decode() if isinstance(v, bytes) else v for k, v in out.items()}
-
-
 @contextmanager
 def _opened(path: PathLike) -> Iterator[h5py.File]:
     """An open file; errors of h5py in the block become DataErrors."""
