@@ -70,12 +70,12 @@ def test_squares_are_cauchy_losses(scale):
 def correspondences(turn, shift, wrong, noise=0.05):
     """Rays of both frames with a focal length that is `wrong` times too long."""
     rng = np.random.default_rng(0)
-    r = np.column_stack([rng.uniform(-0.6, 0.6, (800, 2)), np.ones(800)])
-    X = rng.uniform(2, 6, 800)[:, None] * r @ rotation.exp(np.array(turn)).T + np.array(shift)
+    r = np.column_stack([rng.uniform(-0.6, 0.6, (400, 2)), np.ones(400)])
+    X = rng.uniform(2, 6, 400)[:, None] * r @ rotation.exp(np.array(turn)).T + np.array(shift)
     q = X / X[:, 2:]
-    q[:, :2] += noise / FOCAL * rng.standard_normal((800, 2))
+    q[:, :2] += noise / FOCAL * rng.standard_normal((400, 2))
     r, q = (v / [wrong, wrong, 1.0] for v in (r, q))
-    return Matches(r, q, np.ones(800), FOCAL * wrong)
+    return Matches(r, q, np.ones(400), FOCAL * wrong)
 
 
 @pytest.mark.parametrize("wrong", [0.7, 1.25])
