@@ -164,9 +164,8 @@ def full_depth(
         row = np.rint(y).astype(np.int64).clip(0, h - 1)
         plane = labels[row[:, None], column]
         v, u = np.nonzero(border[row[:, None], column])
-        if len(v):
-            position = np.stack([y[v], x[u]])
-            plane[v, u] = _voted(labels, small, image[top + v, u], position, row[v], column[u])
+        position = np.stack([y[v], x[u]])
+        plane[v, u] = _voted(labels, small, image[top + v, u], position, row[v], column[u])
         uv = np.stack(np.meshgrid(np.arange(width), rows), axis=-1)
         facing = -np.einsum("hwc,hwc->hw", normal[plane], rays(K, uv))
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -160,9 +160,6 @@ def _shared_boundaries(
         first.append(a[differ])
         second.append(b[differ])
     p, q = np.concatenate(first), np.concatenate(second)
-    if not len(p):
-        empty = np.zeros(0, np.int64)
-        return np.zeros((0, 2), np.int64), np.zeros((0, samples or 1, 2)), empty, np.zeros(0)
     i, k = labels.ravel()[p].astype(np.int64), labels.ravel()[q].astype(np.int64)
     swap = i > k
     p, q = np.where(swap, q, p), np.where(swap, p, q)
@@ -201,7 +198,7 @@ def _sample_along(points: Float, which: Int, count: Int, samples: int | None) ->
     along = off[:, 0] * np.cos(angle)[which] + off[:, 1] * np.sin(angle)[which]
     order = np.lexsort((along, which))
     start = np.concatenate([[0], np.cumsum(count)[:-1]])
-    b = int(count.max()) if samples is None else samples
+    b = int(count.max(initial=1)) if samples is None else samples
     # midpoints of b equal parts: b = 1 is the middle, large b tends to the whole boundary
     fraction = (np.arange(b) + 0.5) / b
     inside = np.minimum((fraction[None] * count[:, None]).astype(np.int64), count[:, None] - 1)

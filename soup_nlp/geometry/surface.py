@@ -51,11 +51,10 @@ def joined(rec: Reconstruction, K: Float, group: NDArray[np.integer]) -> tuple[M
         i, k = rec.labels[a], rec.labels[b]
         continuous = (i == k) & np.isfinite(rec.depth_ref[a]) & np.isfinite(rec.depth_ref[b])
         across = (i != k) & (group[a] == group[b])
-        if across.any():
-            pairs = np.stack([i[across], k[across]], axis=1)
-            z = rec.soup.depth_across(pairs, 0.5 * (ray[a][across] + ray[b][across]))
-            near, far = z.min(axis=0), z.max(axis=0)
-            continuous[across] = (far - near) <= JUMP * near
+        pairs = np.stack([i[across], k[across]], axis=1)
+        z = rec.soup.depth_across(pairs, 0.5 * (ray[a][across] + ray[b][across]))
+        near, far = z.min(axis=0), z.max(axis=0)
+        continuous[across] = (far - near) <= JUMP * near
         out.append(continuous)
     return out[0], out[1]
 

@@ -156,14 +156,13 @@ class TumInput(PairInput):
         images = _tum_list(folder.need("rgb.txt"))
         depths = folder.read(_tum_list, "depth.txt") or []
         numbers = self.frame, self.frame + self.step
-        for index in numbers:
-            if not 0 <= index < len(images):
-                raise DataError(
-                    "frame is not in the sequence",
-                    where=folder.path / "rgb.txt",
-                    found=index,
-                    expected=f"0 to {len(images) - 1}",
-                )
+        if numbers[1] >= len(images):
+            raise DataError(
+                "frame is not in the sequence",
+                where=folder.path / "rgb.txt",
+                found=numbers[1],
+                expected=f"0 to {len(images) - 1}",
+            )
         K = folder.read(read_intrinsics, "K.txt", "camera.txt")
         K = _tum_camera(folder.path) if K is None else K
         maps = []

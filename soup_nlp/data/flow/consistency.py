@@ -74,11 +74,9 @@ def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:
 
     Args:
         gap: (H, W) round-trip error, pixels; infinite where the flow leaves the next image.
-        support: Side of the window for the mean error, odd, pixels; 1 is the pixel itself.
+        support: Side of the window for the mean error, odd, pixels.
     """
-    if support > 1:
-        mean = cv2.blur(np.minimum(gap, _NOISE_CAP), (support, support))
-        gap = np.maximum(gap, mean)
+    gap = np.maximum(gap, cv2.blur(np.minimum(gap, _NOISE_CAP), (support, support)))
     confidence = np.exp(-np.square(np.minimum(gap, LIMIT)), dtype=np.float32)
     confidence[~(gap <= LIMIT)] = 0.0
     return np.asarray(confidence, dtype=np.float32)

@@ -246,10 +246,7 @@ def flow_between_bars(match: FlowSource, image_ref: Image, image_next: Image) ->
     """
     inside = content(image_ref, image_next)
     first, second = (np.ascontiguousarray(image[inside]) for image in (image_ref, image_next))
-    flow = match(first, second)
-    if first.shape == image_ref.shape:
-        return flow
-    size = image_ref.shape[:2]
+    flow, size = match(first, second), image_ref.shape[:2]
     uv, confidence = np.zeros((*size, 2), np.float32), np.zeros(size, np.float32)
     uv[inside], confidence[inside] = flow.uv, flow.confidence
     return Flow(uv, confidence, flow.source)

@@ -107,11 +107,10 @@ def fractal_noise(
         x = np.clip((cell / footprint - FINEST_CELLS[0]) / np.ptp(FINEST_CELLS), 0, 1)
         weight = (x * x * (3 - 2 * x)).astype(np.float32)
         visible = np.flatnonzero(weight)
-        if len(visible):
-            # a shift per octave, or all octaves would share a lattice node at the origin
-            shift = np.mod(GOLDEN * (k + 1) * np.array([1.0, 7.0, 13.0]), 1) * PERIOD
-            where = turned[visible] / cell + shift
-            total[visible] += np.float32(scale) * weight[visible] * value_noise(where, seed)
+        # a shift per octave, or all octaves would share a lattice node at the origin
+        shift = np.mod(GOLDEN * (k + 1) * np.array([1.0, 7.0, 13.0]), 1) * PERIOD
+        where = turned[visible] / cell + shift
+        total[visible] += np.float32(scale) * weight[visible] * value_noise(where, seed)
         scale *= persistence
         cell /= LACUNARITY
     return total * np.float32(1.6)
