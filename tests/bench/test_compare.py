@@ -30,7 +30,7 @@ MANY = 1 << 30
 LABEL = {
     "problem": "tiny",
     "problem_hash": "0",
-    "superpixels": 12,
+    "superpixels": 4,
     "formulation": "unit-offset/smooth",
     "start": "proposal",
     "energy_limit": np.finfo(float).max,
@@ -39,7 +39,7 @@ Solve = Callable[[Task], Answer]
 
 
 def make_task(**form: str) -> Task:
-    tiny = Tiny(neighbours=3, samples=3, boundary_samples=1)
+    tiny = Tiny(neighbours=2, samples=3, boundary_samples=1, superpixels=4)
     # wide smoothing: with 0.2 the way from a cold start is so long that rounding decides its end
     # (a length of 1, which is the focal length in pixels)
     wide = float(tiny.data.K_next[0, 0])
@@ -84,10 +84,6 @@ def program(folder: Path, text: str) -> Path:
     return path
 
 
-def die() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 # --- isolation -----------------------------------------------------------------------------------
 
 
@@ -121,7 +117,7 @@ def test_crashes_and_errors_are_answers(tmp_path):
     ended = isolated(lambda: int("no"), tmp_path, 20, MANY)
     assert ended.how == "raised"
     assert ended.value.startswith("ValueError: invalid literal")
-    ended = isolated(die, tmp_path, 20, MANY)
+    ended = isolated(lambda: os.kill(os.getpid(), signal.SIGKILL), tmp_path, 20, MANY)
     words = "killed by SIGKILL, perhaps out of memory"
     assert (ended.how, ended.value) == ("crashed: SIGKILL", words)
 

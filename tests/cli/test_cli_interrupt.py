@@ -80,42 +80,32 @@ def test_a_second_interrupt_aborts_with_a_message(tmp_path, monkeypatch, capfd):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize("at", [solve_module.options.SolveLog.iteration, cases.propose])
-def test_once_there_is_a_start_the_best_iterate_is_written(at, tmp_path, monkeypatch, capfd):
-    pressed = []
+LOG = solve_module.options.SolveLog
 
-    def interrupted(*args, **kwargs):
-        if not pressed:
-            pressed.append(True)
-            ctrl_c()
-        return at(*args, **kwargs)
 
-    owner = cases if at is cases.propose else solve_module.options.SolveLog
-    monkeypatch.setattr(owner, at.__name__, interrupted)
-    assert solve(tmp_path) == 1
+@pytest.mark.parametrize(
+    ("owner", "at", "times", "number"),
+    [
+        (cases, "propose", 1, signal.SIGINT),
+        (LOG, "iteration", 1, signal.SIGTERM),
+        (LOG, "iteration", 2, signal.SIGTERM),
+    ],
+)
+def test_once_there_is_a_start_the_best_iterate_is_written(
+    owner, at, times, number, earlier, monkeypatch, capfd
+):
+    """After one signal; two of them leave the earlier result."""
+    before, original = (earlier / "result.h5").read_bytes(), getattr(owner, at)
+    sent = iter([lambda: ctrl_c(times, number)])
+    monkeypatch.setattr(owner, at, lambda *args: (next(sent, int)(), original(*args))[1])
+    assert solve(earlier) == (1 if times == 1 else 130)
     assert "interrupt received" in capfd.readouterr().err
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["status"] == "Interrupted"
+    summary = json.loads((earlier / "summary.json").read_text())
+    assert (summary["status"] == "Interrupted") == (times == 1)
     energy = {name: terms["total"] for name, terms in summary["energy"].items()}
     # the start itself may be kept, known to rounding
     assert energy["solution"] <= energy["start"] * (1 + 1e-9)
-    assert all((tmp_path / name).is_file() for name in folders.FILES)
-
-
-@pytest.mark.parametrize("times", [1, 2])
-def test_sigterm_ends_like_ctrl_c(times, earlier, monkeypatch, capfd):
-    before = (earlier / "result.h5").read_bytes()
-    sent = iter([lambda: ctrl_c(times, signal.SIGTERM)])
-    original = solve_module.options.SolveLog.iteration
-    monkeypatch.setattr(
-        solve_module.options.SolveLog,
-        "iteration",
-        lambda *args: (next(sent, lambda: None)(), original(*args)),
-    )
-    assert solve(earlier) == (1 if times == 1 else 130)
-    assert "interrupt received" in capfd.readouterr().err
-    status = json.loads((earlier / "summary.json").read_text())["status"]
-    assert (status == "Interrupted") == (times == 1)
+    assert all((earlier / name).is_file() for name in folders.FILES)
     assert ((earlier / "result.h5").read_bytes() == before) == (times == 2)
     assert (earlier / folders.FAILED).is_file() == (times == 2)
     assert cli.main(["check", str(earlier)]) == 0

@@ -1,6 +1,7 @@
 """The preset that is the method as printed: its options, its start, its unit, its proposals."""
 
 import re
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -57,20 +58,13 @@ STREET = {"kind": "scene", "scene": "street", "width": 256, "height": 112}
 SMALL = {"input": STREET, "segmentation": {"superpixels": 60, "neighbours": 8}}
 
 
-def value(problem: Problem, key: str):
-    out = problem
-    for name in key.split("."):
-        out = getattr(out, name)
-    return out
-
-
 def paper(*overrides: str, **fields) -> Problem:
     return make_problem({**SMALL, "preset": "paper", **fields}, overrides)
 
 
 def test_the_preset_is_what_the_paper_prints():
     problem = make_problem({"input": STREET, "preset": "paper"})
-    assert {key: value(problem, key) for key in PAPER} == PAPER
+    assert {key: attrgetter(key)(problem) for key in PAPER} == PAPER
     assert 5 <= problem.refine.rounds <= 10
     assert np.isfinite(problem.energy.weights.sigma_cont)
     # E is printed with the factor 1 of E_arap, here 1 / alpha1 times as much: a pixel costs 1
@@ -81,7 +75,7 @@ def test_the_preset_is_what_the_paper_prints():
 def test_every_option_of_the_preset_is_in_the_problem():
     problem = make_problem({"input": STREET, "preset": "paper"})
     for key, wanted in leaves(PRESETS["paper"]):
-        actual = value(problem, key)
+        actual = attrgetter(key)(problem)
         assert (list(actual) if isinstance(actual, tuple) else actual) == wanted, key
     assert problem == make_problem({"input": STREET, "preset": "paper"}, overrides_of("paper"))
 

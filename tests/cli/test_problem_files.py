@@ -224,5 +224,4 @@ def test_problems_are_found_by_name_anywhere(tmp_path, monkeypatch, capsys):
 
 
 def test_the_wheel_holds_the_problems():
-    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    assert '"problems" = "soup_nlp/problems"' in text
+    assert '"problems" = "soup_nlp/problems"' in text("pyproject.toml")

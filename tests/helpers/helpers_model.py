@@ -89,7 +89,7 @@ def disturbed(soup: Soup, size: float) -> Soup:
 
 
 class Tiny:
-    """12 grid superpixels of a 64 x 48 image of noise, a random soup and a noisy flow."""
+    """Grid superpixels of a 64 x 48 image of noise, a random soup and a noisy flow."""
 
     def __init__(
         self,
@@ -99,10 +99,11 @@ class Tiny:
         boundary_samples: int | None = 2,
         samples: int = 3,
         neighbours: int = 4,
+        superpixels: int = 12,
     ) -> None:
         rng = np.random.default_rng(seed)
         self.image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-        labels = segment(self.image, 12, "grid")
+        labels = segment(self.image, superpixels, "grid")
         self.seg: Segmentation = build_segmentation(
             labels, self.image, neighbours=neighbours, boundary_samples=boundary_samples
         )
