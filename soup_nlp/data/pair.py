@@ -21,6 +21,7 @@ from soup_nlp.data.accept import (
     prior_of,
 )
 from soup_nlp.data.formats.cameras import estimated_cameras
+from soup_nlp.data.formats.images import read_images
 from soup_nlp.data.formats.map_files import UNKNOWN_FLOW, flow_layout, read_flow
 from soup_nlp.errors import DataError, expect, repr_of
 
@@ -256,14 +257,14 @@ class Pair:
         expect(self.name, str, "name of the pair", "text")
         truths = "soup_nlp.Truth(depth_ref=..., ...) or None"
         expect(self.truth, (Truth, NoneType), "truth of the pair", truths)
-        images = self.image_ref, self.image_next
-        for what in ("image_ref", "image_next"):
-            put(what, image_of(getattr(self, what), what))
+        # files may have EXIF, and 16-bit files have one range of values
+        files = [Path(x) if is_path(x) else None for x in (self.image_ref, self.image_next)]
+        known = [path for path in files if path is not None]
+        read = iter(read_images(known, turn=self.K_ref is None))
+        for what, path in zip(("image_ref", "image_next"), files, strict=True):
+            put(what, image_of(getattr(self, what) if path is None else next(read), what))
         if self.K_ref is None:
-            # a file may have EXIF
-            files = [Path(image) if is_path(image) else None for image in images]
-            pictures = self.image_ref, self.image_next
-            cameras, sigma = estimated_cameras(files, pictures, fov)
+            cameras, sigma = estimated_cameras(files, (self.image_ref, self.image_next), fov)
             put("focal_sigma", sigma)
             put("K_ref", cameras[0])
             if self.K_next is None:

@@ -11,6 +11,7 @@ from PIL import Image
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
+from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
 
@@ -40,6 +41,9 @@ def test_a_photo_is_turned_as_its_exif_says(orientation, suffix, tmp_path):
     # 90 degrees over the 160 columns that are shown, principal point in the middle of them
     np.testing.assert_allclose(pair.K_ref, [[80, 0, 79.5], [0, 80, 59.5], [0, 0, 1]])
     assert pair.focal_sigma == 0
+    in_python = Pair(*(tmp_path / f"{name}.{suffix}" for name in "ab"), fov=90)
+    assert (in_python.image_ref == image).all()
+    assert (in_python.image_next == image).all()
     # axes of a given camera are unclear
     raw = {"input": {**source, "intrinsics": [200, 200, 79.5, 59.5]}, "base": str(tmp_path)}
     if orientation == 1:
@@ -47,6 +51,8 @@ def test_a_photo_is_turned_as_its_exif_says(orientation, suffix, tmp_path):
     else:
         with pytest.raises(DataError, match="stored turned"):
             make_problem(raw).load_pair()
+        with pytest.raises(DataError, match="stored turned"):
+            Pair(image, tmp_path / f"b.{suffix}", pair.K_ref)
 
 
 @pytest.fixture(scope="module")

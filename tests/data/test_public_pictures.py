@@ -141,6 +141,9 @@ def test_16_bits_are_stretched_to_their_values(low: int, high: int, tmp_path: Pa
         cv2.imwrite(str(tmp_path / f"{name}.png"), image)
     with pytest.warns(DataWarning, match=f"16 bit, values {low} to 65535.*become black to white"):
         first, second = read_images([tmp_path / "a.png", tmp_path / "b.png"])
+    with pytest.warns(DataWarning, match="16 bit"):
+        pair = Pair(tmp_path / "a.png", tmp_path / "b.png", fov=60)
+    np.testing.assert_array_equal([pair.image_ref, pair.image_next], [first, second])
     assert first.min() == 0
     assert (first == 255).mean() == pytest.approx(0.01, abs=0.003)
     # half of the value, up to the outer percentiles and rounding
