@@ -258,7 +258,8 @@ class Pair:
         truths = "soup_nlp.Truth(depth_ref=..., ...) or None"
         expect(self.truth, (Truth, NoneType), "truth of the pair", truths)
         # files may have EXIF, and 16-bit files have one range of values
-        files = [Path(x) if is_path(x) else None for x in (self.image_ref, self.image_next)]
+        given: tuple[ImageLike, ...] = self.image_ref, self.image_next
+        files = [Path(image) if is_path(image) else None for image in given]
         known = [path for path in files if path is not None]
         read = iter(read_images(known, turn=self.K_ref is None))
         for what, path in zip(("image_ref", "image_next"), files, strict=True):
