@@ -245,7 +245,7 @@ def chain(
             print(f"{len(sequence)} frames{spacing}; pairs to solve: {pairs}", file=sys.stderr)
 
     short = options.sizes(superpixels, neighbours, max_size)
-    kept = options.resumable("the pairs that were finished are kept", f"{out}/pairs")
+    kept = options.resumable("pairs that were finished before are kept", f"{out}/pairs")
     with kept, options.SolveLog(quiet).warnings():
         done = solve_chain(
             frames_of,

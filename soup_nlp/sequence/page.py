@@ -66,12 +66,14 @@ def chain_page(chain: Chain, contents: Mapping[str, Any]) -> str:
         "names": [Path(x).name for x in contents["sources"]],
         "scene": scene,
     }
-    links = table(*link_table(contents))
+    heads, rows = link_table(contents)
+    links = table(heads, rows) if rows else ""
     if contents["score"]:
         links += f"<p>{score_text(contents['score'])}.</p>"
+    guess = html.escape(guess_line(certainty(chain), "all images"))
     parts = {
         "title": html.escape(str(contents["name"])),
-        "certainty": html.escape(guess_line(certainty(chain), "all images")),
+        "certainty": f"<p><b>{guess}</b></p>" if guess else "",
         "last": len(chain) - 1,
         "bar": colour_bar(depth_bar(near, far)),
         "tracks": _tracks(chain, scene["tracks"]),

@@ -100,7 +100,8 @@ def chain_lines(chain: Chain, contents: Mapping[str, Any]) -> list[str]:
     """Scales, links and, with a truth, errors of a chain for the terminal."""
     lines = [str(chain)]
     heads, rows = link_table(contents)
-    for pairs, *cells in (heads, *rows):
+    # two frames are one pair, which has no link
+    for pairs, *cells in (heads, *rows) if rows else ():
         padded = [f"{cell:>{WIDTHS[head]}}" for head, cell in zip(heads[1:], cells, strict=True)]
         lines.append(f"{pairs:<10}{''.join(padded)}".rstrip())
     long = [track for track in contents["tracks"] if len(track["path"]) > 2]

@@ -25,7 +25,7 @@ from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
 from soup_nlp.sequence.frames import Frames
 from soup_nlp.sequence.fused import fuse
-from soup_nlp.sequence.page import depth_pictures, guess_of, write_animation
+from soup_nlp.sequence.page import chain_page, depth_pictures, guess_of, write_animation
 from soup_nlp.sequence.score import chain_exit_code, chain_lines, link_table
 from soup_nlp.sequence.solve import one_camera
 
@@ -46,6 +46,10 @@ def test_a_chain_is_written(tmp_path):
     assert row[:2] == ["0, 1", "2.000"]
     assert chain_lines(chain, told)[1].split() == " ".join(heads).split()
     assert "true ratio" not in (tmp_path / "chain.html").read_text()
+    # two frames have no link, so no head of a table
+    two = make_chain(toy_pairs()[:1])
+    assert chain_lines(two, {**told, "links": []})[1].startswith("tracks")
+    assert "spread (log)" not in chain_page(two, {**told, "links": []})
     np.testing.assert_allclose([s["scale"] for s in told["scales"]], [1, 2], rtol=1e-9)
     for k in range(3):
         path = str(tmp_path / "depth" / f"{k:04d}.png")
@@ -88,6 +92,7 @@ def test_a_chain_says_which_depth_is_a_guess(tmp_path):
         said = f"{share}% of all images is a guess: a turn alone or a constant depth"
         text = (tmp_path / "chain.html").read_text()
         assert (f"<b>{said}" in text) == bool(share)
+        assert "<b></b>" not in text
         assert f", {share}% a guess)" in str(chain)
         lines = "\n".join(chain_lines(chain, told))
         assert (f"{share}% is a guess" in lines) == bool(share)
