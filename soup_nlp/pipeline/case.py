@@ -41,7 +41,7 @@ from soup_nlp.start.focal_length import focal_length
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.ground import off_ground
 from soup_nlp.start.occlusion import in_order
-from soup_nlp.start.prior_evidence import PIECES, Evidence, judged
+from soup_nlp.start.prior_evidence import PIECES, PriorEvidence, judged
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
@@ -177,7 +177,7 @@ def _begun(problem: Problem, pair: Pair, seg: Segmentation) -> Begun:
     return start, pair, fitted
 
 
-def _judged(problem: Problem, labels: Labels, begun: Begun) -> tuple[Begun, Evidence]:
+def _judged(problem: Problem, labels: Labels, begun: Begun) -> tuple[Begun, PriorEvidence]:
     """Judge the depth prior of a pair, and return the start for it with the evidence.
 
     Superpixels follow a prior that is used although the flow does not confirm it.

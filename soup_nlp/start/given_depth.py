@@ -15,7 +15,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import FIXED, SCENE, TIES
-from soup_nlp.start.prior_evidence import FEWEST, LEAST_SIGMA, Evidence, Seen, without_gaps
+from soup_nlp.start.prior_evidence import FEWEST, LEAST_SIGMA, PriorEvidence, Seen, without_gaps
 from soup_nlp.start.propose import Start
 from soup_nlp.start.views import FlowFit
 
@@ -39,7 +39,7 @@ class Given:
         from_prior: (N,) True where depth or scale of the start are the prior's.
     """
 
-    evidence: Evidence
+    evidence: PriorEvidence
     log_depth: Float
     sigma: Float
     opened: Float
@@ -53,7 +53,9 @@ class Given:
         return {**numbers, "held": float(self.from_prior.mean())}
 
 
-def by_prior(start: Start, pair: Pair, flow: FlowFit, evidence: Evidence) -> tuple[Start, Given]:
+def by_prior(
+    start: Start, pair: Pair, flow: FlowFit, evidence: PriorEvidence
+) -> tuple[Start, Given]:
     """The start with depths and scales of the pair's prior where the flow leaves them open.
 
     Every rigid component, the scene first, takes its shape and motion from flow and prior and its

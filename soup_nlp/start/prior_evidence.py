@@ -63,7 +63,7 @@ scenes 2.8 and less."""
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class PriorEvidence:
     """Evidence of flow and image for a depth prior.
 
     Attributes:
@@ -197,7 +197,7 @@ def ranks(values: Float) -> Float:
     return np.asarray((np.cumsum(count) - (count - 1) / 2)[place])
 
 
-def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Evidence:
+def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorEvidence:
     """Evidence of flow and image for the depth prior of a pair.
 
     Args:
@@ -232,11 +232,11 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> Eviden
             )
             ratio = gap / by_flow
         sigma = float(np.clip(gap, LEAST_SIGMA, RELIEF))
-        evidence = Evidence(kind, shifted, ratio, sigma, determined)
+        evidence = PriorEvidence(kind, shifted, ratio, sigma, determined)
         if evidence.confirmed:
             return evidence
     right = not determined and follows_edges(log_depth(whole), pair.image_ref)
-    return Evidence(kind, log_depth, ratio, UNCONFIRMED if right else np.inf, determined)
+    return PriorEvidence(kind, log_depth, ratio, UNCONFIRMED if right else np.inf, determined)
 
 
 def as_log_depth(kind: Kind, value: Float, shift: float = 0.0) -> Callable[[Float], Float]:

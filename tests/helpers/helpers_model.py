@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.data.scenes.raycast import Body, Part, Scene, View, render
+from soup_nlp.data.scenes.raycast import Body, Frame, Part, Scene, render
 from soup_nlp.data.scenes.shapes import Box, Plane
 from soup_nlp.data.scenes.texture import Texture
 from soup_nlp.data.scenes.things import about, placed
@@ -266,7 +266,7 @@ def cut_by_part(
     """Grid superpixels cut along the parts' outlines; and which of them lie on one part only."""
     height, width = pair.size
     uv = camera.pixel_grid(height, width).reshape(-1, 2)
-    view = View(scene, pair.K_ref, 0)
+    view = Frame(scene, pair.K_ref, 0)
     part = view.trace(uv)[1].reshape(height, width)
     cells = segment(pair.image_ref, count, "grid")
     labels = split_components(cells * len(view.parts) + part.astype(np.int32), 40)

@@ -131,7 +131,7 @@ class Scene:
         return Scene(bodies, ref, go_on @ ref)
 
 
-class View:
+class Frame:
     """A scene in the camera of a frame, 0 for the reference and 1 for the next.
 
     Attributes:
@@ -267,7 +267,7 @@ def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene")
     """
     size = height, width
     uv = camera.pixel_grid(*size).reshape(-1, 2)
-    ref, following = View(scene, K, 0), View(scene, K, 1)
+    ref, following = Frame(scene, K, 0), Frame(scene, K, 1)
     (depth, part), (depth_next, part_next) = ref.trace(uv), following.trace(uv)
     motions = scene.motions()
     X = depth[:, None] * camera.rays(K, uv)
