@@ -105,12 +105,17 @@ def scores(result: Run) -> Row:
 
 
 def _sigma(result: Run) -> Row:
-    """Entries "within" and "sparsification" at true pixels, after a median scale, if there are."""
+    """Entries "within" and "sparsification" at true pixels, after a median scale.
+
+    There are none without a true depth or without sigma.
+    """
     truth, sigma = result.pair.truth, result.reconstruction.sigma_ref
     if truth is None or sigma is None or not has_depth(truth):
         return {}
     z, gt = at_truth(truth, result.reconstruction.depth_ref)
     true = MEDIAN.mask(gt) & np.isfinite(z)
+    if not true.any():
+        return {}
     z, gt = z[true] * float(np.median(gt[true] / z[true])), gt[true]
     uncertain = at_truth(truth, sigma)[0][true]
     measured = sparsification(np.abs(z - gt) / gt, uncertain)
@@ -184,6 +189,8 @@ def flow_error(pair: Pair) -> dict[str, float] | None:
     if pair.flow is None or pair.truth is None or pair.truth.flow is None:
         return None
     used = np.isfinite(pair.truth.flow).all(axis=2) & (pair.flow.confidence > 0)
+    if not used.any():
+        return None
     gap = np.linalg.norm(pair.flow.uv[used] - pair.truth.flow[used], axis=1)
     return {"mean": float(gap.mean()), "median": float(np.median(gap))}
 

@@ -70,7 +70,7 @@ def solve_trws(
         edges: (E, 2) node numbers.
         pairwise: (E, L, L) finite tables, axis 1 for ``edges[e, 0]``. Their type is the working
             type: float64, or float32 for half the memory; the bound is then exact to that rounding.
-            They are read in place and must not change during the call.
+            Floats are read in place and must not change during the call.
         max_iter: Most iterations.
         gap: Stop once best energy - bound <= ``gap * max(1, |best energy|)``; negative: never.
         stagnation: Stop once, over ``patience`` iterations, the best energy did not fall and the
@@ -85,7 +85,9 @@ def solve_trws(
         ModelError: A cost is not finite in the working type.
     """
     costs, begin = np.asarray(unary, np.float64), init_labels
-    solver = _Passes(costs, plan_levels(colours(len(costs), edges), edges), pairwise)
+    # integers become float64; tables of floats are read in place
+    table = np.asarray(pairwise, np.result_type(pairwise, np.float32))
+    solver = _Passes(costs, plan_levels(colours(len(costs), edges), edges), table)
     first = math.inf if begin is None else mrf_energy(begin, unary, edges, pairwise)
     best = (first, costs.argmin(axis=1) if begin is None else begin)
     rows: list[tuple[float, float, float]] = []

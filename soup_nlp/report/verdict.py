@@ -27,6 +27,11 @@ STATUS = {
     "Constraints_Violated": "not converged: the answer breaks its constraints",
     "Skipped": "refined from the start, no NLP",
     "Interrupted": "interrupted, best iterate kept",
+    "Infeasible_Problem_Detected": "not converged: no feasible point nearby, best iterate kept",
+    "Error_In_Step_Computation": "not converged: no further step is found, best iterate kept",
+    "Search_Direction_Becomes_Too_Small": "not converged: steps are of rounding size, best iterate"
+    " kept",
+    "Restoration_Failed": "not converged: feasibility could not be restored, best iterate kept",
 }
 TITLES = {
     **{name: f"surest {share:.0%}" for name, share in SURE.items()},
@@ -137,7 +142,7 @@ def _numbers(values: Mapping[str, float], form: str) -> str:
 def _status(run: Run) -> list[str]:
     """Status in words."""
     s = run.solution
-    words = STATUS.get(s.status, "not converged, best iterate kept")
+    words = STATUS.get(s.status, f"not converged: {s.status}, best iterate kept")
     far = "the presolve ended before a minimum: solver.far_iterations limits Ipopt there"
     return [f"{words} ({s.status})", *[far] * (s.far and not s.converged)]
 

@@ -132,6 +132,10 @@ def _expected(item: Mapping[str, Any]) -> str:
         return ("one of " if len(words) > 1 else "") + ", ".join(words)
     if item["type"] in ("model_type", "model_attributes_type", "dict_type"):
         return "a section with keys of its own"
+    if item["type"] == "too_short":
+        return f"a list of {item['ctx']['min_length']} or more"
+    if item["type"] == "too_long":
+        return f"a list of {item['ctx']['max_length']} or fewer"
     return str(item["msg"]).removeprefix("Input should be ").removeprefix("Value error, ")
 
 

@@ -64,7 +64,7 @@ OF_ANOTHER_TAG = ("!!bool 5", "!!timestamp x", "!!int [1]", "!!float [1]")
         ),
         (
             "input: {kind: files, ref: a, next: b, intrinsics: [1, 2, 3]}\n",
-            ["key input.intrinsics", "at least 4 items after validation, not 3, or a valid string"],
+            ["key input.intrinsics", "a list of 4 or more, or a valid string"],
         ),
         (
             MOTORCYCLE + "segmentation:\n  superpixls: 7\n",

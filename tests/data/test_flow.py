@@ -158,6 +158,17 @@ def test_flows_of_files_and_of_the_truth(tmp_path: Path) -> None:
             resolve_flow(pair_of(truth), "truth")
 
 
+def test_a_larger_next_image_is_searched_as_a_whole() -> None:
+    wide = cv2.GaussianBlur(
+        np.random.default_rng(1).integers(0, 256, (96, 400, 3), np.uint8), (0, 0), 2
+    )
+    # what leaves the size of the reference image is still in the next one
+    pair = Pair(wide[:, 100:260], wide[:, 60:300], K, K)
+    flow = resolve_flow(pair, "dis")
+    assert flow.confidence[:, 130:].mean() > 0.9
+    np.testing.assert_allclose(np.median(flow.uv[:, 130:], axis=(0, 1)), [40, 0], atol=0.1)
+
+
 PLUGINS = SimpleNamespace(
     mine=lambda first, _: Flow(np.full((*first.shape[:2], 2), 3.0, np.float32), source="mine"),
     cropped=lambda first, _: Flow(np.zeros((*first[1:].shape[:2], 2), np.float32)),

@@ -70,24 +70,27 @@ def test_black_bars_do_not_change_the_flow_between_them(pair, bars, quality):
 
 
 def test_pictures_without_black_bars_are_whole(pair):
-    whole = slice(0, 96), slice(0, 160)
+    def whole(first, second) -> bool:
+        inside = content(first, second)
+        return all(image[inside].shape == image.shape for image in (first, second))
+
     dark = np.zeros_like(pair.image_ref)
     for first, second in ((pair.image_ref, pair.image_next), (dark, dark), (pair.image_ref, dark)):
-        assert content(first, second) == whole
+        assert whole(first, second)
     night = pair.image_ref.copy()
     night[:30] = 0
     # dark in one of the frames only
-    assert content(night, pair.image_next) == whole
+    assert whole(night, pair.image_next)
     assert content(night, night) == (slice(30, 96), slice(0, 160))
     night[:32] = 0
     assert content(night, night) == (slice(32, 96), slice(0, 160))
     lamps = pair.image_ref // 16
     lamps[8:80:8, 20:140:8] = 200
-    assert content(lamps, lamps) == whole
+    assert whole(lamps, lamps)
     # too little would be left; frames of two sizes
     night[:33] = 0
-    assert content(night, night) == whole
-    assert content(night[1:], night)[0] == slice(0, 95)
+    assert whole(night, night)
+    assert whole(night[1:], night)
 
 
 @pytest.fixture(scope="module")

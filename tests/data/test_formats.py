@@ -97,7 +97,7 @@ MALFORMED = [
     ("camera", "K.txt", b"\xff\xfe\x00\x81", "is not text"),
     ("camera", "K.yaml", "camera_model: equidistant\nK: [1, 0, 0, 0, 1, 0, 0, 0, 1]", "fisheye"),
     ("kitti", "calib.txt", "1 2 3", "lacks the numbers of P0:"),
-    ("kitti", "calib.txt", "P1: 1 2", r"numbers of P0:[\s\S]*found: P1:"),
+    ("kitti", "calib.txt", "P1: 1 2", r"numbers of P0:[\s\S]*found: lines P1:"),
     ("kitti", "calib.txt", "P0: 1 2 x", "not a number"),
     ("kitti", "calib.txt", "P0: 1 2 3", r"numbers of P0:[\s\S]*found: 1 2 3[\s\S]*12 finite"),
     ("kitti", "calib.txt", "P0:" + 12 * " nan", r"numbers of P0:[\s\S]*12 finite"),

@@ -156,9 +156,11 @@ def test_the_package_has_a_record_of_every_size():
             assert f"SOUP-{scene}-unit-offset-smooth-N{size}-easy" in known["sha256"]
 
 
-def test_an_instance_has_the_published_bytes(tmp_path):
-    instance = Instance("street", STANDARD, 100, "hard")
-    record = load_frozen("street", 100)
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["orbit", "street"])
+def test_an_instance_has_the_published_bytes(scene, tmp_path):
+    instance = Instance(scene, STANDARD, 100, "hard")
+    record = load_frozen(scene, 100)
     nlp = build_instance(case_of(record), record, STANDARD, "hard")[0]
     file = write_nl(tmp_path / "x.nl", nlp)
     assert file.sha256 == published()["sha256"][instance.name]

@@ -195,6 +195,14 @@ def test_tables_of_the_working_type_are_not_copied():
 # --- options ----------------------------------------------------------------------------------
 
 
+def test_tables_of_whole_numbers_are_those_of_floats():
+    unary, edges, tables = dense(np.random.default_rng(13), 6, 8, 3)
+    whole = np.rint(5 * tables).astype(np.int64)
+    one, other = (solve_trws(unary, edges, t) for t in (whole, whole.astype(float)))
+    assert one.energy == pytest.approx(other.energy, rel=1e-12)
+    assert one.labels.tolist() == other.labels.tolist()
+
+
 def test_never_worse_than_the_initial_labels():
     rng = np.random.default_rng(12)
     unary, edges, tables = dense(rng, 6, 15, 3)

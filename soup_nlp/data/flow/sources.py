@@ -226,7 +226,7 @@ def content(image_ref: Image, image_next: Image) -> tuple[slice, slice]:
     All rows and columns if what is left is too small (`LEAST_CONTENT`) or itself mostly black
     (`LEAST_LIGHT`), or if the images differ in size.
     """
-    whole = slice(0, image_ref.shape[0]), slice(0, image_ref.shape[1])
+    whole = np.s_[:, :]
     if image_ref.shape != image_next.shape:
         return whole
     light = np.maximum(image_ref, image_next).max(axis=2) > BLACK

@@ -176,10 +176,11 @@ def read_rows(path: PathLike, names: Sequence[str], count: int) -> Float:
         rows = [line[len(head) :] for line in lines if line[: len(head)] == head]
         row = _numbers(" ".join(rows[0] if rows else []), f"{path}, {name}", "calibration file")
         if len(row) != count or not np.isfinite(row).all():
+            others = [line[0] for line in lines if line]
             raise DataError(
                 f"calibration file lacks the numbers of {name}",
                 where=path,
-                found=" ".join(rows[0]) if rows else ", ".join(line[0] for line in lines if line),
+                found=" ".join(rows[0]) if rows else f"lines {', '.join(others[:20])}",
                 expected=f"a line '{name} ...' with {count} finite numbers",
             )
         out.append(row)
