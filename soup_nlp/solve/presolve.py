@@ -82,7 +82,7 @@ class Presolve:
         watch: Listeners, stop event and log.
         deadline: `time.perf_counter` at which they end.
         rim: (N, V) multipliers of rim visibility, rows divided by the facing of the anchor, after
-            the last stage.
+            the last stage; None where the presolve ended before it.
         stages: Those that have ended.
     """
 
@@ -93,7 +93,7 @@ class Presolve:
     o: SolverOptions
     watch: Watch
     deadline: float
-    rim: Float = field(default_factory=lambda: np.zeros(0))
+    rim: Float | None = None
     stages: list[Stage] = field(default_factory=list)
 
     def run(self) -> None:

@@ -159,7 +159,8 @@ class _Solve:
         nlp, layout = build_matrix_nlp(soup, self.data, self.weights, form)
         self.watch.say(str(nlp))
         first: dict[str, Any] = {"x0": nlp.x0}
-        if self.o.exact_iterations and near and not worse:
+        # a presolve that was stopped before its last stage has no multipliers
+        if rim is not None and near and not worse:
             first |= warm_start(nlp, self.data, soup, rim)
         stage = self.ipopt(nlp, first, far)
         candidates = {"start": self.start, "presolve": presolved}
@@ -201,9 +202,9 @@ class _Solve:
         """Exact energy."""
         return oracle.energy(soup, self.data, self.weights)["total"]
 
-    def presolve(self) -> tuple[Soup, Float]:
+    def presolve(self) -> tuple[Soup, Float | None]:
         """Soup and multipliers of rim visibility of the presolve; the start where it is off."""
-        soup, rim = self.start, np.zeros(0)
+        soup, rim = self.start, None
         if self.o.presolve:
             # the last stage has the rest of the time
             end = self.laps.begin + 0.7 * self.o.max_seconds

@@ -129,6 +129,5 @@ def test_a_real_run_and_its_table(tmp_path, monkeypatch):
     parts = sum(row["stages"][k] for k in ("build", "functions", "linear algebra"))
     assert parts == pytest.approx(row["stages"]["nlp"], rel=1e-6)
     assert row["stages"]["output"] > 0
-    assert row["cpu"]["nlp"] <= 1.2 * row["stages"]["nlp"]
     assert {"load", "flow", "segmentation", "start", "output"} <= set(row["cpu"])
     assert "| street-s0-64x48 |" in (out / "table.md").read_text()
