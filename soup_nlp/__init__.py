@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from soup_nlp.errors import SoupError
     from soup_nlp.evaluate.metrics import DepthMetrics, Scale
     from soup_nlp.export.symbolic import nlp
+    from soup_nlp.geometry.constraints import constraints
     from soup_nlp.geometry.soup import Reconstruction, Soup
     from soup_nlp.report.folder import WritableRun as Run
     from soup_nlp.report.folder import run, solve_pair
@@ -36,6 +37,7 @@ __all__ = [
     "Truth",
     "__version__",
     "chain",
+    "constraints",
     "evaluate",
     "load",
     "load_problem",
@@ -57,6 +59,7 @@ _HOMES = {
     "Truth": "data.pair",
     "__version__": "storage.versions",
     "chain": "sequence.solve:solve_chain",
+    "constraints": "geometry.constraints",
     "load": "report.result",
     "load_problem": "config.problem",
     "make_problem": "config.problem",

@@ -1,5 +1,6 @@
-"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input, 70 a bug,
-130 Ctrl-C. An unexpected exception becomes a bug report in a file.
+"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input, 3 (check) a
+point of another solver is feasible but not stationary, 70 a bug, 130 Ctrl-C. An unexpected
+exception becomes a bug report in a file.
 """
 
 import ast
@@ -102,8 +103,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Returns:
-        0 good, 1 not converged (interrupted too) or a claim fails, 2 bad input, 70 a bug, 130
-        interrupted before there was anything to keep, or twice: no result is written.
+        0 good, 1 not converged (interrupted too) or a claim fails, 2 bad input, 3 a point of
+        another solver is feasible but not stationary, 70 a bug, 130 interrupted before there was
+        anything to keep, or twice: no result is written.
     """
     prepare_streams()
     if argv is None:

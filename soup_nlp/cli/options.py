@@ -80,10 +80,11 @@ DepthScale = Annotated[float | None, option(DEPTH_SCALE)]
 Workers = Annotated[int, option("Processes of this machine.", min=1)]
 
 
-def finish(good: bool, reason_text: str) -> int:
-    """Print the exit code of a command with its reason; returns the code."""
-    print(f"exit code   {int(not good)}: {reason_text}")
-    return int(not good)
+def finish(good: bool, reason_text: str, bad: int = 1) -> int:
+    """Print the exit code of a command, 0 or `bad`, with its reason; returns the code."""
+    code = 0 if good else bad
+    print(f"exit code   {code}: {reason_text}")
+    return code
 
 
 def changed(

@@ -17,8 +17,8 @@ from soup_nlp.errors import ConfigError, DataError, ExportError
 from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
-from soup_nlp.export.verify import table_text
 from soup_nlp.family.describe import check_sol
+from soup_nlp.geometry.constraints import table
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import convert as convert_folder
 from soup_nlp.report.folder import prepare_folder, renew_page, write_folder
@@ -37,6 +37,9 @@ from soup_nlp.sequence.frames import depth_files
 from soup_nlp.sequence.score import score, score_lines
 from soup_nlp.storage.files import is_folder
 
+NOT_STATIONARY = 3
+"""Exit code of `check` for a .sol whose constraints hold, but which is no KKT point."""
+
 
 def check(
     folder: Annotated[Path, typer.Argument(help="Folder of a result or a chain, or a .sol file.")],
@@ -44,22 +47,28 @@ def check(
         Path | None, option("Exported folder of a .sol; default where the .sol lies.", "--export")
     ] = None,
 ) -> int:
-    """Recompute energy, constraints and metrics of a result, or the constraints of a .sol."""
+    """Recompute energy, constraints and metrics of a result, or the constraints of a .sol.
+
+    Exit code 1: a claim or a constraint does not hold; 3: a .sol is feasible, but no KKT point.
+    """
     if is_folder(folder) or folder.suffix != ".sol":
         report = check_chain(folder) if is_chain(folder) else check_folder(folder)
         print(report)
-        good, claim = report.ok, "claim"
+        return options.finish(
+            report.ok, "every claim holds" if report.ok else "a claim does not hold"
+        )
+    if folder.stem.startswith("SOUP-") and export_ is None:
+        verdict = check_sol(folder)
+        rows, r, text = verdict.kinds, verdict.residuals, str(verdict)
     else:
-        if folder.stem.startswith("SOUP-") and export_ is None:
-            verdict = check_sol(folder)
-            rows, text = verdict.kinds, str(verdict)
-        else:
-            imported = import_sol(export_ or folder.parent, folder)
-            rows, text = sol_table(imported), foreign_verdict(imported)
-        print(f"{table_text(rows)}\n{text}")
-        good, claim = all(row.ok for row in rows), "constraint"
-    conclusion = f"every {claim} holds" if good else f"a {claim} does not hold"
-    return options.finish(good, conclusion)
+        imported = import_sol(export_ or folder.parent, folder)
+        rows, r, text = sol_table(imported), imported.residuals, foreign_verdict(imported)
+    print(f"{table(rows)}\n{text}")
+    if not all(row.ok for row in rows):
+        return options.finish(False, "a constraint does not hold")
+    conclusion = f"every constraint holds, and the point is {'' if r.optimal else 'not '}stationary"
+    details = f"{conclusion} (dual {r.dual:.1e}, complementarity {r.complementarity:.1e})"
+    return options.finish(r.optimal, details, bad=NOT_STATIONARY)
 
 
 def evaluate(

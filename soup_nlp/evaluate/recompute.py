@@ -1,4 +1,4 @@
-"""Independent computation of energy, constraints, depth and scores from stored arrays.
+"""Independent computation of energy, depth and scores from stored arrays.
 
 Nothing of `soup_nlp.model`, `soup_nlp.solve` or `soup_nlp.evaluate.metrics` is used, so that an
 error there cannot confirm itself.
@@ -89,27 +89,6 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
     }
     terms = {name: w[name] * float(cost.sum()) for name, cost in costs.items()}
     return {"total": sum(terms.values()), **terms}
-
-
-def constraints(s: State, rim_ray: Float, min_facing: float) -> dict[str, Float]:
-    """Violation of every kind of constraint, by superpixel (simplex: one number).
-
-    Args:
-        s: State of a soup.
-        rim_ray: (N, V, 3) rays where visibility is imposed.
-        min_facing: c of `-n . r >= c`.
-    """
-    n = len(s["lam"])
-    gram = np.einsum("nji,njk->nik", s["R"], s["R"]) - np.eye(3)
-    facing = -(s["n"][:, None] * rim_ray).sum(-1)
-    return {
-        "so3": np.abs(gram).reshape(n, -1).max(1),
-        "normal": np.abs((s["n"] ** 2).sum(1) - 1),
-        "simplex": np.abs(s["lam"].sum(keepdims=True) - 1),
-        "positive": np.maximum(0.0, -np.minimum(s["lam"], s["d"])),
-        "det": np.abs(np.linalg.det(s["R"]) - 1),
-        "visible": np.maximum(0.0, (min_facing - facing).max(1)),
-    }
 
 
 def depth_map(s: State, labels: Int, K: Float) -> Float:

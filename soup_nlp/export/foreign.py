@@ -10,11 +10,11 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ExportError
-from soup_nlp.evaluate import recompute
 from soup_nlp.export.artefact import CHOICES, fingerprint, read_manifest
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import Sol, read_sol
-from soup_nlp.export.verify import ENERGY_SLACK, FEASIBLE, Kind, examine, kind, violations
+from soup_nlp.export.verify import ENERGY_SLACK, FEASIBLE, Residuals, examine, violations
+from soup_nlp.geometry.constraints import Kind, constraints, kind
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Layout, MatrixLayout
@@ -41,12 +41,14 @@ class Imported:
         sol: Contents of the .sol file.
         manifest: Manifest of the export.
         violations: Violations of bounds (nx,) and rows (ng,).
+        residuals: KKT residuals of the answer.
     """
 
     run: Run
     sol: Sol
     manifest: Mapping[str, Any]
     violations: Mapping[str, Float]
+    residuals: Residuals
 
     def __str__(self) -> str:
         """Message of the solver, and whether recomputed energy and residuals confirm its claim."""
@@ -95,18 +97,16 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
     answer = read_sol(sol, *file_orders(nlp))
     # values at an arbitrary point may be infinite or NaN; such an answer is not verified
     with np.errstate(all="ignore"):
-        run = foreign_run(case, form, nlp, layout, answer, source=Path(sol).name)
-    return Imported(run, answer, manifest, violations(nlp, answer.x))
+        r = examine(nlp, answer.x, answer.lam_g)
+        run = foreign_run(case, form, nlp, layout, answer, r, source=Path(sol).name)
+    return Imported(run, answer, manifest, violations(nlp, answer.x), r)
 
 
 def sol_table(imported: Imported) -> list[Kind]:
     """Residuals of an answer by kind of constraint, before its retraction."""
     run = imported.run
-    state = {k: getattr(run.answer, k) for k in ("lam", "n", "d", "R", "t")}
-    facing = run.problem.formulation.min_facing
-    with np.errstate(all="ignore"):
-        violated = recompute.constraints(state, run.data.rim_ray, facing)
-    rows = [kind(k, v, FEASIBLE, superpixels=k != "simplex") for k, v in violated.items()]
+    found = constraints(run.answer, run.data.rim_ray, run.problem.formulation.min_facing)
+    rows = [replace(row, limit=FEASIBLE) for row in found.values()]
     return rows + [kind(k, v, FEASIBLE, False) for k, v in imported.violations.items()]
 
 
@@ -116,6 +116,7 @@ def foreign_run(
     nlp: NLP,
     layout: Layout,
     answer: Sol,
+    r: Residuals,
     source: str,
 ) -> Run:
     """A run whose solution is the answer of another solver.
@@ -123,7 +124,6 @@ def foreign_run(
     It has converged if the solver claims success, the recomputed KKT residuals are those of an
     optimum, and the exact energy is not above that of the proposal.
     """
-    r = examine(nlp, answer.x, answer.lam_g)
     point = layout.unpack(answer.x)
     soup = point.retracted()
     start, energy = (oracle.energy(s, case.data, case.weights) for s in (case.start.soup, soup))

@@ -1,6 +1,5 @@
 """KKT residuals of the point of another solver."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -175,71 +174,3 @@ def _least_squares(A: sparse.csr_matrix, b: Float) -> Float:
     for _ in range(3):
         x += solve(np.concatenate([b - A @ x, np.zeros(n)]))[k:]
     return x
-
-
-# --- constraints by kind -------------------------------------------------------------------------
-
-WORST = 3
-"""Number of superpixels that are listed for a kind."""
-EQUATIONS: Mapping[str, str] = {
-    "so3": "R'R = I",
-    "normal": "|n|^2 = 1",
-    "simplex": "sum lam = 1",
-    "positive": "lam, d > 0",
-    "det": "det R = 1",
-    "visible": "-n . r >= c",
-    "bounds": "lbx <= x <= ubx",
-    "rows": "lbg <= g <= ubg",
-}
-
-
-@dataclass(frozen=True)
-class Kind:
-    """One kind of constraint.
-
-    Attributes:
-        name: Name in EQUATIONS.
-        largest: Largest violation.
-        limit: Largest allowed violation.
-        count: Number of superpixels (or entries) beyond the limit.
-        total: Number of superpixels (or entries).
-        worst: (superpixel, violation), worst first; empty if entries are not superpixels.
-    """
-
-    name: str
-    largest: float
-    limit: float
-    count: int
-    total: int
-    worst: tuple[tuple[int, float], ...]
-
-    @property
-    def ok(self) -> bool:
-        """Whether the largest violation is within the limit; False for NaN."""
-        return bool(self.largest <= self.limit)
-
-    def __str__(self) -> str:
-        listed = "  ".join(f"{i} ({v:.1e})" for i, v in self.worst)
-        return (
-            f"{'ok  ' if self.ok else 'FAIL'} {self.name:<9} {EQUATIONS[self.name]:<17}"
-            f"{self.largest:>9.1e} {self.limit:>9.1e} {self.count:>6} of {self.total:<6} {listed}"
-        )
-
-
-def kind(name: str, violation: Float, limit: float, superpixels: bool = True) -> Kind:
-    """Summary of nonnegative violations (M,)."""
-    # NaN counts as an infinite violation
-    v = np.where(np.isfinite(violation), violation, np.inf)
-    order = np.argsort(-v, kind="stable")[:WORST]
-    worst = tuple((int(k), float(v[k])) for k in order if v[k] > 0) if superpixels else ()
-    largest = float(v.max(initial=0.0))
-    return Kind(name, largest, limit, int((v > limit).sum()), len(v), worst)
-
-
-def table_text(rows: list[Kind]) -> str:
-    """The table with its header."""
-    head = (
-        f"     {'kind':<9} {'equation':<17}{'largest':>9} {'limit':>9} {'beyond':>9}"
-        f"{'':<8}worst superpixels"
-    )
-    return "\n".join([head, *map(str, rows)])

@@ -15,9 +15,10 @@ from scipy.sparse.csgraph import connected_components
 from soup_nlp.arrays import Float
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import Sol, read_sol
-from soup_nlp.export.verify import FEASIBLE, Kind, Residuals, active, examine, kind, violations
+from soup_nlp.export.verify import FEASIBLE, Residuals, active, examine, violations
 from soup_nlp.family.frozen import load_frozen
 from soup_nlp.family.instances import build_instance, case_of, parse_name
+from soup_nlp.geometry.constraints import Kind, kind
 from soup_nlp.model.nlp import NLP
 
 CLASSES = ("constant", "linear", "quadratic", "general")

@@ -14,6 +14,7 @@ from soup_nlp.evaluate.confidence import Confidence
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import score_depths
 from soup_nlp.geometry.components import Components, find_components
+from soup_nlp.geometry.constraints import Constraints, constraints
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup
@@ -26,7 +27,6 @@ from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.refine.records import Refined
-from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution
 from soup_nlp.start.given_depth import Given
@@ -187,9 +187,12 @@ class Run(Case):
     @property
     def residuals(self) -> dict[str, float]:
         """Constraint residuals of `soup`, beside those of Ipopt's answer."""
-        facing = self.problem.formulation.min_facing
-        constraints = constraint_residuals(self.soup, self.data.rim_ray, facing)
-        return {**self.solution.residuals, **constraints}
+        return {**self.solution.residuals, **self.constraints.largest}
+
+    @property
+    def constraints(self) -> Constraints:
+        """Residuals of `soup` by kind of constraint, with the worst superpixels."""
+        return constraints(self.soup, self.data.rim_ray, self.problem.formulation.min_facing)
 
     @property
     def good(self) -> bool:

@@ -27,6 +27,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, StoppedError, expect
 from soup_nlp.evaluate.confidence import confidence
 from soup_nlp.evaluate.scoring import rigid_depth, score_depths
+from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.model import oracle
@@ -38,7 +39,6 @@ from soup_nlp.pipeline.record import Case, Run, full_size
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined, RefineOptions
-from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
 from soup_nlp.start.start_options import StartOptions
@@ -196,7 +196,7 @@ def skipped(case: Case) -> Solution:
         stages=(),
         energy_start=oracle.energy(start, data, case.weights),
         energy=oracle.energy(soup, data, case.weights),
-        residuals=constraint_residuals(soup, data.rim_ray, form.min_facing),
+        residuals=constraints(soup, data.rim_ray, form.min_facing).largest,
         multipliers={},
         nlp={},
         description="",

@@ -15,8 +15,8 @@ from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate import recompute
 from soup_nlp.evaluate.scoring import DEPTHS, SURE
+from soup_nlp.geometry.constraints import constraints
 from soup_nlp.report.layout import require_layout
-from soup_nlp.solve.kkt import LIMITS
 from soup_nlp.storage.files import as_path, read_json
 from soup_nlp.storage.folders import MARK, digest_of, mark_of, recover
 from soup_nlp.storage.store import read_h5, require
@@ -27,8 +27,8 @@ ROUNDINGS = 16
 """Error of a pixel coordinate after projection into both frames, in units of machine precision."""
 LOST = 1e-4
 """Share of the pixels that may lie on either side of a horizon."""
-WORST = 3
-"""Number of superpixels that are named by a claim."""
+OF_ROWS = ("so3", "normal", "simplex")
+"""Kinds of constraint that are rows of the NLP as they are."""
 RECOMPUTED, WRITTEN = "recomputed", "as written"
 MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, MemoryError)
 """Errors of claims and arrays that are missing or do not fit together."""
@@ -152,20 +152,18 @@ def _energies(r: Stored) -> Iterator[Claim]:
 def _constraints(r: Stored) -> Iterator[Claim]:
     """Largest violation of every kind, of the solution, the NLP's soup and Ipopt's answer."""
     rim, facing = require(r.tree, "energy/rim_ray"), float(r.tree["weights"]["min_facing"])
-    claimed, limits, within = {"solution": r.claims["residuals"]}, {"solution": LIMITS}, 0.0
+    claimed, within = {"solution": r.claims["residuals"]}, 0.0
     if r.claims["status"] != "Skipped":
         claimed |= {which: r.claims[f"{which}_residuals"] for which in ("nlp", "answer")}
-        # the limit of Ipopt's answer is the claimed violation
         within = float(r.claims["residuals"]["nlp_infeasibility"]) * (1 + 1e-6) + ABSOLUTE
-        limits |= {"nlp": LIMITS, "answer": dict.fromkeys(("so3", "normal", "simplex"), within)}
-    for which, kinds in limits.items():
-        violations = recompute.constraints(r.soup(which), rim, facing)
-        for name, limit in kinds.items():
-            # NaN counts as an infinite violation
-            violation = np.nan_to_num(violations[name], nan=np.inf, posinf=np.inf)
-            value, claim = float(violation.max()), _number(claimed[which][name])
-            note = "" if name == "simplex" else _worst(violation, limit)
-            yield Claim(f"{which} {name}", claim, value, 1e-3 * value + ABSOLUTE, limit, note)
+    for which, claims in claimed.items():
+        found = list(constraints(r.soup(which), rim, facing).values())
+        if which == "answer":
+            # its limit is the claimed violation, for what Ipopt's rows say of it
+            found = [replace(k, limit=within) for k in found if k.name in OF_ROWS]
+        for k in found:
+            value, claim = k.largest, _number(claims[k.name])
+            yield Claim(f"{which} {k.name}", claim, value, 1e-3 * value + ABSOLUTE, k.limit, k.note)
     if r.claims["delivered"] == "constrained NLP":
         a, b = r.soup("answer"), r.soup("nlp")
         # the gauge decides the unit of length and how a distance is split into lam and d
@@ -173,16 +171,6 @@ def _constraints(r: Stored) -> Iterator[Claim]:
         gaps = [np.abs(a[k] - b[k]).max() for k in ("n", "R")]
         gap = float(max(*gaps, np.abs(ratio / ratio.mean() - 1).max()))
         yield Claim("nlp is Ipopt's answer", 0.0, gap, 10 * within + RELATIVE)
-
-
-def _worst(violation: Float, limit: float) -> str:
-    """The superpixels of the largest violations (N,), and how many are beyond the limit."""
-    order = [k for k in np.argsort(-violation, kind="stable")[:WORST] if violation[k] > 0]
-    if not order:
-        return ""
-    beyond = int((violation > limit).sum())
-    count = f"{beyond} of {len(violation)} beyond {limit:.1e}; " if beyond else ""
-    return f"{count}worst superpixels " + "  ".join(f"{k} ({violation[k]:.1e})" for k in order)
 
 
 def _depths(r: Stored) -> Iterator[Claim]:

@@ -15,6 +15,7 @@ from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, MOST_SIGMA, NO_CONFIDEN
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.geometry.components import Components, find_components
+from soup_nlp.geometry.constraints import Constraints, constraints
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
@@ -175,6 +176,12 @@ class Result:
     def bending(self) -> bool:
         """Whether the whole image bends; then no component is rigid."""
         return bool(self.bends.all())
+
+    @property
+    def constraints(self) -> Constraints:
+        """Residuals of the delivered soup by kind of constraint, recomputed from its arrays."""
+        facing = float(self.tree["weights"]["min_facing"])
+        return constraints(self.tree["solution"], self.tree["energy"]["rim_ray"], facing)
 
     def soup(self, key: str) -> Float:
         """An array of the delivered soup: lam, n, d, R or t."""

@@ -7,10 +7,10 @@ import numpy as np
 from soup_nlp.arrays import Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.evaluate.metrics import component_overlaps, skill
+from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.findings import DETERMINED, ORIGINS, limits
-from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.storage.versions import versions
 
@@ -43,8 +43,8 @@ def summary(run: Run) -> dict[str, Any]:
         | ({} if r is None else {"refinement": run.energy["total"]}),
         "energy": {"start": s.energy_start, "nlp": s.energy, "solution": run.energy},
         "residuals": run.residuals,
-        "nlp_residuals": constraint_residuals(s.soup, run.data.rim_ray, facing),
-        "answer_residuals": constraint_residuals(run.answer, run.data.rim_ray, facing),
+        "nlp_residuals": constraints(s.soup, run.data.rim_ray, facing).largest,
+        "answer_residuals": constraints(run.answer, run.data.rim_ray, facing).largest,
         "refinement": None
         if r is None
         else {

@@ -1,4 +1,4 @@
-"""KKT points: residuals recomputed in plain numpy, and the multipliers of the presolve's answer."""
+"""KKT points: optimality, and the multipliers of the presolve's answer."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,55 +8,14 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from soup_nlp.arrays import Float
+from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.ipopt import Stage
 
-LIMITS = {
-    "so3": 1e-8,
-    "normal": 1e-8,
-    "simplex": 1e-10,
-    "positive": 0.0,
-    "det": 1e-8,
-    # Ipopt keeps inequalities to its own tolerance
-    "visible": 1e-6,
-}
-"""Largest violation that a delivered soup may have, by kind of constraint."""
 UNMET = "Constraints_Violated"
 """Status of a solve whose answer violates its constraints, whatever status the solver reports."""
-
-
-def feasible(soup: Soup, rim_ray: Float, min_facing: float) -> bool:
-    """Whether a soup satisfies its constraints within LIMITS; arguments as below."""
-    violations = constraint_residuals(soup, rim_ray, min_facing)
-    # false for NaN too
-    return all(violations[name] <= limit for name, limit in LIMITS.items())
-
-
-def constraint_residuals(soup: Soup, rim_ray: Float, min_facing: float) -> dict[str, float]:
-    """Largest violation of every kind of constraint, from the arrays alone.
-
-    Args:
-        soup: State.
-        rim_ray: (N, V, 3) rays where visibility is imposed.
-        min_facing: c of `-n . r >= c`.
-
-    Returns:
-        so3 (largest entry of |R^T R - I|), normal (| |n|^2 - 1 |), simplex (|sum lam - 1|),
-        positive (how far a scale or offset is below 0), visible (how far -n . r is below c),
-        det (how far det R is from +1).
-    """
-    gram = np.swapaxes(soup.R, 1, 2) @ soup.R - np.eye(3)
-    facing = -np.einsum("nc,nvc->nv", soup.n, rim_ray)
-    return {
-        "so3": float(np.abs(gram).max()),
-        "normal": float(np.abs(np.sum(soup.n**2, axis=1) - 1).max()),
-        "simplex": float(abs(soup.lam.sum() - 1)),
-        "positive": float(max(0.0, -soup.lam.min(), -soup.d.min())),
-        "visible": float(max(0.0, (min_facing - facing).max())),
-        "det": float(np.abs(np.linalg.det(soup.R) - 1).max()),
-    }
 
 
 def optimality(nlp: NLP, x: Float, lam_x: Float, lam_g: Float) -> dict[str, float]:
@@ -89,7 +48,7 @@ def residuals(
     g = nlp.constraints(stage.x)
     outside = np.maximum(nlp.lbg - g, g - nlp.ubg).max(initial=0.0)
     return {
-        **constraint_residuals(soup, data.rim_ray, min_facing),
+        **constraints(soup, data.rim_ray, min_facing).largest,
         "nlp_infeasibility": float(max(outside, 0.0)),
         **optimality(nlp, stage.x, stage.lam_x, stage.lam_g),
     }

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.arrays import Float
+from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
@@ -18,7 +19,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.ipopt import Ipopt, Stage
-from soup_nlp.solve.kkt import UNMET, WARM, feasible, residuals, warm_start
+from soup_nlp.solve.kkt import UNMET, WARM, residuals, warm_start
 from soup_nlp.solve.presolve import EXACT, LEAST_SECONDS, STOPPED, Presolve
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.storage.progress import Watch
@@ -243,7 +244,7 @@ class _Solve:
     def admissible(self, ends: Mapping[str, Soup]) -> dict[str, Soup]:
         """Soups that satisfy the constraints; if none does, the start with tilted planes."""
         data, facing = self.data, self.form.min_facing
-        kept = {k: s for k, s in ends.items() if feasible(s, data.rim_ray, facing)}
+        kept = {k: s for k, s in ends.items() if constraints(s, data.rim_ray, facing).within()}
         if kept:
             return kept
         rays = data.visibility_ray(self.form.depth_ratio)

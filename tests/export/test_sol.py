@@ -13,7 +13,8 @@ from soup_nlp.errors import ExportError
 from soup_nlp.export import verify
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import Sol, read_sol, write_sol
-from soup_nlp.export.verify import bound_multipliers, kind, least_squares_multipliers
+from soup_nlp.export.verify import bound_multipliers, least_squares_multipliers
+from soup_nlp.geometry.constraints import kind
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.solve.kkt import optimality
 

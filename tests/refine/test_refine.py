@@ -10,6 +10,7 @@ from helpers_model import K_NEXT, K_REF, Tiny, random_soup, weights_for, with_gr
 
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.geometry.superpixels import segment
@@ -30,7 +31,6 @@ from soup_nlp.refine.particles import (
     neighbours,
 )
 from soup_nlp.refine.records import RefineOptions
-from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.storage.progress import Watch
 
 FEW = RefineOptions(rounds=3, particles=16)
@@ -178,7 +178,7 @@ def test_no_round_raises_the_energy_or_violates_constraints(units):
     assert done.energy == oracle.energy(done.soup, tiny.data, weights)
     assert done.status == "rounds"
     assert len(done.rounds) == FEW.rounds
-    residuals = constraint_residuals(done.soup, tiny.data.rim_ray, 1e-3)
+    residuals = constraints(done.soup, tiny.data.rim_ray, 1e-3).largest
     assert max(residuals.values()) < 1e-12
     for r in done.rounds:
         assert r.bound <= r.mrf_energy + 1e-9

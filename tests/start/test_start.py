@@ -11,9 +11,9 @@ from helpers_truth import majority
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.solve.kkt import constraint_residuals
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.views import FlowFit
 
@@ -82,7 +82,7 @@ def assert_usable(start: Start, seg: Segmentation, K_ref: np.ndarray = CORNER_K)
         assert not np.isnan(getattr(start, name)).any(), name
     assert len(start.soup) == len(start.borrowed) == len(start.motion) == len(seg)
     anchors = camera.rays(K_ref, seg.anchors)[:, None]
-    r = constraint_residuals(start.soup, anchors, 0.0)
+    r = constraints(start.soup, anchors, 0.0).largest
     assert r["so3"] <= 1e-8
     assert r["det"] <= 1e-8
     assert r["normal"] <= 1e-10
