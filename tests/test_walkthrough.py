@@ -1,0 +1,78 @@
+"""The commands and programs of the README and of the guides run as printed, from top to bottom.
+
+Every page starts in an empty folder with the files that a reader brings. Only sizes differ: what a
+command solves has few superpixels and small images.
+"""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import webbrowser
+from pathlib import Path
+
+import pytest
+from helpers_files import write_pair
+
+from soup_nlp.cli.main import main
+from soup_nlp.config.problem import Problem
+from soup_nlp.data.scenes.catalogue import render_scene
+
+ROOT = Path(__file__).resolve().parents[1]
+BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+INSTALLATION = {"pip", "make"}
+"""Programs of an installation, which `.ci/run` uses."""
+SOLVES = {"solve", "demo", "chain"}
+"""Commands that write their result and end with 1 where most of a small image is a guess."""
+
+
+def small(tree):
+    """The sections of a problem file with small sizes."""
+    segmentation = {**tree.get("segmentation", {})}
+    segmentation["superpixels"] = min(segmentation.get("superpixels", 40), 40)
+    sizes = {"max_size": 0.03, "segmentation": segmentation}
+    if isinstance(tree.get("input"), dict) and tree["input"].get("kind") == "scene":
+        sizes["input"] = {**tree["input"], "width": 192, "height": 96}
+    return {**tree, **sizes}
+
+
+@pytest.fixture
+def reader(tmp_path, monkeypatch):
+    """An empty folder with the reader's own files, and small sizes for what is solved there."""
+    monkeypatch.chdir(tmp_path)
+    validate = Problem.model_validate
+    monkeypatch.setattr(Problem, "model_validate", lambda tree: validate(small(tree)))
+    monkeypatch.setattr(webbrowser, "open", lambda address: True)
+    (tmp_path / "clip").mkdir()
+    for frame in range(2):
+        pair = render_scene("orbit", width=192, height=96, frame=frame)
+        write_pair(tmp_path / "clip", pair, [f"{frame}", f"{frame + 1}"])
+    for name, frame in (("a", 0), ("b", 1)):
+        shutil.copy(tmp_path / "clip" / f"{frame}.png", tmp_path / f"{name}.png")
+
+
+def run_line(words):
+    """Run one command line; returns its exit code."""
+    if words[0] == "soup-nlp":
+        return main(words[1:])
+    beside = str(Path(sys.executable).parent)
+    program = shutil.which(words[0], path=beside) or shutil.which(words[0])
+    if program is None:
+        pytest.skip(f"no {words[0]}")
+    return subprocess.run([program, *words[1:]], check=False).returncode
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize("page", ["README.md", "docs/using.md", "docs/python.md"])
+def test_a_page_runs_as_printed(page):
+    names = {}
+    for language, block in BLOCK.findall((ROOT / page).read_text(encoding="utf-8")):
+        if language == "python":
+            exec(block, names)
+            continue
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if words and words[0] not in INSTALLATION:
+                assert run_line(words) <= (len(words) > 1 and words[1] in SOLVES), line
