@@ -1,10 +1,9 @@
-"""Camera files: Sintel .cam, KITTI calibration, Virtual KITTI intrinsics, plain text.
+"""Camera files: intrinsics of common tools, Sintel .cam, rows of KITTI and Virtual KITTI.
 
 All intrinsics are (3, 3), in pixels. Every reader raises `DataError` for a file that is missing, of
-another kind, or without a valid camera.
+another kind, or without one valid camera.
 """
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,28 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image
+from soup_nlp.data.formats.camera_names import (
+    DISTORTION,
+    TRY,
+    cameras_of,
+    check_model,
+    distortion_of,
+    matrix_of,
+    names_found,
+    number,
+    refused,
+)
+from soup_nlp.data.formats.camera_text import leaves
 from soup_nlp.data.formats.images import check_body
-from soup_nlp.data.formats.map_files import after_magic
+from soup_nlp.data.formats.map_files import MAGIC, after_magic
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.storage.files import PathLike, parse_yaml, read_text
-
-CAMERA = ("fx", "fy", "cx", "cy")
-DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""Coefficients of distortion in OpenCV's order; up to six more have no common names."""
-
-
-def _numbers(text: str, where: PathLike, what: str) -> list[float]:
-    """Numbers of a text, separated by blanks or commas."""
-    values = []
-    for word in text.replace(",", " ").split():
-        try:
-            values.append(float(word))
-        except ValueError:
-            raise DataError(
-                f"{what} holds a word that is not a number", where=where, found=repr(word)
-            ) from None
-    return values
+from soup_nlp.storage.files import PathLike, read_bytes, read_text
 
 
 def check_intrinsics(matrix: NDArray[Any], where: object) -> Float:
@@ -57,7 +51,7 @@ def check_intrinsics(matrix: NDArray[Any], where: object) -> Float:
             where=where,
             found=K.tolist(),
             expected="finite numbers [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy",
-            hint="give fy without its sign, if the y axis points up (ICL-NUIM)" if up else None,
+            hint="give fy without its sign, if the y axis points up (ICL-NUIM)" if up else TRY,
         )
     return K
 
@@ -82,69 +76,63 @@ def read_intrinsics(path: PathLike) -> Float:
 
 
 def read_camera(path: PathLike) -> tuple[Float, Float]:
-    """Read intrinsics (3, 3) and distortion (n,) of OpenCV (k1 k2 p1 p2 k3 ...) from a text file.
+    """Read intrinsics (3, 3) and distortion (n,) of OpenCV (k1 k2 p1 p2 k3 ...) from a file.
 
-    The file holds nine numbers (the 3x3 matrix, row by row) or four (fx fy cx cy), separated by
-    blanks or commas; lines that start with # are comments. The distortion follows if there is one.
-    Instead, numbers may have names (fx: 500), or the file may be a YAML file of OpenCV or ROS.
-    """
-    lines = read_text(path, "intrinsics file").splitlines()
-    text = "\n".join(x for x in lines if not x.strip().startswith("#"))
-    values = _named(text, path) or _numbers(text, path, "intrinsics file")
-    matrix = len(values) in (13, 14, 17) or (len(values) == 9 and values[6:] == [0, 0, 1])
-    count = 9 if matrix or (len(values) == 9 and not _is_distortion(values[4:])) else 4
-    if not (len(values) == count or (_is_distortion(values[count:]) and len(values) < 23)):
-        raise DataError(
-            "intrinsics file has the wrong number of values",
-            where=path,
-            found=len(values),
-            expected="9 (the 3x3 matrix by rows) or 4 (fx fy cx cy), then the distortion if any",
-        )
-    K = np.reshape(values[:9], (3, 3)) if count == 9 else intrinsics(*values[:4])
-    return check_intrinsics(K, path), np.array(values[count:])
-
-
-def _is_distortion(values: Sequence[float]) -> bool:
-    """Whether numbers may be coefficients of distortion, which are small."""
-    return len(values) > 0 and max(abs(x) for x in values) < 100
-
-
-def _named(text: str, where: PathLike) -> list[float]:
-    """fx, fy, cx, cy and distortion of a text with names; empty if it has none.
+    Numbers without names are the 3x3 matrix, row by row, or fx fy cx cy, and then the distortion if
+    there is one. With names the file is that of a common tool (ROS, OpenCV, Kalibr, nerfstudio,
+    Open3D, RealSense, COLMAP ...).
 
     Raises:
-        DataError: the distortion model of the lens is not OpenCV's.
+        DataError: the file holds no camera, several cameras, or one of another model.
     """
-    if re.search("fisheye|equidistant|KannalaBrandt", text, re.IGNORECASE):
-        raise DataError(
-            "camera file holds the distortion of a fisheye lens",
-            where=where,
-            expected="a pinhole camera, with distortion k1 k2 p1 p2 k3 ... or without",
-            hint="undistort the images first, for example by cv2.fisheye.undistortImage",
+    try:
+        if read_bytes(path, "camera file").startswith(MAGIC):
+            return read_cam(path), np.zeros(0)
+        named = leaves(path)
+    except DataError as error:
+        raise refused(error.what, path, error.found, error.hint or TRY) from None
+    except ValueError as error:  # also of decoding
+        raise refused("camera file is not text of a known kind", path, error) from None
+    if [names for names, _ in named] == [()]:
+        return _plain([number(word, "", path) for word in named[0][1]], path)
+    check_model(named, path)
+    cameras = cameras_of(named, path)
+    different: dict[tuple[float, ...], str] = {}
+    for name, K in cameras:
+        different.setdefault(tuple(K.ravel()), f"{name or 'unnamed'}: {_four(K)}")
+    if len(different) > 1:
+        several = list(different.values())
+        raise refused(
+            f"camera file holds {len(several)} cameras",
+            path,
+            "; ".join(several[:8]),
+            f"choose one by its numbers: --intrinsics {_four(cameras[0][1])} for {cameras[0][0]}",
         )
-    pattern = rf"\b({'|'.join((*CAMERA, *DISTORTION))})\b[\"']?\s*[:=]?\s*(-?[\d.]+(?:e[-+]?\d+)?)"
-    named = {name.lower(): float(x) for name, x in re.findall(pattern, text, re.IGNORECASE)}
-    if named.keys() >= set(CAMERA):
-        last = max((k + 1 for k, name in enumerate(DISTORTION) if name in named), default=0)
-        return [named.get(name, 0.0) for name in (*CAMERA, *DISTORTION[:last])]
-    try:
-        # the YAML parser rejects OpenCV's header and tags
-        tree = parse_yaml(re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE))
-    except ValueError:
-        return []
-    if not isinstance(tree, dict):
-        return []
+    if not cameras:
+        raise refused("camera file holds no camera", path, *names_found(named))
+    return check_intrinsics(cameras[0][1], path), distortion_of(named, path)
 
-    def entry(names: str) -> list[float]:
-        value: Any = next((v for k, v in tree.items() if re.fullmatch(names, str(k))), [])
-        value = value.get("data", []) if isinstance(value, dict) else value
-        return [float(x) for x in np.ravel(value)]
 
-    try:
-        K = entry("camera_?[mM]atrix|K")
-        return [*K, *entry("distortion_(coefficients|parameters)|dist_?[cC]oeffs|D")] if K else []
-    except (TypeError, ValueError):
-        return []
+def _four(K: Float) -> str:
+    return ",".join(f"{x:g}" for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+
+
+def _plain(values: list[float], where: PathLike) -> tuple[Float, Float]:
+    """Intrinsics and distortion of numbers without names."""
+    K = matrix_of(values)
+    if K is not None:
+        return check_intrinsics(K, where), np.zeros(0)
+    matrix = len(values) in (13, 14, 17) or (len(values) == 9 and not _small(values[4:]))
+    count = 9 if matrix else 4
+    if not (len(values) == count or (_small(values[count:]) and len(values) < 23)):
+        raise refused("intrinsics file has the wrong number of values", where, len(values))
+    K = np.reshape(values[:9], (3, 3)) if matrix else intrinsics(*values[:4])
+    return check_intrinsics(K, where), np.array(values[count:])
+
+
+def _small(values: Sequence[float]) -> bool:
+    """Whether numbers may be coefficients of distortion."""
+    return len(values) > 0 and max(abs(x) for x in values) < 100
 
 
 def undistorted(image: Image, K: Float, distortion: Float) -> tuple[Image, Float]:
@@ -174,7 +162,7 @@ def read_rows(path: PathLike, names: Sequence[str], count: int) -> Float:
     for name in names:
         head = name.split()
         rows = [line[len(head) :] for line in lines if line[: len(head)] == head]
-        row = _numbers(" ".join(rows[0] if rows else []), f"{path}, {name}", "calibration file")
+        row = [number(word, name, path) for word in (rows[0] if rows else [])]
         if len(row) != count or not np.isfinite(row).all():
             others = [line[0] for line in lines if line]
             raise DataError(

@@ -82,7 +82,7 @@ def _read_pieh(path: PathLike, what: str, *channels: int) -> FloatMap:
     return _floats(content[8:], (height, width, *channels), "<", path, what)
 
 
-def _array(content: bytes, path: PathLike, what: str) -> NDArray[Any]:
+def npy_array(content: bytes, path: PathLike, what: str) -> NDArray[Any]:
     """One array of real numbers of the content of a .npy file, without pickles."""
     stream = io.BytesIO(content)
     try:
@@ -117,7 +117,7 @@ def read_npz(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
     if size > most:
         raise DataError(f"{what} is too large", where=path, found=f"{size} bytes", expected=most)
     return {
-        name.removesuffix(".npy"): _array(part, path, f"{what}, {name}")
+        name.removesuffix(".npy"): npy_array(part, path, f"{what}, {name}")
         for name, part in parts.items()
     }
 
@@ -206,7 +206,7 @@ def read_flow(path: PathLike) -> Float:
     readers: dict[str, Reader] = {
         ".flo": lambda p: _read_pieh(p, "flow file", 2),
         ".png": lambda p: (_read_flow_png(p, "KITTI flow") - 2.0**15) / 64.0,
-        ".npy": lambda p: _array(read_bytes(p, "flow file"), p, "flow file"),
+        ".npy": lambda p: npy_array(read_bytes(p, "flow file"), p, "flow file"),
     }
     return _known_flow(_by_suffix(path, readers, "flow"), path)
 
@@ -214,7 +214,7 @@ def read_flow(path: PathLike) -> Float:
 def read_confidence(path: PathLike) -> NDArray[Any]:
     """The confidence of a .npy file, or of a grey image of 8 or 16 bits (black is 0, white 1)."""
     if Path(path).suffix == ".npy":
-        return _array(read_bytes(path, "confidence file"), path, "confidence file")
+        return npy_array(read_bytes(path, "confidence file"), path, "confidence file")
     image = decode(path, "confidence map")
     whole = image.dtype.kind == "u"
     return image / np.iinfo(image.dtype).max if whole else image
@@ -303,7 +303,7 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
 
     readers: dict[str, Reader] = {
         ".dpt": lambda p: _read_pieh(p, "depth file"),
-        ".npy": lambda p: _array(read_bytes(p, "depth file"), p, "depth file"),
+        ".npy": lambda p: npy_array(read_bytes(p, "depth file"), p, "depth file"),
         ".pfm": read_pfm,
         ".png": by_scale,
     }

@@ -1,0 +1,217 @@
+"""Cameras in the named values of a file: their intrinsics, model and distortion.
+
+Names of other models, values that are no numbers, and a name twice with other values are refused.
+"""
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from soup_nlp.arrays import Float
+from soup_nlp.data.formats.camera_text import Leaf
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.storage.files import PathLike
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Coefficients of distortion in OpenCV's order; up to six more have no common names."""
+
+_EXPECTED = (
+    "one pinhole camera in pixels: fx fy cx cy or a 3x3 matrix, as numbers or with names (text,"
+    " YAML, JSON, INI, .npy, COLMAP's cameras.txt), with distortion k1 k2 p1 p2 k3 ... or without"
+)
+TRY = "give the four numbers: --intrinsics FX,FY,CX,CY, in Python K_ref=(fx, fy, cx, cy)"
+
+_NUMBER = re.compile(
+    r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|\.?nan|\.?inf(?:inity)?)", re.IGNORECASE
+)
+_FOCAL = r"(?:f|fl|focal(?:_?length)?)"
+_POINT = r"(?:c|pp|principal_?point)"
+_SCALARS = {
+    "fx": rf"{_FOCAL}_?x|fu",
+    "fy": rf"{_FOCAL}_?y|fv",
+    "cx": rf"{_POINT}_?x|cu|u0",
+    "cy": rf"{_POINT}_?y|cv|v0",
+    "f": rf"{_FOCAL}|fc",
+    "c": rf"{_POINT}|cc",
+    "skew": "skew",
+}
+_PARAMETER = re.compile(
+    "(?:(.*)[._ -])?(?:"
+    + "|".join(f"(?P<{name}>{pattern})" for name, pattern in _SCALARS.items())
+    + "|"
+    + "|".join(f"(?P<{name}>{name[0]}_?{name[1]})" for name in DISTORTION)
+    + ")",
+    re.IGNORECASE,
+)
+_MATRIX = r"k|k_\d+|mtx|cam_?k|(?:camera_?)?intrinsics?(?:_?matrix)?|camera_?matrix"
+_OTHER_MODEL = r"xi|alpha|beta|omega|lambda"
+"""Parameters of double sphere, extended unified and field-of-view cameras."""
+_LIST = r"d_?\d*|kc|disto?|(?:distortion|dist)(?:_?(?:coeff\w*|param\w*|vector))?|coeff\w*"
+_DISTORTED = (
+    r"(?<!un)distort|dist_?co|\bdist\b|radial|tangential|coeff|kappa|poly|\bk_?\d*$|\bp_?\d+$"
+    r"|\bs_?[1-4]$|\btau_?[xy]$"
+)
+_MODEL = r"xi|alpha|beta|omega|lambda"
+"""Parameters of double sphere, extended unified and field-of-view cameras."""
+_LIST = r"d_?\d*|kc|disto?|(?:distortion|dist)(?:_?(?:coeff\w*|param\w*|vector))?|coeff\w*"
+_DISTORTED = r"(?<!un)dist(?!ance)|radial|tangential|coeff|kappa|poly|\b[kps]_?\d*$|\btau_?[xy]$"
+_MODEL = r"(?:camera|distortion|lens|projection)?_?(?:model|type)(?:_?name)?|projection|lens"
+_PINHOLE = (
+    r"pin_?hole|opencv|rad_?tan|radial|plumb|rational|brown|perspective|linear|none|null|false|^$"
+)
+_OTHER = (
+    r"fish|equi|kannala|brandt|double|spher|^ds$|^e?ucm$|unified|omni|^mei|^fov|atan|^kb\d*$|scara"
+    r"|ocam|pano|cylind|division|prism|theta|ortho"
+)
+
+
+def refused(what: str, where: PathLike, found: object = None, hint: str = TRY) -> DataError:
+    """The error for a camera file, with what is expected and what to try."""
+    return DataError(what, where=where, found=found, expected=_EXPECTED, hint=hint)
+
+
+def number(word: str, name: str, where: PathLike) -> float:
+    """A word as a number, all of it."""
+    if not _NUMBER.fullmatch(word):
+        comma = ", with a point instead of the decimal comma" if "," in word else ""
+        what = f"camera file holds a word that is not a number{name and ' for '}{name}"
+        raise refused(what, where, repr(word), f"write plain numbers{comma}; or {TRY}")
+    return float(re.sub(r"\.(?=[ni])", "", word.lower()))
+
+
+def names_found(named: Sequence[Leaf]) -> tuple[str, str]:
+    """Names of a file without a camera, and what to try."""
+    shown = ", ".join(".".join(names) for names, _ in named[:12]) or "nothing"
+    for names, words in named:
+        if names[-1:] == ("camera_angle_x",) and re.fullmatch(r"\d*\.\d+", "".join(words)):
+            degrees = math.degrees(float(words[0]))
+            return shown, f"camera_angle_x is a field of view: --fov {degrees:.2f}"
+    return shown, TRY
+
+
+def matrix_of(values: Sequence[float]) -> Float | None:
+    """The camera of 9 numbers of a matrix, by rows or columns, of 3x4 or of 4x4; None for others.
+
+    Column by column it has its principal point in the last row.
+    """
+    if len(values) not in (9, 12, 16):
+        return None
+    whole = np.reshape(values, (4, 4) if len(values) == 16 else (3, -1))
+    for matrix in (whole, whole.T) if len(values) != 12 else (whole,):
+        K = matrix[:3, :3]
+        rest = matrix[3:].ravel().tolist() in ([], [0, 0, 0, 1])
+        if rest and (K[2] == [0, 0, 1]).all() and K[1, 0] == 0:
+            return np.array(K)
+    return None
+
+
+def _scalar(names: Sequence[str]) -> tuple[str, str]:
+    """The names before a parameter of a camera, and which one it is; empty for other names."""
+    match = _PARAMETER.fullmatch(".".join(names))
+    return (match.group(1) or "", str(match.lastgroup)) if match else ("", "")
+
+
+def cameras_of(named: Sequence[Leaf], where: PathLike) -> list[tuple[str, Float]]:
+    """Name and intrinsics (3, 3) of every camera with names."""
+    groups: dict[str, dict[str, list[float]]] = {}
+    out: list[tuple[str, Float]] = []
+    for names, words in named:
+        name, last = ".".join(names), names[-1] if names else ""
+        group, parameter = _scalar(names)
+        if parameter in ("f", "c") and not all(map(_NUMBER.fullmatch, words)):
+            continue  # a text, such as the focal length in millimetres
+        if parameter in _SCALARS:
+            values = [number(word, name, where) for word in words]
+            if len(values) not in ((1, 2) if parameter in "fc" else (1,)):
+                raise refused(f"{name} is not one number", where, " ".join(words) or "no number")
+            if groups.setdefault(group, {}).setdefault(parameter, values) != values:
+                both = f"{groups[group][parameter][0]:g} and {values[0]:g}"
+                raise refused(f"{name} is given twice", where, both)
+        elif re.fullmatch(_MATRIX, last, re.IGNORECASE) and len(words) in (4, 9, 12, 16):
+            values = [number(word, name, where) for word in words]
+            K = intrinsics(*values) if len(values) == 4 else matrix_of(values)
+            rows = np.reshape(values[:9], (3, 3)) if K is None else K
+            out.append((name, rows))
+        elif len(words) == 9 or (len(words) == 12 and re.fullmatch(r"[pP]\d+", last)):
+            numbers = [number(word, name, where) for word in words if _NUMBER.fullmatch(word)]
+            K = matrix_of(numbers)
+            # a rotation has no element above 1
+            if K is not None and K.diagonal().min() > 0 and K[0, 0] > 1:
+                out.append((name, K))
+    for group, found in groups.items():
+        point = {"cx", "cy", "c"} & found.keys()
+        if {"fx", "fy"} & found.keys() or ("f" in found and point):
+            out.append((group, _grouped(group, found, where)))
+    return out
+
+
+def _grouped(group: str, values: dict[str, list[float]], where: PathLike) -> Float:
+    """Intrinsics of parameters with the same names before them."""
+    # fx and fy, or one focal length for both
+    parts = {k: v for k, v in values.items() if k in ("fx", "fy", "cx", "cy")}
+    for pair, names in (("f", ("fx", "fy")), ("c", ("cx", "cy"))):
+        for k, name in enumerate(names if pair in values else ()):
+            parts.setdefault(name, values[pair][k:] or values[pair])
+    missing = [name for name in ("fx", "fy", "cx", "cy") if name not in parts]
+    if missing:
+        what = f"camera {group}".strip() + f" lacks {' and '.join(missing)}"
+        raise refused(what, where, ", ".join(values))
+    K = intrinsics(*(parts[name][0] for name in ("fx", "fy", "cx", "cy")))
+    K[0, 1] = values.get("skew", [0.0])[0]
+    return K
+
+
+def check_model(named: Sequence[Leaf], where: PathLike) -> None:
+    """Raise DataError if a name or a parameter is that of another model than a pinhole camera."""
+    for names, words in named:
+        last, value = (names[-1] if names else "").lower(), " ".join(words).lower()
+        numbers = re.fullmatch(r"[-+.\d\se]*", value)
+        of_model = re.fullmatch(_MODEL, last) or (re.fullmatch(_LIST, last) and not numbers)
+        strict = last not in ("model", "type", "lens", "projection")
+        other = re.search(_OTHER, value) or (strict and not re.search(_PINHOLE, value))
+        parameter = re.fullmatch(_OTHER_MODEL, last) and value not in ("0", "0.0")
+        if (of_model and not numbers and other) or (parameter and numbers):
+            raise refused(
+                "camera file holds a camera of another model, such as a fisheye lens",
+                where,
+                f"{'.'.join(names)}: {value}",
+                "undistort the images first, for example by cv2.fisheye.undistortImage, and give"
+                " the camera of the new images",
+            )
+
+
+def distortion_of(named: Sequence[Leaf], where: PathLike) -> Float:
+    """Coefficients (n,) of the distortion of all names in the file, in OpenCV's order."""
+    found: dict[int, float] = {}
+
+    def put(name: str, values: Iterable[tuple[int, float]]) -> None:
+        for k, value in values:
+            if not math.isfinite(value) or found.setdefault(k, value) != value:
+                both = f"{found[k]:g} and {value:g}" if k in found else f"{value:g}"
+                raise refused(f"distortion {name} is unclear", where, both)
+
+    inverse = any("inverse" in word.lower() for _, words in named for word in words)
+    for names, words in named:
+        name, (_, parameter) = ".".join(names), _scalar(names)
+        matrix = len(words) in (9, 12, 16)  # K, or a projection P1
+        if parameter in DISTORTION and not matrix:
+            if len(words) != 1:
+                raise refused(f"{name} is not one number", where, " ".join(words) or "no number")
+            put(name, [(DISTORTION.index(parameter), number(words[0], name, where))])
+            continue
+        as_list = re.fullmatch(_LIST, names[-1] if names else "", re.IGNORECASE)
+        if not as_list and (matrix or not re.search(_DISTORTED, name, re.IGNORECASE)):
+            continue
+        if not words or not re.match(r"[-+.\d]", words[0]):
+            continue  # a name of the model, none, false
+        values = [number(word, name, where) for word in words]
+        if any(values) and (not as_list or len(values) > 14 or inverse):
+            what = "camera file holds distortion of another model than OpenCV's"
+            hint = "undistort the images first, and give the camera of the new images"
+            raise refused(what, where, f"{name}: {' '.join(words)}", hint)
+        put(name, enumerate(values))
+    last = max((k + 1 for k, value in found.items() if value), default=0)
+    return np.array([found.get(k, 0.0) for k in range(last)])
