@@ -48,16 +48,12 @@ _PARAMETER = re.compile(
 )
 _MATRIX = r"k|k_\d+|mtx|cam_?k|(?:camera_?)?intrinsics?(?:_?matrix)?|camera_?matrix"
 _OTHER_MODEL = r"xi|alpha|beta|omega|lambda"
-"""Parameters of double sphere, extended unified and field-of-view cameras."""
+"""Parameters of double sphere, extended unified, field-of-view and division cameras."""
 _LIST = r"d_?\d*|kc|disto?|(?:distortion|dist)(?:_?(?:coeff\w*|param\w*|vector))?|coeff\w*"
 _DISTORTED = (
     r"(?<!un)distort|dist_?co|\bdist\b|radial|tangential|coeff|kappa|poly|\bk_?\d*$|\bp_?\d+$"
     r"|\bs_?[1-4]$|\btau_?[xy]$"
 )
-_MODEL = r"xi|alpha|beta|omega|lambda"
-"""Parameters of double sphere, extended unified and field-of-view cameras."""
-_LIST = r"d_?\d*|kc|disto?|(?:distortion|dist)(?:_?(?:coeff\w*|param\w*|vector))?|coeff\w*"
-_DISTORTED = r"(?<!un)dist(?!ance)|radial|tangential|coeff|kappa|poly|\b[kps]_?\d*$|\btau_?[xy]$"
 _MODEL = r"(?:camera|distortion|lens|projection)?_?(?:model|type)(?:_?name)?|projection|lens"
 _PINHOLE = (
     r"pin_?hole|opencv|rad_?tan|radial|plumb|rational|brown|perspective|linear|none|null|false|^$"
