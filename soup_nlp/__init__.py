@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from soup_nlp.geometry.soup import Reconstruction, Soup
     from soup_nlp.report.folder import WritableRun as Run
     from soup_nlp.report.folder import run, solve_pair
-    from soup_nlp.report.result import Result, load
+    from soup_nlp.report.result import Result
+    from soup_nlp.sequence.folder import load
     from soup_nlp.sequence.solve import solve_chain as chain
     from soup_nlp.storage.versions import __version__
 
@@ -60,7 +61,7 @@ _HOMES = {
     "__version__": "storage.versions",
     "chain": "sequence.solve:solve_chain",
     "constraints": "geometry.constraints",
-    "load": "report.result",
+    "load": "sequence.folder",
     "load_problem": "config.problem",
     "make_problem": "config.problem",
     "nlp": "export.symbolic",

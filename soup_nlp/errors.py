@@ -66,6 +66,10 @@ class DataError(SoupError):
     """An input image, flow, camera or truth file is wrong."""
 
 
+class FrameError(DataError, IndexError):
+    """A chain has no frame of this number."""
+
+
 class ModelError(SoupError):
     """The model cannot be built from these inputs."""
 

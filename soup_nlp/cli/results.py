@@ -19,20 +19,12 @@ from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
 from soup_nlp.family.describe import check_sol
 from soup_nlp.geometry.constraints import table
-from soup_nlp.report.check import check_folder
-from soup_nlp.report.folder import convert as convert_folder
-from soup_nlp.report.folder import prepare_folder, renew_page, write_folder
+from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.formats import FORMATS
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import accuracy, sectioned
-from soup_nlp.sequence.folder import (
-    CHAIN_PAGE,
-    check_chain,
-    convert_chain,
-    is_chain,
-    read_chain,
-    renew_chain_page,
-)
+from soup_nlp.sequence import folder as folders
+from soup_nlp.sequence.folder import is_chain, read_chain, renew_page
 from soup_nlp.sequence.frames import depth_files
 from soup_nlp.sequence.score import score, score_lines
 from soup_nlp.storage.files import is_folder
@@ -52,7 +44,7 @@ def check(
     Exit code 1: a claim or a constraint does not hold; 3: a .sol is feasible, but no KKT point.
     """
     if is_folder(folder) or folder.suffix != ".sol":
-        report = check_chain(folder) if is_chain(folder) else check_folder(folder)
+        report = folders.check(folder)
         print(report)
         return options.finish(
             report.ok, "every claim holds" if report.ok else "a claim does not hold"
@@ -88,7 +80,7 @@ def evaluate(
                 hint="soup-nlp evaluate DIR/pairs/000_001 scores one pair with other rules",
             )
         truths = [read_depth(path, depth_scale) for path in depth_files(depth)]
-        print("\n".join(score_lines(score(read_chain(folder)[0], truths))))
+        print("\n".join(score_lines(score(read_chain(folder), truths))))
         return
     scores = evaluate_folder(folder, depth, scale=scale, cap=cap, depth_scale=depth_scale)
     print("\n".join(accuracy(scores)))
@@ -132,10 +124,10 @@ def view(
     no_open: Annotated[bool, option("Print the address, open no browser.", "--no-open")] = False,
 ) -> None:
     """Open the page of a result in a browser, or serve it."""
-    page, renewed = (CHAIN_PAGE, renew_chain_page) if is_chain(folder) else (PAGE, renew_page)
-    file = folder / page
+    is_chain(folder)
+    file = folder / PAGE
     if renew or not file.is_file():
-        file = renewed(folder)
+        renew_page(folder)
     if serve is None:
         address = file.resolve().as_uri()
         opened = not no_open and webbrowser.open(address)
@@ -153,7 +145,7 @@ def view(
             hint="--serve 0 chooses one",
         ) from error
     with server:
-        address = f"http://127.0.0.1:{server.server_address[1]}/{page}"
+        address = f"http://127.0.0.1:{server.server_address[1]}/{PAGE}"
         print(f"serving     {address} until Ctrl-C", flush=True)
         if not no_open:
             webbrowser.open(address)
@@ -174,6 +166,5 @@ def convert(
 ) -> None:
     """Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions."""
     target = folder if out is None else out
-    write = convert_chain if is_chain(folder) else convert_folder
-    for name in write(folder, options.listed(to), out, overwrite):
+    for name in folders.convert(folder, options.listed(to), out, overwrite):
         print(target / name)

@@ -19,11 +19,11 @@ from soup_nlp.pipeline.run import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import exit_code, verdict
-from soup_nlp.sequence.folder import CHAIN, SINGLE
+from soup_nlp.sequence.folder import SINGLE
 from soup_nlp.sequence.frames import IMAGES, VIDEOS, Frames
 from soup_nlp.sequence.score import chain_exit_code, chain_lines
 from soup_nlp.sequence.solve import AUTO, named, solve_chain
-from soup_nlp.storage.files import as_path, is_file, read_json
+from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.folders import default_folder
 from soup_nlp.storage.progress import interruptible
 from soup_nlp.storage.system import scratch
@@ -263,8 +263,8 @@ def chain(
             begin=begin,
             say=options.RowProgress(quiet),
         )
-    print("\n".join(chain_lines(done, read_json(out / CHAIN, CHAIN))))
-    print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "points/", "pairs/"]))
+    print("\n".join(chain_lines(done)))
+    print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "pairs/"]))
     code, why = chain_exit_code(done)
     print(f"exit code   {code}: {why}")
     return code

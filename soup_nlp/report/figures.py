@@ -147,7 +147,7 @@ def overview(drawn: Mapping[str, Picture], title: str) -> Image:
 
 def write_png(path: PathLike, rgb: Image) -> None:
     """Write an (H, W, 3) uint8 RGB image as PNG."""
-    _encode(path, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    encode_png(path, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 
 def depth_png_scale(depth: AnyFloat) -> float:
@@ -157,10 +157,10 @@ def depth_png_scale(depth: AnyFloat) -> float:
     return float(2.0 ** np.floor(np.log2(65535.0) - np.log2(far)))
 
 
-def write_clipped_depth_png16(path: PathLike, depth: AnyFloat, scale: float | None = None) -> float:
-    """Write a depth map as 16-bit PNG: value = round(depth * scale), 0 where unknown.
+def write_depth_png16(path: PathLike, depth: AnyFloat, scale: float | None = None) -> float:
+    """Write a depth map as 16-bit PNG: value = round(depth * scale), at least 1.
 
-    Values of known depths are clipped to 1 .. 65535.
+    0 stands for what is unknown, or farther than 65535 can say: no depth is clipped.
 
     Args:
         path: File to write; its folder must exist.
@@ -172,15 +172,16 @@ def write_clipped_depth_png16(path: PathLike, depth: AnyFloat, scale: float | No
         The scale, which a reader needs: depth = value / scale.
     """
     z = np.asarray(depth, np.float64)
-    known = np.isfinite(z) & (z > 0)
-    if scale is None:
-        scale = depth_png_scale(z)
-    value = np.clip(np.round(np.where(known, z, 0.0) * scale), 1, 65535)
-    _encode(path, np.where(known, value, 0).astype(np.uint16))
-    return float(scale)
+    scale = depth_png_scale(z) if scale is None else float(scale)
+    with np.errstate(invalid="ignore"):
+        value = np.round(z * scale)
+        fits = (z > 0) & (value <= 65535)
+    encode_png(path, np.where(fits, np.maximum(value, 1), 0).astype(np.uint16))
+    return scale
 
 
-def _encode(path: PathLike, array: NDArray[np.generic]) -> None:
+def encode_png(path: PathLike, array: NDArray[np.generic]) -> None:
+    """Write an array (H, W) of uint8 or uint16, or (H, W, 3) BGR, as PNG."""
     # files are a third smaller than at the default level
     _, data = cv2.imencode(".png", array, [cv2.IMWRITE_PNG_COMPRESSION, 2])
     write_bytes(path, data.tobytes())

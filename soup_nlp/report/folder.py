@@ -19,13 +19,14 @@ from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import DataError
 from soup_nlp.pipeline import run as pipeline
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.figures import overview, write_clipped_depth_png16, write_picture, write_png
+from soup_nlp.report.chain import Chain
+from soup_nlp.report.figures import overview, write_depth_png16, write_picture, write_png
 from soup_nlp.report.findings import guess_line
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import rows_in_file
-from soup_nlp.report.page import page
+from soup_nlp.report.page import pair_page
 from soup_nlp.report.pictures import pictures
-from soup_nlp.report.result import PAGE, Result, load, result_of
+from soup_nlp.report.result import PAGE, Result, result_of
 from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.files import as_path, write_json, write_text
@@ -131,21 +132,20 @@ def write_folder(
         words = facts(run) if verdict is None else verdict
         contents = {**summary(run), "verdict": words.splitlines()}
         result = result_of(run, contents)
-        drawn, rec = pictures(result), run.reconstruction
+        drawn, rec = pictures(Chain.of(result)), run.reconstruction
         depths: dict[str, AnyFloat] = {"ref": rec.depth_ref, "next": rec.depth_next}
         if run.full is not None:
             depths |= {"ref_full": run.full.depth_ref, "next_full": run.full.depth_next}
         scales = {
-            name: write_clipped_depth_png16(new / f"depth_{name}.png", z)
-            for name, z in depths.items()
+            name: write_depth_png16(new / f"depth_{name}.png", z) for name, z in depths.items()
         }
         for name, file in PICTURES.items():
             if name in drawn:
                 write_picture(new / file, drawn[name])
         write_png(new / "overview.png", overview(drawn, _title(result)))
-        write_formats(new, result, ("motions", "ply", *formats))
+        write_formats(new, Chain.of(result), ("motions", "ply", *formats))
         if run.problem.output.page:
-            write_text(new / PAGE, page(result, drawn))
+            write_text(new / PAGE, pair_page(result, drawn))
         write_json(new / "summary.json", {**contents, "depth_png_scale": scales})
         attributes, rows = _attributes(run, config), rows_in_file(result.metre_unit)
         write_h5(new / "result.h5", result.tree, attributes, rows)
@@ -192,51 +192,6 @@ def write_failure(folder: Path, log: str, ipopt_log: Path, overwrite: bool = Fal
         write_text(new / FAILED, log)
 
 
-def renew_page(folder: Path) -> Path:
-    """Make the page of a result folder again from its arrays; returns the file of the page.
-
-    Args:
-        folder: Result folder.
-
-    Raises:
-        DataError: the folder holds no result, or cannot be written.
-    """
-    result = load(folder)
-    try:
-        text = page(result, pictures(result))
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise DataError(
-            "result lacks what a page shows", where=folder, found=repr(error), hint="solve it again"
-        ) from error
-    with staged(folder, overwrite=True) as new:
-        write_text(new / PAGE, text)
-    return folder / PAGE
-
-
-def convert(
-    folder: Path, formats: Sequence[str], out: Path | None = None, overwrite: bool = False
-) -> list[str]:
-    """Write a result folder in other formats.
-
-    Args:
-        folder: Result folder of `solve`, `import` or `Run.save`.
-        formats: See `formats.FORMATS`.
-        out: Output folder; None for the result folder itself.
-        overwrite: Overwrite files that the program did not make.
-
-    Returns:
-        Names of the files and folders.
-
-    Raises:
-        ConfigError: a format is not known.
-        DataError: the folder holds no result, or the other one cannot be written.
-    """
-    names = check_formats(formats)
-    result = load(folder)
-    with staged(folder if out is None else out, overwrite=overwrite) as new:
-        return write_formats(new, result, names)
-
-
 # --- the run that Python gets --------------------------------------------------------------------
 
 Given = ParamSpec("Given")
@@ -273,7 +228,7 @@ class WritableRun(Run):
     def plot(self) -> Image:
         """The overview as a picture: notebooks show it, `.save` writes it."""
         result = result_of(self, summary(self))
-        return fromarray(overview(pictures(result), _title(result)))
+        return fromarray(overview(pictures(Chain.of(result)), _title(result)))
 
     def _repr_html_(self) -> str:
         """Text and overview, for notebooks."""

@@ -1,18 +1,22 @@
 """Files for other programs, by the name of their format, and the motions of a result."""
 
 import io
-from collections.abc import Callable, Collection, Mapping, Sequence
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from soup_nlp.errors import ConfigError, DataError, printable, repr_of
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.rotation import log
-from soup_nlp.report.figures import write_clipped_depth_png16
-from soup_nlp.report.models import AXES, write_cloud, write_colmap, write_glb
-from soup_nlp.report.result import FRAMES, Result
+from soup_nlp.report.chain import AXES, Chain
+from soup_nlp.report.clouds import write_cloud, write_fused
+from soup_nlp.report.figures import depth_png_scale, encode_png, write_depth_png16
+from soup_nlp.report.models import write_colmap, write_glb, write_views
+from soup_nlp.report.result import Result
 from soup_nlp.storage.files import write_bytes, write_json, write_text
 
 CONVENTIONS = {
@@ -34,56 +38,146 @@ CONVENTIONS = {
 }
 """Meaning of the entries of motions.json."""
 
-Writer = Callable[[Path, Result], list[str]]
-"""Writes files into a folder and returns their names."""
+Writer = Callable[[Path, Chain], list[str]]
+"""Writes files of a chain, or of a pair as one, into a folder and returns their names."""
 
 
-def _both_frames(pattern: str, write: Callable[[Path, Result, int], object]) -> Writer:
-    """Writer of one file for each frame; `pattern` has {} for the name of the frame."""
+def file_of(chain: Chain, stem: str, frame: str, suffix: str) -> str:
+    """Name of the file of a frame: stem_ref.png of a pair, stem/0000.png of a chain."""
+    return f"{stem}{'_' if chain.single else '/'}{frame}{suffix}"
 
-    def writer(folder: Path, result: Result) -> list[str]:
-        names = [pattern.format(frame) for frame in FRAMES]
+
+def _each(
+    stem: str, suffix: str, write: Callable[[Path, Chain, int], object], pairs: bool = False
+) -> Writer:
+    """Writer of one file for each frame, or for each pair."""
+
+    def writer(folder: Path, chain: Chain) -> list[str]:
+        names = [file_of(chain, stem, frame, suffix) for frame in chain.names]
+        if pairs:
+            names = [stem + suffix] if chain.single else names[:-1]
         for k, name in enumerate(names):
-            write(folder / name, result, k)
+            (folder / name).parent.mkdir(exist_ok=True)
+            write(folder / name, chain, k)
         return names
 
     return writer
 
 
-def _write_npy(path: Path, result: Result, frame: int) -> None:
-    """Write a depth map as float32 .npy; NaN where unknown."""
+def _all(*writers: Writer) -> Writer:
+    return lambda folder, chain: [name for write in writers for name in write(folder, chain)]
+
+
+def _one(name: str, write: Callable[[Path, Chain], object]) -> Writer:
+    """Writer of one file or folder."""
+
+    def writer(folder: Path, chain: Chain) -> list[str]:
+        write(folder / name, chain)
+        return [name]
+
+    return writer
+
+
+def _write_npy(path: Path, values: NDArray[np.floating]) -> None:
     packed = io.BytesIO()
-    np.save(packed, result.depths[frame].astype(np.float32))
+    np.save(packed, values.astype(np.float32))
     write_bytes(path, packed.getvalue())
 
 
-def _write_pfm(path: Path, result: Result, frame: int) -> None:
+def _write_pfm(path: Path, chain: Chain, k: int) -> None:
     """Write a depth map as portable float map, little endian, rows upwards; inf where unknown."""
-    z = result.depths[frame]
+    z = chain[k].depth
     z = np.where(np.isfinite(z) & (z > 0), z, np.inf).astype("<f4")
     header = f"Pf\n{z.shape[1]} {z.shape[0]}\n-1\n"
     write_bytes(path, header.encode("ascii") + z[::-1].tobytes())
 
 
-def _colmap(folder: Path, result: Result) -> list[str]:
-    write_colmap(folder / "colmap", result)
-    return ["colmap"]
+def _write_flo(path: Path, chain: Chain, k: int) -> None:
+    """Write the flow of a pair as Middlebury .flo; 1e10 where unknown."""
+    uv = np.nan_to_num(chain.pairs[k].flow, nan=1e10).astype("<f4")
+    write_bytes(path, b"PIEH" + struct.pack("<ii", uv.shape[1], uv.shape[0]) + uv.tobytes())
 
 
-def _png(folder: Path, result: Result) -> list[str]:
-    names = [f"depth_{frame}.png" for frame in FRAMES]
-    scale = {
-        frame: write_clipped_depth_png16(folder / name, depth)
-        for frame, name, depth in zip(FRAMES, names, result.depths)
-    }
-    write_json(folder / "depth_png.json", {"values_per_unit": scale, "unit": result.unit})
+def _write_labels(path: Path, chain: Chain, k: int) -> None:
+    """Write the components of a frame as grey PNG, of 8 bits where they suffice; unknown is 0."""
+    labels = np.maximum(chain[k].components, 0)
+    encode_png(path, labels.astype(np.uint8 if labels.max() < 256 else np.uint16))
+
+
+def _write_moving(path: Path, chain: Chain, k: int) -> None:
+    """Write what moves by itself as grey PNG, 255 where it does."""
+    encode_png(path, np.where(chain[k].components > 0, 255, 0).astype(np.uint8))
+
+
+def write_depths(folder: Path, chain: Chain) -> tuple[list[str], float]:
+    """Write depth maps as 16-bit PNG; returns their names and values per unit, one for all."""
+    depths = [frame.depth for frame in chain]
+    scale = depth_png_scale(np.concatenate([z.ravel() for z in depths]))
+    names = [file_of(chain, "depth", frame, ".png") for frame in chain.names]
+    for name, z in zip(names, depths, strict=True):
+        (folder / name).parent.mkdir(exist_ok=True)
+        write_depth_png16(folder / name, z, scale)
+    return names, scale
+
+
+def _png(folder: Path, chain: Chain) -> list[str]:
+    names, scale = write_depths(folder, chain)
+    write_json(folder / "depth_png.json", {"values_per_unit": scale, "unit": chain.unit})
     return [*names, "depth_png.json"]
 
 
-def _rrd(folder: Path, result: Result) -> list[str]:
-    """Write images, depth, cameras, points and components of both frames, on a timeline `frame`.
+def _write_cameras(path: Path, chain: Chain) -> None:
+    """Write the intrinsics of all frames, 3 x 3; of one alone where they have the same."""
+    cameras = [frame.K for frame in chain]
+    same = all(np.array_equal(cameras[0], K) for K in cameras)
+    rows = np.concatenate(cameras[:1] if same else cameras)
+    write_text(path, "".join(" ".join(f"{x:.17g}" for x in row) + "\n" for row in rows))
 
-    The world is the reference camera (x right, y down, z ahead); the static scene does not move.
+
+def _write_kitti(path: Path, chain: Chain) -> None:
+    """Write world_from_camera of every frame, the first 3 rows in one line (KITTI odometry)."""
+    rows = (" ".join(f"{x:.9g}" for x in p.matrix[:3].ravel()) for p in chain.world_from_camera)
+    write_text(path, "\n".join(rows) + "\n")
+
+
+def write_tum(path: Path, chain: Chain) -> None:
+    """Write world_from_camera of every frame in the format of the TUM benchmark."""
+    lines = [
+        "# timestamp tx ty tz qx qy qz qw: position and orientation of the camera in the first"
+        " frame's camera coordinates",
+        f"# axes: {AXES}; timestamp: frame number; unit: {chain.unit}",
+    ]
+    for k, pose in enumerate(chain.world_from_camera):
+        lines.append(f"{k} " + " ".join(f"{x:.9g}" for x in (*pose.t, *pose.quaternion)))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _write_transforms(folder: Path, chain: Chain) -> None:
+    """Write images, masks and transforms.json, as NeRF programs read them.
+
+    Poses are world_from_camera with y up, looking along -z; pixel (0, 0) has its centre at 0.5.
+    """
+    write_views(folder, chain)
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {
+            "file_path": f"images/{frame.name}.png",
+            "mask_path": f"masks/{frame.name}.png.png",
+            "transform_matrix": flip @ frame.pose.matrix @ flip,
+            **dict(zip(("w", "h"), frame.depth.shape[::-1])),
+            **dict(zip(("fl_x", "fl_y"), frame.K.diagonal())),
+            **dict(zip(("cx", "cy"), frame.K[:2, 2] + 0.5)),
+        }
+        for frame in chain
+    ]
+    about = {"camera_model": "PINHOLE", "unit": chain.unit}
+    write_json(folder / "transforms.json", {**about, "frames": frames})
+
+
+def _write_recording(path: Path, chain: Chain) -> None:
+    """Write images, depth, cameras, points and components of all frames, on a timeline `frame`.
+
+    The world is the first camera (x right, y down, z ahead); the static scene does not move.
 
     Raises:
         DataError: the package rerun-sdk is not installed.
@@ -93,35 +187,34 @@ def _rrd(folder: Path, result: Result) -> list[str]:
     except ImportError as error:
         raise DataError(
             "recordings need the package rerun-sdk",
-            where=folder,
+            where=path,
             hint="pip install 'soup-nlp[rerun]'",
         ) from error
-    poses = np.eye(4), result.components.camera.inverse.matrix
     out = rr.RecordingStream("soup_nlp")
-    out.save(folder / "scene.rrd")
+    out.save(path)
     out.log("world", rr.ViewCoordinates.RDF, static=True)
-    for frame in (0, 1):
-        out.set_time("frame", sequence=frame)
-        pose, image = poses[frame], result.images[frame]
-        camera = rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
-        out.log("world/camera", camera)
-        size = [image.shape[1], image.shape[0]]
-        out.log(
-            "world/camera/image", rr.Pinhole(image_from_camera=result.K[frame], resolution=size)
-        )
-        out.log("world/camera/image/rgb", rr.Image(image).compress(jpeg_quality=92))
-        depth = np.nan_to_num(result.depths[frame]).astype(np.float32)
-        out.log("world/camera/image/depth", rr.DepthImage(depth, meter=1.0))
-        points = result.points[frame] @ pose[:3, :3].T + pose[:3, 3]
-        of_pixel = result.components.of_pixel
-        for part in result.components:
-            chosen = result.sure & (of_pixel == part.label)
-            name = "background" if part.label == 0 else f"component_{part.label}"
-            cloud = rr.Points3D(points[chosen], colors=result.images[0][chosen])
-            out.log(f"world/{name}", cloud)
+    for number, frame in enumerate(chain):
+        out.set_time("frame", sequence=number)
+        pose, size = frame.pose, frame.depth.shape[::-1]
+        out.log("world/camera", rr.Transform3D(translation=pose.t, mat3x3=pose.R))
+        camera = rr.Pinhole(image_from_camera=frame.K, resolution=size)
+        out.log("world/camera/image", camera)
+        out.log("world/camera/image/rgb", rr.Image(frame.image).compress(jpeg_quality=92))
+        depth = rr.DepthImage(np.nan_to_num(frame.depth).astype(np.float32), meter=1.0)
+        out.log("world/camera/image/depth", depth)
+        k, side = chain.seen(number)
+        pair = chain.pairs[k]
+        for part in pair.components:
+            chosen, track = pair.sure & (pair.components.of_pixel == part.label), chain.tracks[k]
+            name = f"component_{track[part.label]}" if part.label else "background"
+            places = pose(pair.points[side][chosen])
+            out.log(f"world/{name}", rr.Points3D(places, colors=pair.images[0][chosen]))
     out.flush()
     out.disconnect()
-    return ["scene.rrd"]
+
+
+def _write_motions(path: Path, chain: Chain, k: int) -> None:
+    write_json(path, motions(chain.pairs[k]))
 
 
 def motions(result: Result) -> dict[str, Any]:
@@ -156,26 +249,6 @@ def motions(result: Result) -> dict[str, Any]:
     }
 
 
-def trajectory(result: Result) -> str:
-    """Poses of the camera in the format of the TUM benchmark, ref_from_camera, frames 0 and 1."""
-    still = RigidMotion(np.eye(3), np.zeros(3))
-    lines = [
-        "# timestamp tx ty tz qx qy qz qw: position and orientation of the camera in the"
-        " reference frame's camera coordinates",
-        f"# axes: {AXES}; timestamp: frame number; unit: {result.unit}",
-    ]
-    return tum_text(lines, (still, result.components.camera.inverse))
-
-
-def tum_text(comments: Sequence[str], poses: Sequence[RigidMotion]) -> str:
-    """Poses in the format of the TUM benchmark, below some comments."""
-    lines = [
-        f"{k} " + " ".join(f"{x:.9g}" for x in (*pose.t, *pose.quaternion))
-        for k, pose in enumerate(poses)
-    ]
-    return "\n".join([*comments, *lines]) + "\n"
-
-
 def _motion(motion: RigidMotion) -> dict[str, Any]:
     return {"next_from_ref": motion.matrix, "translation": motion.t, **_turn(motion)}
 
@@ -184,31 +257,45 @@ def _turn(motion: RigidMotion) -> dict[str, Any]:
     return {"rotation_deg": np.degrees(log(motion.R)), "quaternion_xyzw": motion.quaternion}
 
 
-def _motions(folder: Path, result: Result) -> list[str]:
-    write_json(folder / "motions.json", motions(result))
-    write_text(folder / "trajectory.tum", trajectory(result))
-    return ["motions.json", "trajectory.tum"]
-
-
 FORMATS: Mapping[str, tuple[Writer, str]] = {
     "ply": (
-        _both_frames("points_{}.ply", write_cloud),
-        "point clouds with normals, confidence and component",
+        _all(
+            _each("points", ".ply", write_cloud),
+            lambda folder, chain: (
+                [] if chain.single else _one("scene.ply", write_fused)(folder, chain)
+            ),
+        ),
+        "point clouds with normals, confidence, component; of a chain also its static scene as one",
     ),
-    "glb": (_both_frames("mesh_{}.glb", write_glb), "textured meshes, glTF 2.0"),
-    "colmap": (_colmap, "COLMAP's text model with images and masks of what moves"),
-    "npy": (_both_frames("depth_{}.npy", _write_npy), "depth as float32 arrays"),
-    "pfm": (_both_frames("depth_{}.pfm", _write_pfm), "depth as portable float maps"),
+    "glb": (_each("mesh", ".glb", write_glb), "textured meshes, glTF 2.0"),
+    "colmap": (_one("colmap", write_colmap), "COLMAP's text model, images, masks of what moves"),
+    "transforms": (_one("transforms", _write_transforms), "transforms.json with images and masks"),
+    "npy": (
+        _all(
+            _each("depth", ".npy", lambda path, chain, k: _write_npy(path, chain[k].depth)),
+            _each("sigma", ".npy", lambda path, chain, k: _write_npy(path, chain[k].sigma)),
+            _one("K.txt", _write_cameras),
+        ),
+        "depth and sigma as float32 arrays, K.txt",
+    ),
+    "pfm": (_each("depth", ".pfm", _write_pfm), "depth as portable float maps"),
     "png": (_png, "depth as 16-bit PNG"),
-    "rrd": (_rrd, "a recording for the Rerun viewer (extra: rerun)"),
-    "motions": (_motions, "motions.json and the camera's trajectory (TUM)"),
+    "masks": (
+        _all(_each("components", ".png", _write_labels), _each("moving", ".png", _write_moving)),
+        "labels of the components, and 255 where something moves by itself",
+    ),
+    "flow": (_each("flow", ".flo", _write_flo, pairs=True), "the flow that was used, .flo"),
+    "kitti": (_one("poses.txt", _write_kitti), "camera poses as in KITTI odometry"),
+    "rrd": (_one("scene.rrd", _write_recording), "a recording for the Rerun viewer (extra: rerun)"),
+    "motions": (
+        _all(_each("motions", ".json", _write_motions, True), _one("trajectory.tum", write_tum)),
+        "motions of the components (.json) and the camera's trajectory (TUM)",
+    ),
 }
 """Writer and description of every format."""
 
 
-def check_formats(
-    names: Sequence[str], known: Collection[str] = FORMATS, hint: str | None = None
-) -> list[str]:
+def check_formats(names: Sequence[str]) -> list[str]:
     """Check names of formats and return them without repetitions.
 
     Raises:
@@ -218,21 +305,20 @@ def check_formats(
         raise ConfigError(
             "formats are no list of names",
             found=printable(repr_of(names), 60),
-            expected=f"a list of {', '.join(known)}",
+            expected=f"a list of {', '.join(FORMATS)}",
         )
-    wrong = [name for name in names if name not in known]
+    wrong = [name for name in names if name not in FORMATS]
     if wrong or not names:
         raise ConfigError(
             "unknown format" if wrong else "no format is named",
             found=", ".join(map(repr, wrong)) or None,
-            expected=", ".join(known),
-            hint=hint,
+            expected=", ".join(FORMATS),
         )
     return list(dict.fromkeys(names))
 
 
-def write_formats(folder: Path, result: Result, names: Sequence[str]) -> list[str]:
-    """Write a result in several formats into an existing folder.
+def write_formats(folder: Path, chain: Chain, names: Sequence[str]) -> list[str]:
+    """Write a chain, or a pair as one, in several formats into an existing folder.
 
     Returns:
         Names of the files and folders that were written.
@@ -241,4 +327,4 @@ def write_formats(folder: Path, result: Result, names: Sequence[str]) -> list[st
         ConfigError: a format is not known.
         DataError: a file cannot be written, or a package is missing.
     """
-    return [file for name in check_formats(names) for file in FORMATS[name][0](folder, result)]
+    return [file for name in check_formats(names) for file in FORMATS[name][0](folder, chain)]

@@ -1,10 +1,9 @@
-"""report.html: a result as one page that a browser opens without a network or a server."""
+"""report.html: a pair or a chain as one page that a browser opens without a network or a server."""
 
 import base64
 import json
 import zlib
-from collections.abc import Mapping
-from functools import cache
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from io import BytesIO
@@ -17,13 +16,13 @@ from numpy.typing import NDArray
 from PIL.Image import fromarray
 
 from soup_nlp.arrays import Float, Image, Mask
-from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, whole_cells
+from soup_nlp.report.chain import STILL, Chain
 from soup_nlp.report.colour import component_colours
 from soup_nlp.report.findings import ORIGINS, guess_line
-from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
+from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel, pictures
 from soup_nlp.report.result import Result
 from soup_nlp.start.components import TIES
 from soup_nlp.storage.files import plain
@@ -40,72 +39,89 @@ MODES = {
     "error": "error",
 }
 """Labels of the buttons that colour the 3D view, by name of the picture."""
-NOTES = {
-    "image_next": "<p>The next frame on the points that it shows; dark grey = hidden there.</p>"
-}
+IN_CHAIN = ("image_ref", "depth_ref", "normals", "components", "superpixels", "confidence", "error")
+"""Pictures of every frame of a chain."""
 LISTED = 8
 """Number of components whose motion is listed."""
-SIDE = 1600
-"""Larger side of a picture in the page, pixels; larger pictures are resized."""
+SHOWN = 3
+"""Smallest number of frames of a track that is shown; shorter tracks are mostly no objects."""
+SIDES, QUALITY = (1600, 720), 80
+"""Larger side of a picture of a pair and of a chain, pixels; JPEG quality of those of a chain."""
+PIXELS = 600_000, 4_000_000
+"""Largest number of shown pixels of a pair, and of all pairs; larger images are subsampled."""
 
 
-def page(result: Result, drawn: Mapping[str, Picture]) -> str:
-    """The page of a result: HTML that holds everything it shows."""
-    data = {
-        "scene": {
-            key: packed(value) if isinstance(value, np.ndarray) else value
-            for key, value in make_scene(result).items()
-        },
-        "modes": [
-            {"name": name, "word": word, "title": drawn[name].title,
-             "legend": _legend(drawn[name]) + NOTES.get(name, "")}
-            for name, word in MODES.items() if name in drawn
-        ],
-    }  # fmt: skip
-    parts = {
-        "title": escape(result.name),
-        "style": web_file("page.css"),
-        "summary": _summary(result),
-        "gallery": "\n".join(_figure(picture) for picture in drawn.values()),
-        "limits": "\n".join(f"<li>{escape(line)}</li>" for line in result.summary["limits"]),
-        "components": _components(result),
-        "verdict": escape("\n".join(result.summary["verdict"])),
-    }
-    return filled("page", data, parts)
+def page(chain: Chain, parts: Mapping[str, str], drawn: Mapping[str, Picture] | None = None) -> str:
+    """The page as HTML that holds everything it shows.
 
-
-def filled(name: str, data: Mapping[str, Any], parts: Mapping[str, object]) -> str:
-    """A page as one HTML file: the template of a name with its script and other parts."""
-    return Template(web_file(f"{name}.html")).substitute(
-        parts,
-        three=web_file("three.js"),
-        script=web_file("view.js") + web_file(f"{name}.js"),
+    Args:
+        chain: A chain, or a pair as one.
+        parts: HTML of "summary", the line below the title, and of sections by their titles.
+        drawn: Pictures of a pair, where they are drawn already.
+    """
+    sections = "".join(
+        f"<div{' class=wide' * (title == 'Verdict')}><h2>{title}</h2>{text}</div>\n"
+        for title, text in parts.items()
+        if title != "summary" and text
+    )
+    return Template(_file("page.html")).substitute(
+        title=escape(chain.name),
+        style=_file("page.css"),
+        summary=parts["summary"],
+        sections=sections,
+        three=_file("three.js"),
+        script=_file("page.js"),
         # "<" could end the script element
-        data=json.dumps(plain(data)).replace("<", "\\u003c"),
+        data=json.dumps(plain(make_scene(chain, drawn))).replace("<", "\\u003c"),
     )
 
 
-@cache
-def web_file(name: str) -> str:
-    """Text of a script, style or template of the pages."""
+def pair_page(result: Result, drawn: Mapping[str, Picture] | None = None) -> str:
+    """The page of a result; `drawn` are its pictures, where they are drawn already."""
+    limits = "".join(f"<li>{escape(line)}</li>" for line in result.summary["limits"])
+    parts = {
+        "summary": _summary(result),
+        "What limits this result": f"<ul>{limits}</ul>",
+        "Components and their motion": _components(result),
+        "Verdict": preformatted(result.summary["verdict"]),
+    }
+    return page(Chain.of(result), parts, drawn)
+
+
+def _file(name: str) -> str:
+    """Text of a script, style or template of the page."""
     return (files("soup_nlp.report") / "web" / name).read_text(encoding="utf-8")
 
 
-def packed(array: NDArray[Any]) -> str:
+def preformatted(lines: Sequence[str]) -> str:
+    """Lines of text in HTML."""
+    return "<pre>" + escape("\n".join(lines)) + "</pre>"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in HTML; cells are HTML."""
+    top = "".join(f"<th>{escape(h)}</th>" for h in head)
+    body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
+    return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def swatch(colour: Any) -> str:
+    """A field of a colour in HTML."""
+    return f'<i style="background:{_css(colour)}"></i>'
+
+
+def _css(colour: Any) -> str:
+    return "#" + "".join(f"{int(c):02x}" for c in colour)
+
+
+def _packed(array: NDArray[Any]) -> str:
     """An array's numbers, deflated, as base64."""
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     return base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
 
 
-def encoded(image: Image, kind: str, most: int = SIDE, **options: Any) -> str:
-    """A picture (H, W, 3) as a data URI.
-
-    Args:
-        image: The picture.
-        kind: "jpeg", "png" or "webp".
-        most: Largest side, pixels; larger pictures are resized.
-        options: Those of Pillow's encoder.
-    """
+def encoded(image: Image, kind: str, most: int = SIDES[0], **options: Any) -> str:
+    """A picture (H, W, 3), reduced to a largest side of `most` pixels, as a data URI."""
     side = max(image.shape[:2])
     if side > most:
         size = [round(x * most / side) for x in image.shape[1::-1]]
@@ -115,57 +131,33 @@ def encoded(image: Image, kind: str, most: int = SIDE, **options: Any) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode('ascii')}"
 
 
-def _legend(picture: Picture) -> str:
-    """A legend in HTML."""
-    legend = picture.legend
-    if isinstance(legend, Bar):
-        return colour_bar(legend)
-    if isinstance(legend, Swatches):
-        return '<div class="swatches">' + "".join(
-            f'<span><i style="background:{_css(c)}"></i>{escape(text)}</span>'
-            for c, text in legend.entries
-        ) + "</div>"  # fmt: skip
-    if isinstance(legend, Wheel):
-        source = encoded(legend.image, "png")
-        text = f"<span>{escape(legend.text)}</span>"
-        return f'<div class="wheel"><img src="{source}" alt="">{text}</div>'
-    return ""
-
-
-def colour_bar(bar: Bar) -> str:
-    """A colour scale with its values below, in HTML."""
-    stops = bar.colours[0, np.linspace(0, bar.colours.shape[1] - 1, 24).astype(int)]
-    ramp = ",".join(_css(c) for c in stops)
-    texts = "".join(f"<span>{escape(text)}</span>" for text in bar.texts)
-    return (
-        f'<div class="bar" style="background:linear-gradient(to right,{ramp})"></div>'
-        f'<div class="ticks">{texts}</div>'
-    )
-
-
-def _css(colour: Any) -> str:
-    return "#" + "".join(f"{int(c):02x}" for c in colour)
-
-
-def _figure(picture: Picture) -> str:
-    """A picture with its title and legend in HTML; those with a legend are stored without loss."""
-    if picture.legend is None:
+def _figure(picture: Picture, single: bool) -> dict[str, str]:
+    """A picture for the data; of a pair, those with a legend are stored without loss."""
+    if not single:
+        source = encoded(picture.image, "jpeg", SIDES[1], quality=QUALITY)
+    elif picture.legend is None:
         source = encoded(picture.image, "jpeg", quality=90)
     else:
         # the least effort takes a fifth of the time; files are half as large again
         source = encoded(picture.image, "webp", lossless=True, method=0, quality=50)
-    title = escape(picture.title)
-    return (
-        f'<figure><figcaption>{title}</figcaption><img data-name="{picture.name}" alt="{title}"'
-        f' src="{source}">{_legend(picture)}</figure>'
-    )
+    return {"title": picture.title, "legend": _legend(picture.legend), "source": source}
 
 
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """A table in HTML; cells are HTML."""
-    top = "".join(f"<th>{escape(h)}</th>" for h in head)
-    body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+def _legend(legend: Legend | None) -> str:
+    """A legend in HTML."""
+    if isinstance(legend, Bar):
+        stops = legend.colours[0, np.linspace(0, legend.colours.shape[1] - 1, 24).astype(int)]
+        ramp = ",".join(map(_css, stops))
+        texts = "".join(f"<span>{escape(text)}</span>" for text in legend.texts)
+        bar = f'<div class="bar" style="background:linear-gradient(to right,{ramp})"></div>'
+        return f'{bar}<div class="ticks">{texts}</div>'
+    if isinstance(legend, Swatches):
+        entries = (f"<span>{swatch(c)}{escape(text)}</span>" for c, text in legend.entries)
+        return f'<div class="swatches">{"".join(entries)}</div>'
+    if isinstance(legend, Wheel):
+        image = f'<img src="{encoded(legend.image, "png")}" alt="">'
+        return f'<div class="wheel">{image}<span>{escape(legend.text)}</span></div>'
+    return ""
 
 
 def _summary(result: Result) -> str:
@@ -175,15 +167,17 @@ def _summary(result: Result) -> str:
     words.append(f"{s['sizes']['superpixels']} superpixels")
     if m and m["mre"] is not None:
         words.append(f"MRE {m['mre']:.4f} after one {m['scale_rule']} scale")
-    usable = float(np.mean(result.flow_confidence > 0))
-    words.append(f"{usable:.0%} of the flow usable")
+    words.append(f"{np.mean(result.flow_confidence > 0):.0%} of the flow usable")
     whole = sum(v for k, v in s["seconds"].items() if not k.startswith("nlp_"))
     if whole:
         words.append(f"{whole:.1f} s")
-    figures = [escape(word) for word in words]
-    if guess := guess_line(s["certainty"]):
-        figures.insert(0, f"<strong>{escape(guess)}</strong>")
-    return " &middot; ".join(figures)
+    return headline(guess_line(s["certainty"]), words)
+
+
+def headline(guess: str, words: Sequence[str]) -> str:
+    """Figures in one line of HTML; the sentence on the guess is first."""
+    strong = [f"<strong>{escape(guess)}</strong>"] if guess else []
+    return " &middot; ".join([*strong, *map(escape, words)])
 
 
 def _components(result: Result) -> str:
@@ -199,7 +193,7 @@ def _components(result: Result) -> str:
         name = "0, the camera's motion" if part.label == 0 else str(part.label)
         rows.append(
             [
-                f'<i style="background:{_css(colours[part.label])}"></i>{name}',
+                swatch(colours[part.label]) + name,
                 f"{part.pixels / result.labels.size:.1%}",
                 f"{motion.angle:.2f}&deg;",
                 f"{shift:.3g} {escape(result.length)}",
@@ -212,18 +206,78 @@ def _components(result: Result) -> str:
     return table(head, rows) + note
 
 
-# --- the data of the 3D view: planes, motions and cameras -----------------------------------------
-
-MOST_PIXELS = 600_000
-"""Larger images are subsampled for the view."""
+# --- the data of the page: planes, motions, cameras and pictures ----------------------------------
 
 
-def make_scene(result: Result) -> dict[str, Any]:
-    """The 3D view of a result, in the shown unit and the reference camera's axes.
+def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict[str, Any]:
+    """What page.js reads, in the shown unit and the first camera's axes.
 
     Returns:
-        Arrays, numbers and lists by the names that page.js reads. The arrays have the types in
-        which they are packed:
+        "pairs": see `make_pair`. "names": of the frames. "modes": names and words of the colours.
+        "cameras": (4, 4) world_from_camera of every frame; of a pair whose surfaces bend, the
+        identity. "paths": colour and points of what moves and of the camera. "middle", "far",
+        "deepest": median depth, depth beyond which points are hidden at first, largest depth.
+        "origins": words for what gives a component its scale.
+    """
+    metre, pairs = chain.metre or 1.0, []
+    most = min(PIXELS[0], PIXELS[1] / len(chain.pairs))
+    for k in range(len(chain.pairs)):
+        shown = drawn or pictures(chain, k)
+        kept = {n: p for n, p in shown.items() if chain.single or n in IN_CHAIN}
+        pair = make_pair(chain, k, most)
+        figures = {name: _figure(picture, chain.single) for name, picture in kept.items()}
+        pairs.append({**{n: _stored(v) for n, v in pair.items()}, "pictures": figures})
+    z = metre * np.concatenate([pair.depths[0].ravel() for pair in chain.pairs])
+    z = z[np.isfinite(z)]
+    far, deepest = _far(z)
+    still = chain.single and chain.pairs[0].bending
+    poses = [STILL] * len(chain) if still else chain.world_from_camera
+    names = [str(x).rpartition("/")[2] for x in chain.summary.get("sources", ())]
+    return {
+        "pairs": pairs,
+        "names": names or ["reference frame", "next frame"],
+        "modes": [[n, word] for n, word in MODES.items() if n in pairs[0]["pictures"]],
+        "cameras": [_pose(pose.matrix, metre) for pose in poses],
+        "paths": [{"colour": c, "points": points} for _, c, _, points in paths(chain)],
+        "middle": float(np.median(z)) if z.size else 1.0,
+        "far": far,
+        "deepest": deepest,
+        "unit": chain.length,
+        "origins": [ORIGINS[name][1] for name in TIES],
+    }
+
+
+def _pose(matrix: Float, metre: float) -> list[list[float]]:
+    """A pose in the shown unit."""
+    out = matrix.copy()
+    out[:3, 3] *= metre
+    return out.tolist()
+
+
+def paths(chain: Chain) -> list[tuple[str, str, int, list[Float]]]:
+    """Name, colour, first frame and points (3,) of the paths of the camera and of what moves."""
+    metre = chain.metre or 1.0
+    camera = [metre * pose.t for pose in chain.world_from_camera]
+    out = [] if chain.single else [("camera", "#ffa94d", 0, camera)]
+    colours = component_colours(max(chain.track_numbers, default=0) + 1)
+    for track in chain.track_numbers:
+        path = chain.path(track)
+        points = [metre * point for point in path.values()]
+        moved = np.linalg.norm(points[-1] - points[0]) > 0.01 * abs(points[0][2])
+        if moved if chain.single else len(path) >= SHOWN:
+            out.append((f"track {track}", _css(colours[track]), min(path), points))
+    return out
+
+
+def _stored(value: Any) -> Any:
+    return _packed(value) if isinstance(value, np.ndarray) else value
+
+
+def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
+    """A pair in the shown unit, in the axes of its reference camera.
+
+    Returns:
+        Arrays in the types in which they are packed, numbers and lists:
 
         "labels": (h, w) superpixel of the shown pixels, every "step"-th in both directions.
         "planes": (N, 3) m with depth 1 / (m . ray).
@@ -231,52 +285,40 @@ def make_scene(result: Result) -> dict[str, Any]:
             pivot p and shift s; at time t a point X is at exp(t w) (X - p) + p + t s.
         "motionCamera": (N, 9) the same relative to the camera.
         "borrowed": (N,) the depth comes from neighbours.
-        "component": (N,) what moves as one. "tie": (N,) index in "origins", words on its scale.
+        "component": (N,) what moves as one, by track. "tie": (N,) index in "origins".
         "seen": (h, w) pixels that are visible in the next frame.
         "sigma": (h, w) standard deviation of log depth, 0 to 254 for 0 to 0.5; 255 where unknown.
         "surface": bits of the (h - 1, w - 1) cells of four pixels without a jump of the depth.
-        "camera": (4, 4) reference_from_next; the identity if surfaces bend.
-        "middle", "far", "deepest": median depth, depth beyond which points are hidden at first,
-            largest depth.
+        "guess": share of the pixels whose depth is a guess.
     """
-    rec = result.reconstruction
-    step = int(np.ceil(np.sqrt(max(rec.labels.size / MOST_PIXELS, 1.0))))
-    every = slice(None, None, step)
-    n, lam, scale = result.soup("n"), result.soup("lam"), result.scale
-    R, T = nearest(result.soup("R")), scale * lam[:, None] * result.soup("t")
-    pivot = _pivots(result)
-    camera = RigidMotion(np.eye(3), np.zeros(3))
-    if not result.bending:
-        pose = result.components.camera.inverse
-        camera = RigidMotion(pose.R, scale * pose.t)
-    z = scale * rec.depth_ref[np.isfinite(rec.depth_ref)]
-    far, deepest = _far(z)
-    labels, start = rec.labels[every, every], result.tree["start"]
-    surface = np.packbits(surface_cells(result, step), bitorder="little")
+    result, scale = chain.pairs[k], chain.metre or 1.0
+    rec, soup, start = result.reconstruction, result.soup, result.tree["start"]
+    step = int(np.ceil(np.sqrt(max(rec.labels.size / most, 1.0))))
+    every = np.s_[::step, ::step]
+    R, T = nearest(soup.R), scale * soup.translation
+    camera = STILL if result.bending else result.components.camera.inverse
+    home = T @ camera.R.T + scale * camera.t
+    pivot = _pivots(result, scale)
+    labels = rec.labels[every]
     return {
         "labels": labels.astype(np.uint16),
-        "planes": _single(inverse_depth(n, scale * lam * result.soup("d"))),
-        "motion": _single(_motion(camera.R @ R, camera(T), pivot)),
+        "planes": _single(inverse_depth(soup.n, scale * soup.distance)),
+        "motion": _single(_motion(camera.R @ R, home, pivot)),
         "motionCamera": _single(_motion(R, T, pivot)),
         "borrowed": (np.asarray(start["borrowed"], bool) & ~result.bends).astype(np.uint8),
-        "seen": (~hidden(rec)[every, every]).astype(np.uint8),
-        "sigma": _sigma(result)[every, every],
-        "component": result.components.of_superpixel.astype(np.uint16),
+        "seen": (~hidden(rec)[every]).astype(np.uint8),
+        "sigma": _sigma(result)[every],
+        "component": chain.of_track(k)[result.components.of_superpixel].astype(np.uint16),
         "tie": np.asarray(start["tie"], np.uint8),
-        "surface": surface,
-        "count": len(n),
+        "surface": np.packbits(surface_cells(result, step), bitorder="little"),
+        "count": len(soup),
         "step": step,
         "size": rec.labels.shape[::-1],
         "grid": labels.shape[::-1],
         "sizeNext": rec.depth_next.shape[::-1],
-        "K": result.K[0].tolist(),
-        "KNext": result.K[1].tolist(),
-        "camera": camera.matrix.tolist(),
-        "middle": float(np.median(z)) if z.size else 1.0,
-        "far": far,
-        "deepest": deepest,
-        "unit": result.length,
-        "origins": [ORIGINS[name][1] for name in TIES],
+        "K": result.K.tolist(),
+        "KNext": result.K_next.tolist(),
+        "guess": float(chain[k].guess.mean()),
     }
 
 
@@ -292,7 +334,7 @@ def surface_cells(result: Result, step: int) -> Mask:
 
 
 def _sigma(result: Result) -> NDArray[np.uint8]:
-    """(H, W) sigma as a byte, see `make_scene`."""
+    """(H, W) sigma as a byte, see `make_pair`."""
     byte = np.rint(np.clip(result.sigma / 0.5, 0, 1) * 254)
     return np.where(np.isfinite(result.sigma), byte, 255).astype(np.uint8)
 
@@ -301,12 +343,11 @@ def _far(z: Float) -> tuple[float, float]:
     """Depth at which the view ends at first, and largest depth."""
     if not z.size:
         return 1.0, 1.0
-    deepest = float(z.max())
     # sky and horizon may be orders of magnitude behind the rest
-    return min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70))), deepest
+    return min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70))), float(z.max())
 
 
-def _pivots(result: Result) -> Float:
+def _pivots(result: Result, scale: float) -> Float:
     """(N, 3) centre of the component of every superpixel, or of the superpixel if it bends."""
     parts, rec = result.components, result.reconstruction
     known = np.isfinite(rec.depth_ref)
@@ -314,8 +355,7 @@ def _pivots(result: Result) -> Float:
     sums = [np.bincount(at, x, count) for x in rec.points_ref[known].T]
     centroid = np.stack(sums, axis=1) / np.maximum(np.bincount(at, minlength=count), 1)[:, None]
     common = np.stack([part.centre for part in parts])[parts.of_superpixel]
-    centre = np.where(result.bends[:, None], centroid, common)
-    return np.asarray(result.scale * np.nan_to_num(centre))
+    return np.asarray(scale * np.nan_to_num(np.where(result.bends[:, None], centroid, common)))
 
 
 def _motion(R: Float, T: Float, pivot: Float) -> Float:

@@ -8,6 +8,7 @@ from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.arrays import AnyFloat, Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.report.chain import Chain
 from soup_nlp.report.colour import (
     Image,
     colourise_depth,
@@ -15,7 +16,6 @@ from soup_nlp.report.colour import (
     colourise_normals,
     colourise_shares,
     component_colours,
-    depth_range,
     draw_superpixels,
     flow_limit,
     wheel_key,
@@ -27,12 +27,6 @@ DENSE = 0.5
 """If a smaller share of the pixels is known, as with laser points, each is drawn larger."""
 ERROR_TICKS, SIGMA_TICKS = (0.0, 0.05, 0.1, 0.15, 0.2), (0.0, 0.1, 0.2, 0.3)
 """Values below the legends of error and sigma; the last one has the brightest colour."""
-DEPTHS = (
-    ("ref", "depth_ref", "depth of the reference frame", "solution", ""),
-    ("next", "depth_next", "depth of the next frame", "solution_next", "; grey = unseen"),
-    ("start_ref", "depth_start", "depth of the start", "start", ""),
-)
-"""Array, name, title, scores and remark of the pictures of depth."""
 
 
 @dataclass(frozen=True)
@@ -78,22 +72,28 @@ class Picture:
     legend: Legend | None = None
 
 
-def pictures(result: Result) -> dict[str, Picture]:
-    """All pictures of a result by name, in the order of the overview.
+def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
+    """All pictures of a pair of a chain by name, in the order of the overview.
 
     "image_ref", "image_next", "superpixels", "components", "flow", "flow_confidence",
     "depth_ref", "depth_next", "depth_start", "depth_true", "error", "confidence" and "normals".
-    Pictures of unknown quantities are left out.
+    Pictures of unknown quantities are left out. Colours mean the same in all pairs.
     """
+    result = chain.pairs[k]
     before, after = result.images
     drawn = [
         Picture("image_ref", "reference frame", before),
         Picture("image_next", "next frame", after),
-        *_parts(result),
+        Picture(
+            "superpixels",
+            f"{len(result.bends)} superpixels",
+            draw_superpixels(before, result.labels),
+        ),
+        _components(chain, k),
         *_flow(result),
-        *_depths(result),
+        *_depths(chain, k),
     ]
-    error = relative_error(result)
+    error = relative_error(result, chain.metre)
     if error is not None:
         title = "depth error relative to the truth; grey = no truth"
         drawn.append(_shares("error", title, _enlarged(error), "inferno", ERROR_TICKS))
@@ -103,37 +103,28 @@ def pictures(result: Result) -> dict[str, Picture]:
     return {picture.name: picture for picture in drawn}
 
 
-def _parts(result: Result) -> list[Picture]:
-    """Superpixels and components."""
-    labels, component = result.labels, result.components.of_superpixel
-    back = result.images[0]
-    number, count = len(component), len(result.components)
-    colours = component_colours(count)
-    pixels = np.bincount(component[labels].ravel(), minlength=count) / labels.size
+def _components(chain: Chain, k: int) -> Picture:
+    """The image in the colours of the components; striped where most of the depth is a guess."""
+    result, track = chain.pairs[k], chain.of_track(k)
+    part = result.components.of_pixel
+    count = len(track)
+    colours = component_colours(max(track) + 1)[track]
+    pixels = np.bincount(part.ravel(), minlength=count) / part.size
     first = [
-        ((int(c[0]), int(c[1]), int(c[2])), f"{k}: {share:.1%}")
-        for k, (c, share) in enumerate(zip(colours, pixels, strict=True))
+        ((int(c[0]), int(c[1]), int(c[2])), f"{number}: {share:.1%}")
+        for number, c, share in zip(track, colours, pixels, strict=True)
     ][:6]
     kind = "component" if result.bends.any() else "rigid component"
     word = f"one {kind}" if count == 1 else f"{count} {kind}s, share of the image"
-    grey = back.astype(float).mean(axis=2, keepdims=True)
-    shaded = colours[component[labels]] * (0.6 + 0.4 * grey / 255)
-    unsure = _unsure(result, count)
-    stripe = np.add.outer(np.arange(labels.shape[0]), np.arange(labels.shape[1])) % 8 < 3
-    shaded[unsure[component[labels]] & stripe] = 255
+    grey = result.images[0].astype(float).mean(axis=2, keepdims=True)
+    shaded = colours[part] * (0.6 + 0.4 * grey / 255)
+    guess = np.bincount(part.ravel(), ~(result.sigma.ravel() <= MOST_SIGMA), minlength=count)
+    unsure = guess / part.size > 0.5 * pixels
+    stripe = np.add.outer(np.arange(part.shape[0]), np.arange(part.shape[1])) % 8 < 3
+    shaded[unsure[part] & stripe] = 255
     if unsure.any():
         word += "; striped: most of its depth is a guess"
-    return [
-        Picture("superpixels", f"{number} superpixels", draw_superpixels(back, labels)),
-        Picture("components", word, shaded.astype(np.uint8), Swatches(tuple(first))),
-    ]
-
-
-def _unsure(result: Result, count: int) -> Mask:
-    """(count,) True for components most of whose pixels have a guess as depth."""
-    part = result.components.of_superpixel[result.labels].ravel()
-    guess = np.bincount(part, ~(result.sigma.ravel() <= MOST_SIGMA), minlength=count)
-    return np.asarray(guess > 0.5 * np.bincount(part, minlength=count))
+    return Picture("components", word, shaded.astype(np.uint8), Swatches(tuple(first)))
 
 
 def _flow(result: Result) -> list[Picture]:
@@ -153,24 +144,28 @@ def _flow(result: Result) -> list[Picture]:
     ]
 
 
-def _depths(result: Result) -> list[Picture]:
+def _depths(chain: Chain, k: int) -> list[Picture]:
     """Depths of both frames, of the start and of the truth, with one colour scale."""
-    truth, stored = result.true_depth, result.tree["depth"]
-    near, far = depth_range(stored["ref"] * result.scale if truth is None else truth)
-    bar, out = depth_bar(near, far, f" {result.length}"), []
-    guesses = dict(zip(("depth_ref", "depth_next"), result.guesses, strict=True))
-    for array, name, title, scored, more in DEPTHS:
-        score = result.summary["metrics"].get(scored, {})
-        # the next frame has the scale of the solution
-        scaled = score if name == "depth_start" else result.summary["metrics"].get("solution", {})
-        z = stored[array] * float(scaled.get("scale") or 1.0)
-        guess = guesses.get(name, np.zeros(z.shape, bool))
-        colours = colourise_depth(z, near, far, guess)
-        mre = score.get("mre")
-        said = "" if mre is None else f", MRE {mre:.3f}"
-        if guess.mean() >= LEAST:
-            more += "; pale = a guess" + f" ({guess.mean():.0%})" * (name == "depth_ref")
-        out.append(Picture(name, f"{title}{said}{more}", colours, bar))
+    result, scores = chain.pairs[k], chain.pairs[k].summary.get("metrics", {})
+    truth, (near, far) = result.true_depth, chain.depth_range
+    bar, out = depth_bar(near, far, f" {chain.length}"), []
+
+    def add(name: str, title: str, z: AnyFloat, scored: str, guess: Mask | None = None) -> None:
+        mre = scores.get(scored, {}).get("mre")
+        title += "" if mre is None else f", MRE {mre:.3f}"
+        title += "; grey = unseen" * (name == "depth_next")
+        if guess is not None and guess.mean() >= LEAST:
+            title += "; pale = a guess" + f" ({guess.mean():.0%})" * (name == "depth_ref")
+        colours = colourise_depth(z, near, far, False if guess is None else guess)
+        out.append(Picture(name, title, colours, bar))
+
+    metre, guess = chain.metre or 1.0, ~(result.sigma <= MOST_SIGMA)
+    add("depth_ref", "depth of the reference frame", metre * result.depths[0], "solution", guess)
+    seen = result.in_next(guess, False)
+    add("depth_next", "depth of the next frame", metre * result.depths[1], "solution_next", seen)
+    if (start := result.depth_maps.get("start")) is not None:
+        scale = float(scores.get("start", {}).get("scale") or 1.0)
+        add("depth_start", "depth of the start", scale * start, "start")
     if truth is not None:
         true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)
         out.append(Picture("depth_true", "true depth; grey = no truth", true, bar))
@@ -193,14 +188,14 @@ def _enlarged(values: AnyFloat) -> AnyFloat:
     return np.where(distance < 1.5, values[tuple(nearest)], np.nan)
 
 
-def relative_error(result: Result) -> AnyFloat | None:
+def relative_error(result: Result, scale: float | None) -> AnyFloat | None:
     """(H, W) |z_gt - s z| / z_gt of the reference frame, NaN where unknown; None without truth."""
-    truth, z = result.true_depth, result.tree["depth"]["ref"]
-    if truth is None or "solution" not in result.summary["metrics"]:
+    truth, z = result.true_depth, result.depths[0]
+    if truth is None or scale is None:
         return None
     known = (truth > 0) & (z > 0)
     error = np.full(truth.shape, np.nan)
-    error[known] = np.abs(truth[known] - result.scale * z[known]) / truth[known]
+    error[known] = np.abs(truth[known] - scale * z[known]) / truth[known]
     return error
 
 
@@ -215,7 +210,7 @@ def _shares(
 
 
 def _normals(result: Result) -> Picture:
-    n = result.soup("n")[result.labels]
+    n = result.reconstruction.normals
     entries = {"faces the camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
                "up": (0, -1, 0), "down": (0, 1, 0)}  # fmt: skip
     # one pixel for each direction

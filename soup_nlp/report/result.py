@@ -4,14 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, MOST_SIGMA, NO_CONFIDENCE
+from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, NO_CONFIDENCE
 from soup_nlp.evaluate.metrics import DepthMetrics
 from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.geometry.components import Components, find_components
@@ -29,8 +29,6 @@ PAGE = "report.html"
 """Name of the page in a result folder."""
 UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
 """Unit of lengths in files."""
-FRAMES = ("ref", "next")
-"""Names of the two frames in files."""
 INPUTS = ("image_ref", "image_next", "K_ref", "K_next", "confidence")
 """Arrays of the pair without which there is no `Result`."""
 
@@ -72,9 +70,14 @@ class Result:
         return self.tree["input"]["image_ref"], self.tree["input"]["image_next"]
 
     @property
-    def K(self) -> tuple[Float, Float]:
-        """(3, 3) intrinsics of both frames, pixels."""
-        return self.tree["input"]["K_ref"], self.tree["input"]["K_next"]
+    def K(self) -> Float:
+        """(3, 3) intrinsics of the reference frame, pixels."""
+        return np.asarray(self.tree["input"]["K_ref"], float)
+
+    @property
+    def K_next(self) -> Float:
+        """(3, 3) intrinsics of the next frame, pixels."""
+        return np.asarray(self.tree["input"]["K_next"], float)
 
     @property
     def flow(self) -> NDArray[np.floating]:
@@ -99,7 +102,7 @@ class Result:
     @property
     def depth_maps(self) -> dict[str, Float]:
         """(H, W) z of the reference frame, as those of a `Run`."""
-        stored = self.tree["depth"]
+        stored = self.tree.get("depth", {})
         return {name: stored[key] for name, key in DEPTHS.items() if key in stored}
 
     @property
@@ -135,11 +138,16 @@ class Result:
         """(H, W) confidence of the depth from 0 (unknown) to 1 (certain)."""
         return np.maximum(1.0 - self.sigma / NO_CONFIDENCE, 0.0)
 
-    @cached_property
-    def guesses(self) -> tuple[Mask, Mask]:
-        """(H, W) True where the depth of each frame is a guess; False where it is unknown."""
-        guess, source = ~(self.sigma <= MOST_SIGMA), self.reconstruction.source_next
-        return guess, (source >= 0) & guess.ravel()[source]
+    def in_next(self, values: NDArray[Any], unknown: float) -> NDArray[Any]:
+        """(H', W') values of the reference frame where the next frame shows their points."""
+        source = self.reconstruction.source_next
+        return np.where(source >= 0, values.ravel()[source], unknown)
+
+    @property
+    def parallax_px(self) -> float:
+        """Median displacement that the camera's translation causes, pixels."""
+        static = self.components.of_superpixel == 0
+        return float(np.median(self.tree["start"]["parallax"][static]))
 
     @property
     def metre(self) -> float | None:
@@ -165,7 +173,7 @@ class Result:
     @property
     def labels(self) -> NDArray[np.integer]:
         """(H, W) superpixel of every pixel."""
-        return np.asarray(self.tree["segmentation"]["labels"])
+        return self.reconstruction.labels
 
     @property
     def bends(self) -> Mask:
@@ -183,20 +191,42 @@ class Result:
         facing = float(self.tree["weights"]["min_facing"])
         return constraints(self.tree["solution"], self.tree["energy"]["rim_ray"], facing)
 
-    def soup(self, key: str) -> Float:
-        """An array of the delivered soup: lam, n, d, R or t."""
-        return np.asarray(self.tree["solution"][key], float)
+    @property
+    def soup(self) -> Soup:
+        """Planes and motions of the superpixels."""
+        return self.reconstruction.soup
+
+    def scaled(self, factor: float) -> Self:
+        """The same result in another unit of length, of which `factor` are one of now."""
+        rec, soup, parts = self.reconstruction, self.soup, self.components
+        lengths = ("depth_ref", "depth_next", "points_ref", "points_next")
+        changes = {name: factor * getattr(rec, name) for name in lengths}
+        rec = replace(rec, soup=replace(soup, lam=factor * soup.lam), **changes)
+        members = tuple(
+            replace(
+                c, motion=RigidMotion(c.motion.R, factor * c.motion.t), centre=factor * c.centre
+            )
+            for c in parts
+        )
+        metrics = {k: replace(m, scale=m.scale / factor) for k, m in self.metrics.items()}
+        parts = replace(parts, members=members)
+        return replace(self, reconstruction=rec, components=parts, metrics=metrics)
 
     @cached_property
     def surface(self) -> tuple[Mask, Mask]:
         """Continuity of the surface to the right and downwards, see `geometry.surface.joined`."""
-        return joined(self.reconstruction, self.K[0], self.components.of_pixel)
+        return joined(self.reconstruction, self.K, self.components.of_pixel)
 
     @cached_property
     def sure(self) -> Mask:
         """(H, W) pixels of clouds: visible in both frames, confident, not at a depth jump."""
         known = self.confidence >= self.min_confidence
         return known & ~hidden(self.reconstruction) & ~at_jumps(*self.surface)
+
+    @property
+    def static(self) -> Mask:
+        """(H, W) confident pixels of the static scene."""
+        return np.asarray(self.sure & (self.components.of_pixel == 0))
 
 
 def result_of(run: Run, summary: Mapping[str, Any]) -> Result:

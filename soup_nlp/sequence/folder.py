@@ -1,30 +1,26 @@
-"""Folder of a chain: written, read, checked, and converted for other programs.
+"""Folders of results and chains: read, checked, shown and converted; that of a chain written."""
 
-It holds depth and clouds in one scale, trajectories, a table, a page and a video.
-"""
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import Any
 
-import cv2
 import numpy as np
 
-from soup_nlp.arrays import Float, Image
+from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
+from soup_nlp.report.chain import AXES, Chain
 from soup_nlp.report.check import CheckReport, Claim, check_folder
-from soup_nlp.report.figures import depth_png_scale, write_clipped_depth_png16
-from soup_nlp.report.formats import check_formats, tum_text
-from soup_nlp.report.models import AXES, thinned, write_model, write_ply
-from soup_nlp.sequence.chain import Chain, make_chain, read_pair
-from soup_nlp.sequence.fused import fuse, projected
-from soup_nlp.sequence.page import RATE, chain_page, depth_pictures, write_animation
-from soup_nlp.sequence.score import certainty, score
-from soup_nlp.storage.files import as_path, is_file, read_json, write_bytes, write_json, write_text
+from soup_nlp.report.formats import check_formats, write_depths, write_formats, write_tum
+from soup_nlp.report.page import pair_page
+from soup_nlp.report.result import PAGE, Result
+from soup_nlp.report.result import load as load_pair
+from soup_nlp.sequence.links import make_chain, read_pair
+from soup_nlp.sequence.score import certainty, chain_page, score
+from soup_nlp.storage.files import as_path, is_file, read_json, write_json, write_text
 from soup_nlp.storage.folders import staged
 from soup_nlp.storage.rows import failed, read_rows
-from soup_nlp.storage.system import scratch
 
 CHAIN = "chain.json"
 """File that makes a folder that of a chain."""
@@ -32,10 +28,8 @@ ROWS = "pairs.jsonl"
 """File with a row for each pair of a sequence."""
 SAME = 1e-6
 """Largest relative difference of stored scales and poses from recomputed ones."""
-COLMAP_POINTS = 60_000
-"""Largest number of points of a COLMAP model."""
-VISIBLE = 0.03
-"""A point is visible in a frame if log depths of point and frame differ by less than this."""
+SINGLE = CHAIN, "trajectory.tum", PAGE
+"""Files of a chain that are not made for each frame."""
 
 
 def is_chain(folder: Path) -> bool:
@@ -68,13 +62,27 @@ def _some(names: Sequence[str]) -> str:
     return f"{len(names)} ({', '.join(names[:6])}{more})" if names else "none"
 
 
-def read_chain(folder: Path) -> tuple[Chain, dict[str, Any]]:
-    """The chain of a folder, made again from its pairs, and the contents of chain.json.
+def load(folder: str | Path) -> Result | Chain:
+    """A result of `solve`, `import` or `Run.save`, or a chain: depth, points, sigma, motions.
+
+    `reconstruction`, `components`, `camera` and `metrics` of a result are those of the `Run`.
+
+    Args:
+        folder: Its folder.
+
+    Raises:
+        DataError: the folder holds neither, or a damaged one.
+    """
+    folder = as_path(folder, "result folder")
+    return read_chain(folder) if is_chain(folder) else load_pair(folder)
+
+
+def read_chain(folder: Path) -> Chain:
+    """The chain of a folder, made again from its pairs.
 
     Raises:
         DataError: a pair is missing or damaged.
     """
-    folder = as_path(folder, "folder of a chain")
     contents = read_json(folder / CHAIN, CHAIN)
     try:
         count = int(contents["frames"])
@@ -85,20 +93,26 @@ def read_chain(folder: Path) -> tuple[Chain, dict[str, Any]]:
         read_pair(a, b, folder / "pairs" / f"{a:03d}_{b:03d}")
         for a, b in [*((k, k + 1) for k in range(count - 1)), *over]
     ]
-    return make_chain(solved[: count - 1], solved[count - 1 :]), contents
+    return make_chain(solved[: count - 1], solved[count - 1 :], contents)
 
 
-def check_chain(folder: Path) -> CheckReport:
-    """Recompute every claim of the pairs of a chain, and its scales and poses from the pairs."""
-    chain, contents = read_chain(folder)
-    claims = []
-    for pair in (folder / "pairs" / f"{p.first:03d}_{p.second:03d}" for p in chain.pairs):
+def check(folder: Path) -> CheckReport:
+    """Recompute every claim of a result, or of the pairs of a chain with its scales and poses.
+
+    Raises:
+        DataError: the folder holds neither, or a damaged one.
+    """
+    if not is_chain(folder):
+        return check_folder(folder)
+    chain, claims = read_chain(folder), []
+    for k in range(len(chain.pairs)):
+        pair = folder / "pairs" / f"{k:03d}_{k + 1:03d}"
         right = float(check_folder(pair).ok)
         claims.append(Claim(f"pair {pair.name}: every claim", 1.0, right))
     poses = np.array([m.matrix for m in chain.world_from_camera])
     arrays: Mapping[str, tuple[Any, Float]] = {
-        "scales by the pairs": ([row["scale"] for row in contents["scales"]], chain.scales),
-        "camera poses by pairs and scales": (contents["world_from_camera"], poses),
+        "scales by the pairs": ([row["scale"] for row in chain.summary["scales"]], chain.scales),
+        "camera poses by pairs and scales": (chain.summary["world_from_camera"], poses),
     }
     for name, (stored, found) in arrays.items():
         # null in JSON becomes NaN, which is no rounding error
@@ -109,77 +123,56 @@ def check_chain(folder: Path) -> CheckReport:
     return CheckReport(tuple(claims))
 
 
-def write_fused(path: Path, chain: Chain, contents: Mapping[str, Any]) -> None:
-    """The static scene of all frames as one cloud."""
-    cloud = fuse(chain)
-    title = f"{contents['name']}: static scene of {len(chain)} frames, one point per voxel"
-    note = "sigma_log_depth: of the frame that the point is from; guesses are left out"
-    comments = [title, f"frame: {WORLD}", f"unit: {contents['unit']}", note]
-    scalars = {"sigma_log_depth": cloud["sigma"], "frame": cloud["label"]}
-    write_ply(path, cloud["points"], cloud["colours"], None, scalars, comments)
+def chain_of(folder: Path) -> Chain:
+    """The chain of a folder, or its result as a chain of two frames."""
+    found = load(folder)
+    return Chain.of(found) if isinstance(found, Result) else found
 
 
-def _write_colmap(folder: Path, chain: Chain, contents: Mapping[str, Any]) -> None:
-    """COLMAP's model of the sequence: all frames and the fused cloud."""
-    cloud = fuse(chain, COLMAP_POINTS)
-    frames, seen = range(len(chain)), []
-    for k in frames:
-        inside, v, u, z = projected(chain, cloud["points"], k)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            near = np.abs(np.log(z / chain.depth(k)[v, u])) < VISIBLE
-        at = np.flatnonzero(inside & near)
-        seen.append((at, np.stack([u[at], v[at]], 1).astype(float)))
-    write_model(
-        folder,
-        [f"{k:04d}.png" for k in frames],
-        [chain.image(k) for k in frames],
-        [chain.camera(k) for k in frames],
-        [pose.inverse for pose in chain.world_from_camera],
-        [chain.labels(k) > 0 for k in frames],
-        (cloud["points"], cloud["colours"]),
-        seen,
-        f"{contents['name']}; unit: {contents['unit']}",
-    )
-
-
-FORMATS: Mapping[str, tuple[str, Callable[[Path, Chain, Mapping[str, Any]], None]]] = {
-    "ply": ("scene.ply", write_fused),
-    "glb": ("scene.glb", write_animation),
-    "colmap": ("colmap", _write_colmap),
-}
-"""Name and writer of the formats of a chain beside trajectory.tum and its clouds by frame."""
-
-
-def convert_chain(
-    folder: Path, names: Sequence[str], out: Path | None = None, overwrite: bool = False
+def convert(
+    folder: Path, formats: Sequence[str], out: Path | None = None, overwrite: bool = False
 ) -> list[str]:
-    """Write a chain for other programs; returns the names of the files.
+    """Write the result or the chain of a folder in other formats.
+
+    Args:
+        folder: The folder.
+        formats: See `formats.FORMATS`.
+        out: Output folder; None for the same folder.
+        overwrite: Overwrite files that the program did not make.
+
+    Returns:
+        Names of the files and folders.
 
     Raises:
-        ConfigError: a format is not one of a chain.
+        ConfigError: a format is not known.
+        DataError: there is no result, or the output folder cannot be written.
     """
-    hint = "formats of single pairs: soup-nlp convert DIR/pairs/000_001 --to ..."
-    chosen = [FORMATS[name] for name in check_formats(names, FORMATS, hint)]
-    chain, contents = read_chain(folder)
+    names, chain = check_formats(formats), chain_of(folder)
     with staged(folder if out is None else out, overwrite=overwrite) as new:
-        for name, write in chosen:
-            write(new / name, chain, contents)
-        return [name for name, _ in chosen]
+        return write_formats(new, chain, names)
 
 
-CHAIN_PAGE = "chain.html"
-SINGLE = "chain.json", "trajectory.tum", "depth.mp4", CHAIN_PAGE, "scene.ply"
-"""Files of a chain that are not made for each frame."""
-POINTS = 100_000
-"""Largest number of points in the cloud of a frame."""
-WORLD = f"the first frame's camera, {AXES}"
-UNIT = "the first pair's soup unit (free scale: its planes are at mean distance 1)"
+def renew_page(folder: Path) -> Path:
+    """Make the page of a result or a chain again from its arrays; returns its file.
+
+    Raises:
+        DataError: the folder holds neither, or cannot be written.
+    """
+    found = load(folder)
+    try:
+        text = pair_page(found) if isinstance(found, Result) else chain_page(found)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise DataError(
+            "result lacks what a page shows", where=folder, found=repr(error), hint="solve it again"
+        ) from error
+    with staged(folder, overwrite=True) as new:
+        write_text(new / PAGE, text)
+    return folder / PAGE
 
 
 def chain_files(count: int) -> list[str]:
     """Names of the files of a chain of `count` frames."""
-    clouds = [f"points/{k:04d}.ply" for k in range(count - 1)]
-    return [*SINGLE, *(f"depth/{k:04d}.png" for k in range(count)), *clouds]
+    return [*SINGLE, *(f"depth/{k:04d}.png" for k in range(count))]
 
 
 def write_chain(
@@ -188,7 +181,7 @@ def write_chain(
     name: str,
     sources: Sequence[str],
     over: Sequence[tuple[int, int]] = (),
-) -> None:
+) -> Chain:
     """Write every file of a chain, `chain_files`, into an existing folder.
 
     Args:
@@ -197,46 +190,29 @@ def write_chain(
         name: Name of the sequence.
         sources: Path or description of every frame.
         over: Frames of the further pairs that link the chain.
+
+    Returns:
+        The chain with the contents of its chain.json.
     """
-    (folder / "depth").mkdir(exist_ok=True)
-    (folder / "points").mkdir(exist_ok=True)
-    depths = [chain.depth(k) for k in range(len(chain))]
-    scale = depth_png_scale(np.concatenate([z.ravel() for z in depths]))
-    for k, z in enumerate(depths):
-        write_clipped_depth_png16(folder / "depth" / f"{k:04d}.png", z, scale)
-    for k in range(len(chain.pairs)):
-        _cloud(folder / "points" / f"{k:04d}.ply", chain, k, name)
+    _, scale = write_depths(folder, chain)
     contents = {"name": name, "sources": list(sources), "over": list(over), **summary(chain)}
     contents |= {"depth_png_scale": scale, "score": score(chain)}
-    write_json(folder / "chain.json", contents)
-    head = f"# timestamp tx ty tz qx qy qz qw; timestamp: frame number; unit: {UNIT}"
-    write_text(folder / "trajectory.tum", tum_text([head], chain.world_from_camera))
-    write_fused(folder / "scene.ply", chain, contents)
-    pictures, _ = depth_pictures(chain)
-    write_video(
-        folder / "depth.mp4",
-        [np.vstack([chain.image(k), picture]) for k, picture in enumerate(pictures)],
-    )
-    write_text(folder / CHAIN_PAGE, chain_page(chain, contents))
-
-
-def renew_chain_page(folder: Path) -> Path:
-    """Make the page of a chain's folder again; returns its file."""
-    text = chain_page(*read_chain(folder))
-    with staged(folder, overwrite=True) as new:
-        write_text(new / CHAIN_PAGE, text)
-    return folder / CHAIN_PAGE
+    chain = replace(chain, summary=contents)
+    write_json(folder / CHAIN, contents)
+    write_tum(folder / "trajectory.tum", chain)
+    write_text(folder / PAGE, chain_page(chain))
+    return chain
 
 
 def summary(chain: Chain) -> dict[str, Any]:
     """Scales, links, poses and tracks as plain values."""
     return {
         "frames": len(chain),
-        "unit": UNIT,
+        "unit": chain.unit,
         "world": f"the first frame's camera: {AXES}",
         "scales": [
-            {"pair": [p.first, p.second], "scale": s, "parallax_px": p.parallax_px}
-            for p, s in zip(chain.pairs, chain.scales)
+            {"pair": [k, k + 1], "scale": s, "parallax_px": pair.parallax_px}
+            for k, (pair, s) in enumerate(zip(chain.pairs, chain.scales, strict=True))
         ],
         "links": [
             {
@@ -260,31 +236,3 @@ def summary(chain: Chain) -> dict[str, Any]:
             for track in chain.track_numbers
         ],
     }
-
-
-def write_video(path: Path, pictures: list[Image]) -> None:
-    """Write pictures of one size as MPEG-4."""
-    height, width = pictures[0].shape[:2]
-    # encoders need even sides
-    size = width - width % 2, height - height % 2
-    # OpenCV needs a name in UTF-8
-    with scratch() as folder:
-        file = folder / "video.mp4"
-        coder = cv2.VideoWriter.fourcc(*"mp4v")
-        video = cv2.VideoWriter(str(file), coder, RATE, size)
-        for picture in pictures:
-            video.write(cv2.cvtColor(picture[: size[1], : size[0]], cv2.COLOR_RGB2BGR))
-        video.release()
-        write_bytes(path, file.read_bytes())
-
-
-def _cloud(path: Path, chain: Chain, frame: int, name: str) -> None:
-    """Write the points of a frame in world coordinates, subsampled."""
-    result = chain.pairs[frame].result
-    keep = thinned(result.sure, POINTS)
-    tracks = np.array([chain.tracks[frame][k] for k in range(len(result.components))])
-    normals = result.normals[0][keep] @ chain.world_from_camera[frame].R.T
-    note = "track: what moves by itself, 0 is the static scene"
-    comments = [f"{name}: frame {frame}", f"frame: {WORLD}", f"unit: {UNIT}", note]
-    scalars = {"track": tracks[result.components.of_pixel[keep]]}
-    write_ply(path, chain.points(frame)[keep], result.images[0][keep], normals, scalars, comments)

@@ -8,9 +8,11 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import MEDIAN, UNSCALED, depth_metrics
+from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import certainty_lines, guess_line
+from soup_nlp.report.page import headline, page, paths, preformatted, table
 from soup_nlp.report.verdict import sectioned
-from soup_nlp.sequence.chain import MAX_GUESSED, Chain
+from soup_nlp.sequence.links import MAX_GUESSED
 
 WIDTHS = {"ratio of scales": 16, "spread (log)": 13, "true ratio": 11, "pixels": 9, "": 8}
 """Columns of `link_table` after the first one, and their characters in the terminal."""
@@ -27,7 +29,7 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     """
     if truths is not None and len(truths) != len(chain):
         raise DataError("truth and chain differ in length", found=len(truths), expected=len(chain))
-    known = [pair.result.tree["truth"] for pair in chain.pairs]
+    known = [pair.tree["truth"] for pair in chain.pairs]
     stored = [*(truth.get("depth_ref") for truth in known), known[-1].get("depth_next")]
     given = enumerate(stored if truths is None else truths)
     true = {k: z for k, z in given if z is not None and MEDIAN.counts(z)}
@@ -96,9 +98,9 @@ def score_text(scores: Mapping[str, Any]) -> str:
     return text
 
 
-def chain_lines(chain: Chain, contents: Mapping[str, Any]) -> list[str]:
+def chain_lines(chain: Chain) -> list[str]:
     """Scales, links and, with a truth, errors of a chain for the terminal."""
-    lines = [str(chain)]
+    lines, contents = [str(chain)], chain.summary
     heads, rows = link_table(contents)
     # two frames are one pair, which has no link
     for pairs, *cells in (heads, *rows) if rows else ():
@@ -114,7 +116,7 @@ def chain_lines(chain: Chain, contents: Mapping[str, Any]) -> list[str]:
 
 def certainty(chain: Chain) -> dict[str, float]:
     """Means over the pairs of a chain of the shares in `report.summary.certainty`."""
-    rows = [pair.result.summary["certainty"] for pair in chain.pairs]
+    rows = [pair.summary["certainty"] for pair in chain.pairs]
     known = {k: [row[k] for row in rows if row.get(k) is not None] for k in rows[0]}
     return {k: float(np.mean(values)) if values else np.nan for k, values in known.items()}
 
@@ -145,7 +147,7 @@ def path_error(chain: Chain) -> dict[str, float] | None:
     pose, positions = np.eye(4), [np.zeros(3)]
     for pair in chain.pairs:
         # component 0 of a truth is the static scene
-        motions = pair.result.tree["truth"].get("motions")
+        motions = pair.tree["truth"].get("motions")
         if motions is None or not np.isfinite(motions[0]).all():
             return None
         pose = pose @ np.linalg.inv(motions[0])
@@ -167,3 +169,28 @@ def aligned(points: Float, target: Float) -> Float:
     size = (a**2).sum()
     scale = float((S * sign).sum() / size) if size > 0 else 1.0
     return scale * a @ (U * sign @ Vt).T + target.mean(axis=0)
+
+
+def chain_page(chain: Chain) -> str:
+    """The page of a chain."""
+    rows = [
+        [
+            f'<i style="background:{colour}"></i>' + name,
+            f"{first} to {first + len(points) - 1}",
+            f"{length:.3g}",
+        ]
+        for name, colour, first, points in paths(chain)
+        for length in [float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())]
+    ]
+    heads, links = link_table(chain.summary)
+    scores = chain.summary["score"]
+    words = [f"{len(chain)} frames", score_text(scores) if scores else f"in {chain.unit}"]
+    parts = {
+        "summary": headline(guess_line(certainty(chain), "all images"), words),
+        "Paths": table(["path", "frames", f"length, {chain.length}"], rows)
+        + "<p>What moves by itself has a scale of its own in every pair: its path is as good as its"
+        " depth.</p>",
+        "Links between pairs": table(heads, links) if links else "",
+        "Verdict": preformatted(chain_lines(chain)),
+    }
+    return page(chain, parts)

@@ -15,9 +15,9 @@ from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
 from soup_nlp.pipeline.case import observed_pair
+from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import write_png
 from soup_nlp.report.folder import run
-from soup_nlp.sequence.chain import Chain, SolvedPair, make_chain, read_pair
 from soup_nlp.sequence.folder import ROWS, SINGLE, chain_files, write_chain
 from soup_nlp.sequence.frames import (
     MAX_STEP,
@@ -32,6 +32,7 @@ from soup_nlp.sequence.frames import (
     key_frames,
     video_frames,
 )
+from soup_nlp.sequence.links import SolvedPair, make_chain, read_pair
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import Job, Row, Say, attempt, failed, measure_all, read_rows
@@ -118,8 +119,7 @@ def solve_chain(
     pairs = solve_pairs(chosen, [*which, *over], folder, overrides, workers, say)
     chain = make_chain(pairs[: len(which)], pairs[len(which) :])
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
-        write_chain(new, chain, name, chosen.names, over)
-    return chain
+        return write_chain(new, chain, name, chosen.names, over)
 
 
 def solve_pairs(

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from soup_nlp.sequence.chain import SolvedPair
 
 from soup_nlp.evaluate.metrics import depth_metrics
 from soup_nlp.geometry.camera import intrinsics
@@ -12,7 +13,6 @@ from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.report.result import Result
-from soup_nlp.sequence.chain import SolvedPair
 
 K = intrinsics(100.0, 100.0, 39.5, 29.5)
 CAMERA = RigidMotion(exp([0.0, 0.01, 0.0]), np.array([0.05, 0.02, -0.1]))

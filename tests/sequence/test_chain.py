@@ -5,9 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_result import CAMERA, small_result, toy_pairs
-
-from soup_nlp.errors import DataError
-from soup_nlp.geometry.rotation import exp
 from soup_nlp.sequence.chain import (
     Link,
     SolvedPair,
@@ -19,6 +16,9 @@ from soup_nlp.sequence.chain import (
     solve_scales,
 )
 from soup_nlp.sequence.fused import fuse, movers
+
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.rotation import exp
 from soup_nlp.sequence.score import aligned
 
 pytestmark = pytest.mark.slow

@@ -11,6 +11,9 @@ import trimesh
 from helpers_chromium import Chromium, find_chromium
 from helpers_files import sets
 from helpers_result import CAMERA, CERTAINTY, toy_pairs
+from soup_nlp.sequence.chain import make_chain
+from soup_nlp.sequence.fused import fuse
+from soup_nlp.sequence.page import chain_page, depth_pictures, guess_of, write_animation
 
 from soup_nlp.bench import chain as chain_study
 from soup_nlp.bench.study import Cell, frame_of
@@ -21,11 +24,8 @@ from soup_nlp.errors import DataError, SolverError
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import solve as solving
-from soup_nlp.sequence.chain import make_chain
 from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
 from soup_nlp.sequence.frames import Frames
-from soup_nlp.sequence.fused import fuse
-from soup_nlp.sequence.page import chain_page, depth_pictures, guess_of, write_animation
 from soup_nlp.sequence.score import chain_exit_code, chain_lines, link_table
 from soup_nlp.sequence.solve import one_camera
 

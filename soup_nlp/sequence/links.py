@@ -1,24 +1,21 @@
-"""A chain of solved pairs with a common scale and frame of reference; tracks of components."""
+"""Links between solved pairs, their common scale, the camera path, and tracks of components."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, linear_sum_assignment
 
-from soup_nlp.arrays import Float, Image, Mask
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError, expect
 from soup_nlp.evaluate.metrics import overlap_shares
-from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.graph import connected
-from soup_nlp.geometry.motion import RigidMotion
-from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.geometry.superpixels import Labels
-from soup_nlp.report.result import INPUTS, Result, load
+from soup_nlp.report.chain import STILL, Chain, Link
+from soup_nlp.report.result import Result, load
 
 MIN_PIXELS = 200
 """Links with fewer pixels are flagged."""
@@ -31,79 +28,35 @@ MADE_BY = "soup_nlp.sequence.solve.solve_pairs(...)"
 """Where pairs of a chain come from, for messages."""
 SAME = 0.3
 """Smallest intersection over union of two components of one track."""
+KEPT = ("input", "start", "truth", "solution", "weights", "energy")
+"""Groups of arrays of a pair that a chain needs."""
 
 
 @dataclass(frozen=True, eq=False)
 class SolvedPair:
-    """A pair of frames with its result.
-
-    Attributes:
-        first: Index of the reference frame.
-        second: Index of the next frame.
-        result: Result of the solve, with the arrays of its input and truth only.
-        parallax_px: Median displacement that the camera's translation causes, pixels.
-    """
+    """A pair of frames, by their numbers, with its result."""
 
     first: int
     second: int
     result: Result
-    parallax_px: float
 
     @property
     def still(self) -> bool:
         """Whether most of the background has no parallax, so that its depth is a guess."""
         return self.result.components.background.borrowed > MAX_GUESSED
 
-    @property
-    def static(self) -> Mask:
-        """(H, W) confident pixels of the static scene in the reference frame."""
-        return np.asarray(self.result.sure & (self.result.components.of_pixel == 0))
-
     def view(self, frame: int) -> tuple[Float, Mask]:
         """(H, W) z of one of the two frames, and its confident pixels of the static scene."""
-        if frame == self.first:
-            return self.result.depths[0], self.static
-        return self.result.depths[1], carried(self.static, self.result.reconstruction) > 0
+        side, static = int(frame != self.first), self.result.static
+        return self.result.depths[side], self.result.in_next(static, False) if side else static
 
 
 def read_pair(first: int, second: int, folder: Path) -> SolvedPair:
     """The pair of two frames from its result folder."""
     result = load(folder)
-    tree = result.tree
-    parallax = float(np.median(tree["start"]["parallax"][result.components.of_superpixel == 0]))
     # a chain holds many pairs, whose other arrays it does not need
-    kept = {"input": {name: tree["input"][name] for name in INPUTS}}
-    kept["truth"] = tree.get("truth", {})
-    return SolvedPair(first, second, replace(result, tree=kept), parallax)
-
-
-def carried(of_pixel: NDArray[np.generic], rec: Reconstruction) -> NDArray[Any]:
-    """(H', W') labels of the reference frame in the next frame; -1 where not visible."""
-    source = rec.source_next
-    return np.where(source >= 0, of_pixel.ravel()[source], -1)
-
-
-@dataclass(frozen=True)
-class Link:
-    """Ratio of the scales of two pairs, measured in a common frame.
-
-    Attributes:
-        first: Index of the pair.
-        second: Index of the other pair.
-        log_ratio: Logarithm of the second's scale over the first's, the median over pixels.
-        spread: Robust standard deviation of the same over pixels (1.4826 MAD).
-        pixels: Number of pixels.
-        bridge: Whether a pair without parallax lies between the two.
-        flagged: Whether it is a guess: a pair has no parallax, or few pixels are shared.
-    """
-
-    first: int
-    second: int
-    log_ratio: float
-    spread: float
-    pixels: int
-    bridge: bool = False
-    flagged: bool = False
+    kept = {name: result.tree[name] for name in KEPT if name in result.tree}
+    return SolvedPair(first, second, replace(result, tree=kept))
 
 
 def link(
@@ -145,9 +98,9 @@ def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
         frame, (z, keep) = pair.second, pair.view(pair.second)
         while not pair.still and frame in at and pairs[at[frame]].still:
             still = pairs[at[frame]]
-            source, static = still.result.reconstruction.source_next, still.result.components
-            keep = (source >= 0) & (keep & (static.of_pixel == 0)).ravel()[source]
-            z, frame = np.where(keep, z.ravel()[source], np.nan), still.second
+            static = still.result.components.of_pixel == 0
+            keep = still.result.in_next(keep & static, False)
+            z, frame = still.result.in_next(z, np.nan), still.second
         if frame > pair.second and frame in at:
             other, sure = pairs[at[frame]].view(frame)
             bridge = link((a, at[frame]), z, other, keep & sure)
@@ -183,106 +136,17 @@ def solve_scales(total: int, links: Sequence[Link]) -> Float:
     return np.exp(np.concatenate([[0.0], answer]))
 
 
-@dataclass(frozen=True, eq=False)
-class Chain:
-    """Solved pairs of consecutive frames in the axes of the first camera and the first unit.
-
-    Attributes:
-        pairs: Pair k has the frames k and k + 1.
-        scales: (K,) factor from the unit of each pair to that of the first.
-        links: Links that determine the scales, including those of pairs over two frames.
-        world_from_camera: Camera poses of the K + 1 frames.
-        tracks: Number of the track by label of a component, for every pair.
-    """
-
-    pairs: tuple[SolvedPair, ...]
-    scales: Float
-    links: tuple[Link, ...]
-    world_from_camera: tuple[RigidMotion, ...]
-    tracks: tuple[dict[int, int], ...]
-
-    def __len__(self) -> int:
-        return len(self.pairs) + 1
-
-    def __str__(self) -> str:
-        low, high = self.scales.min(), self.scales.max()
-        flagged = sum(k.flagged for k in self.links)
-        guess = np.mean([pair.result.summary["certainty"]["guess"] for pair in self.pairs])
-        return (
-            f"Chain({len(self)} frames, scales {low:.3g}..{high:.3g}, {flagged} flagged links,"
-            f" {guess:.0%} a guess)"
-        )
-
-    __repr__ = __str__
-
-    def seen(self, frame: int) -> tuple[int, int]:
-        """A pair that holds a frame, and the frame's number in it: 0, and 1 for the last frame."""
-        last = int(frame == len(self.pairs))
-        return frame - last, last
-
-    def depth(self, frame: int) -> Float:
-        """(H, W) z of a frame in the unit of the chain."""
-        pair, side = self.seen(frame)
-        return self.scales[pair] * self.pairs[pair].result.depths[side]
-
-    def image(self, frame: int) -> Image:
-        """(H, W, 3) uint8 RGB of a frame."""
-        pair, side = self.seen(frame)
-        return self.pairs[pair].result.images[side]
-
-    def camera(self, frame: int) -> Float:
-        """(3, 3) intrinsics of a frame, pixels."""
-        pair, side = self.seen(frame)
-        return self.pairs[pair].result.K[side]
-
-    def labels(self, frame: int) -> Labels:
-        """(H, W) components of a frame; -1 at pixels that only the last frame shows."""
-        pair, side = self.seen(frame)
-        result = self.pairs[pair].result
-        labels = result.components.of_pixel
-        return np.asarray(carried(labels, result.reconstruction) if side else labels, np.int32)
-
-    def points(self, frame: int) -> Float:
-        """(H, W, 3) points of a frame but the last, in world coordinates."""
-        local = self.scales[frame] * self.pairs[frame].result.points[0]
-        return self.world_from_camera[frame](local)
-
-    def motion(self, pair: int, label: int) -> RigidMotion:
-        """Motion of a component in the world from a frame to the next; label 0 does not move."""
-        M, s = self.pairs[pair].result.components[label].motion, self.scales[pair]
-        before, after = self.world_from_camera[pair], self.world_from_camera[pair + 1]
-        return after @ RigidMotion(M.R, s * M.t) @ before.inverse
-
-    def path(self, track: int) -> dict[int, Float]:
-        """Centre (3,) of a track in the world, by frame."""
-        out: dict[int, Float] = {}
-        for k, part in self.members(track).items():
-            out[k] = self.world_from_camera[k](self.scales[k] * part.centre)
-            out[k + 1] = self.motion(k, part.label)(out[k])
-        return out
-
-    @property
-    def track_numbers(self) -> list[int]:
-        """Numbers of the tracks; the background, 0, is none."""
-        return sorted({track for numbers in self.tracks for track in numbers.values()} - {0})
-
-    def members(self, track: int) -> dict[int, Component]:
-        """Components of a track, by number of the pair; a pair need not show the track."""
-        numbered = enumerate(zip(self.pairs, self.tracks, strict=True))
-        return {
-            k: pair.result.components[label]
-            for k, (pair, numbers) in numbered
-            for label, number in numbers.items()
-            if number == track
-        }
-
-
-def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> Chain:
+def make_chain(
+    pairs: Sequence[SolvedPair],
+    over: Sequence[SolvedPair] = (),
+    summary: Mapping[str, Any] | None = None,
+) -> Chain:
     """Determine a common scale of consecutive pairs, the camera path, and tracks of components.
 
     Args:
         pairs: Pairs of the frames (0, 1), (1, 2), ...
         over: Further pairs of the same frames, such as (0, 2), for more links.
+        summary: Contents of chain.json.
 
     Raises:
         DataError: the pairs are not consecutive, or share no pixel.
@@ -295,19 +159,18 @@ def make_chain(pairs: Sequence[SolvedPair], over: Sequence[SolvedPair] = ()) -> 
         raise DataError("pairs of a chain are not consecutive", found=[p.first for p in pairs])
     links = find_links([*pairs, *over])
     scales = solve_scales(len(pairs) + len(over), links)[: len(pairs)]
-    poses = [RigidMotion(np.eye(3), np.zeros(3))]
-    for pair, s in zip(pairs, scales, strict=True):
-        camera = pair.result.components.camera
-        poses.append(poses[-1] @ RigidMotion(camera.R, s * camera.t).inverse)
+    results = [pair.result.scaled(s) for pair, s in zip(pairs, scales, strict=True)]
+    poses = [STILL]
+    for result in results:
+        poses.append(poses[-1] @ result.components.camera.inverse)
     matches = [
-        follow(
-            carried(a.result.components.of_pixel, a.result.reconstruction),
-            b.result.components.of_pixel,
-        )
-        for a, b in pairwise(pairs)
+        follow(a.in_next(a.components.of_pixel, -1), b.components.of_pixel)
+        for a, b in pairwise(results)
     ]
-    tracks = number(matches, [len(p.result.components) for p in pairs])
-    return Chain(tuple(pairs), scales, tuple(links), tuple(poses), tuple(tracks))
+    tracks = number(matches, [len(result.components) for result in results])
+    names = tuple(f"{k:04d}" for k in range(len(poses)))
+    chained = tuple(results), tuple(poses), tuple(tracks), names
+    return Chain(*chained, scales, tuple(links), {} if summary is None else summary)
 
 
 def follow(before: Labels, after: Labels) -> dict[int, int]:

@@ -1,0 +1,238 @@
+"""A chain of solved pairs in one unit of length; a single pair is a chain of two frames."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from soup_nlp.arrays import Float, Image, Mask
+from soup_nlp.errors import FrameError
+from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.geometry.camera import pixel_grid, rays
+from soup_nlp.geometry.components import Component
+from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.report.colour import depth_range
+from soup_nlp.report.result import UNIT, Result
+
+AXES = "x right, y down, z ahead"
+"""Axes of a camera, in words."""
+STILL = RigidMotion(np.eye(3), np.zeros(3))
+"""The identity."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """Ratio of the scales of two pairs, measured in a common frame.
+
+    Attributes:
+        first: Index of the pair.
+        second: Index of the other pair.
+        log_ratio: Logarithm of the second's scale over the first's, the median over pixels.
+        spread: Robust standard deviation of the same over pixels (1.4826 MAD).
+        pixels: Number of pixels.
+        bridge: Whether a pair without parallax lies between the two.
+        flagged: Whether it is a guess: a pair has no parallax, or few pixels are shared.
+    """
+
+    first: int
+    second: int
+    log_ratio: float
+    spread: float
+    pixels: int
+    bridge: bool = False
+    flagged: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One frame of a chain, in the unit of the chain.
+
+    Attributes:
+        name: "ref" or "next" of a pair, else its number.
+        image: (H, W, 3) uint8 RGB.
+        K: (3, 3) intrinsics, pixels.
+        depth: (H, W) z; NaN where unknown.
+        sigma: (H, W) standard deviation of log z; NaN where unknown.
+        components: (H, W) what moves by itself, by number of its track; 0 is the static scene, -1
+            unknown.
+        pose: world_from_camera; the world is the first frame's camera.
+    """
+
+    name: str
+    image: Image
+    K: Float
+    depth: Float
+    sigma: Float
+    components: NDArray[np.int32]
+    pose: RigidMotion
+
+    def __str__(self) -> str:
+        h, w = self.depth.shape
+        return f"Frame({self.name}, {w}x{h}, {self.guess.mean():.0%} a guess)"
+
+    __repr__ = __str__
+
+    @property
+    def guess(self) -> Mask:
+        """(H, W) True where the depth is a guess; False where it is unknown."""
+        return np.asarray(self.sigma > MOST_SIGMA)
+
+    @property
+    def points(self) -> Float:
+        """(H, W, 3) points in world coordinates; NaN where unknown."""
+        ray = rays(self.K, pixel_grid(*self.depth.shape))
+        return self.pose(self.depth[..., None] * ray)
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Solved pairs of consecutive frames in the axes of the first camera and the first unit.
+
+    Attributes:
+        pairs: Results of the frames k and k + 1, in the unit of the first.
+        world_from_camera: Camera poses of the K + 1 frames.
+        tracks: Number of the track by label of a component, for every pair.
+        names: Names of the K + 1 frames in files.
+        scales: (K,) factor from the own unit of each pair to that of the first.
+        links: Links that determine the scales, including those of pairs over two frames.
+        summary: Contents of chain.json, or of a single pair's summary.json.
+    """
+
+    pairs: tuple[Result, ...]
+    world_from_camera: tuple[RigidMotion, ...]
+    tracks: tuple[dict[int, int], ...]
+    names: tuple[str, ...]
+    scales: Float
+    links: tuple[Link, ...] = ()
+    summary: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, result: Result) -> "Chain":
+        """A result as a chain of two frames."""
+        poses = STILL, result.components.camera.inverse
+        tracks = {k: k for k in range(len(result.components))}
+        names = "ref", "next"
+        return cls((result,), poses, (tracks,), names, np.ones(1), summary=result.summary)
+
+    def __len__(self) -> int:
+        return len(self.pairs) + 1
+
+    def __str__(self) -> str:
+        low, high = self.scales.min(), self.scales.max()
+        flagged = sum(k.flagged for k in self.links)
+        guess = np.mean([pair.summary["certainty"]["guess"] for pair in self.pairs])
+        return (
+            f"Chain({len(self)} frames, scales {low:.3g}..{high:.3g}, {flagged} flagged links,"
+            f" {guess:.0%} a guess)"
+        )
+
+    __repr__ = __str__
+
+    @property
+    def name(self) -> str:
+        """Name for titles."""
+        return str(self.summary.get("name", ""))
+
+    @property
+    def single(self) -> bool:
+        """Whether it is a pair."""
+        return len(self.pairs) == 1
+
+    @property
+    def metre(self) -> float | None:
+        """Units of the truth in one unit of length; None where it is not known."""
+        score = self.summary.get("score")
+        return score["scale"] if score else self.pairs[0].metre if self.single else None
+
+    @property
+    def length(self) -> str:
+        """Name of the unit of length in which depths are shown."""
+        return "units" if self.metre is None else self.pairs[0].metre_unit
+
+    @property
+    def unit(self) -> str:
+        """Unit of length as a phrase for headers of files."""
+        return self.pairs[0].unit if self.single else f"{UNIT} of the first pair"
+
+    @cached_property
+    def depth_range(self) -> tuple[float, float]:
+        """(near, far) of the colours of depth in the shown unit, one for all frames."""
+        if self.single and (truth := self.pairs[0].true_depth) is not None:
+            return depth_range(truth)
+        depths = np.concatenate([frame.depth.ravel()[::7] for frame in self])
+        return depth_range(depths * (self.metre or 1.0))
+
+    def seen(self, frame: int) -> tuple[int, int]:
+        """A pair that holds a frame, and the frame's number in it: 0, and 1 for the last frame.
+
+        Raises:
+            FrameError: there is no such frame.
+        """
+        if not (isinstance(frame, int | np.integer) and 0 <= frame < len(self)):
+            raise FrameError(
+                "there is no such frame", found=frame, expected=f"0 to {len(self) - 1}"
+            )
+        last = int(frame == len(self.pairs))
+        return int(frame) - last, last
+
+    def __getitem__(self, number: int) -> Frame:
+        """A frame by its number: image, camera, depth, sigma, components and pose."""
+        k, last = self.seen(number)
+        pair = self.pairs[k]
+        components, sigma = self.of_track(k)[pair.components.of_pixel], pair.sigma
+        if last:
+            components, sigma = pair.in_next(components, -1), pair.in_next(sigma, np.nan)
+        return Frame(
+            name=self.names[number],
+            image=pair.images[last],
+            K=(pair.K, pair.K_next)[last],
+            depth=pair.depths[last],
+            sigma=sigma,
+            components=components.astype(np.int32),
+            pose=self.world_from_camera[number],
+        )
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[k] for k in range(len(self)))
+
+    def depth(self, frame: int) -> Float:
+        """(H, W) z of a frame in the unit of the chain; NaN where unknown."""
+        return self[frame].depth
+
+    def points(self, frame: int) -> Float:
+        """(H, W, 3) points of a frame in world coordinates; NaN where unknown."""
+        return self[frame].points
+
+    def motion(self, pair: int, label: int) -> RigidMotion:
+        """Motion of a component in the world from a frame to the next; label 0 does not move."""
+        before, after = self.world_from_camera[pair], self.world_from_camera[pair + 1]
+        return after @ self.pairs[pair].components[label].motion @ before.inverse
+
+    def of_track(self, pair: int) -> NDArray[np.int64]:
+        """(C,) track of every component of a pair."""
+        return np.array([self.tracks[pair][k] for k in range(len(self.tracks[pair]))])
+
+    @property
+    def track_numbers(self) -> list[int]:
+        """Numbers of the tracks; the background, 0, is none."""
+        return sorted({track for numbers in self.tracks for track in numbers.values()} - {0})
+
+    def members(self, track: int) -> dict[int, Component]:
+        """Components of a track, by number of the pair; a pair need not show the track."""
+        return {
+            k: pair.components[label]
+            for k, (pair, numbers) in enumerate(zip(self.pairs, self.tracks, strict=True))
+            for label, number in numbers.items()
+            if number == track
+        }
+
+    def path(self, track: int) -> dict[int, Float]:
+        """Centre (3,) of a track in the world, by frame."""
+        out: dict[int, Float] = {}
+        for k, part in self.members(track).items():
+            out[k] = self.world_from_camera[k](part.centre)
+            out[k + 1] = self.motion(k, part.label)(out[k])
+        return out
