@@ -15,6 +15,7 @@ from PIL import Image
 import soup_nlp
 from soup_nlp.arrays import Float
 from soup_nlp.evaluate.metrics import depth_metrics
+from soup_nlp.report.chain import Chain
 from soup_nlp.report.colour import colourise_depth, depth_range
 from soup_nlp.report.figures import strip
 from soup_nlp.report.findings import certainty_lines, found_words, hints
@@ -34,7 +35,7 @@ def made(scene: str) -> str:
     """Solve a scene, write its picture, and return the verdict on its depth."""
     source = {"kind": "scene", "scene": scene, "width": 640, "height": 480}
     run = soup_nlp.run(soup_nlp.make_problem({"name": scene, "input": source}, OPTIONS))
-    drawn = pictures(result_of(run, summary(run)))
+    drawn = pictures(Chain.of(result_of(run, summary(run))))
     sheet = strip([drawn[name] for name in PANELS], "", columns=len(PANELS), panel_width=270)
     Image.fromarray(sheet).save(PAGE.with_name("gallery") / f"{scene}.jpg", quality=80)
     shares = certainty(run)

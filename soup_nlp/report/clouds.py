@@ -90,7 +90,9 @@ def write_cloud(path: PathLike, chain: Chain, number: int) -> None:
         "component": chain.of_track(k)[result.components.of_pixel],
         "sigma_log_depth": result.sigma,
     }
-    axes = f"camera of frame {frame}" if chain.single else "the first frame's camera"
+    axes = "the first frame's camera"
+    if chain.single:
+        axes = f"camera of the {('reference', 'next')[side]} frame"
     comments = [
         f"{chain.name}: points of the reference image in frame {frame}",
         f"frame: {axes}, {AXES}",
@@ -143,7 +145,8 @@ def fuse(chain: Chain, most: int = MOST) -> Cloud:
     for k, mask in enumerate(masks):
         chosen = thinned(mask, max(share * mask.sum(), 1))
         cloud = np.empty(int(chosen.sum()), POINT)
-        cloud["points"], cloud["colours"] = frames[k].points[chosen], frames[k].image[chosen]
+        cloud["points"] = frames[k].pose(chain.pairs[k].points[0][chosen])
+        cloud["colours"] = frames[k].image[chosen]
         cloud["sigma"], cloud["frame"] = frames[k].sigma[chosen], k
         fits = np.ones(len(cloud), bool)
         for other in (k - 2, k - 1, k + 1, k + 2):

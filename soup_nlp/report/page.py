@@ -343,8 +343,9 @@ def _far(z: Float) -> tuple[float, float]:
     """Depth at which the view ends at first, and largest depth."""
     if not z.size:
         return 1.0, 1.0
-    # sky and horizon may be orders of magnitude behind the rest
-    return min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70))), float(z.max())
+    # sky and horizon may be orders of magnitude behind the rest; a wall at one depth is shown
+    far = 1.001 * min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70)))
+    return far, float(z.max())
 
 
 def _pivots(result: Result, scale: float) -> Float:

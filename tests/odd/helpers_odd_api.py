@@ -9,7 +9,6 @@ import numpy as np
 from helpers_odd_options import depth_png
 from helpers_odd_run import Case, cases
 from helpers_odd_world import SIZE, World
-from soup_nlp.sequence.chain import make_chain
 
 import soup_nlp
 from soup_nlp.cli.main import main
@@ -17,8 +16,9 @@ from soup_nlp.data.formats import camera_files, images, map_files
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.sol import read_sol
 from soup_nlp.report.check import check_folder
-from soup_nlp.report.result import load
+from soup_nlp.sequence.folder import load
 from soup_nlp.sequence.frames import find_images, video_frames
+from soup_nlp.sequence.links import make_chain
 
 API = "5 Python API"
 THINGS: dict[str, Any] = {

@@ -16,7 +16,8 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import pixel_grid, project, rays
 from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import WRITTEN, CheckReport, check_folder
-from soup_nlp.report.folder import convert, prepare_folder, write_folder
+from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.sequence.folder import convert
 from soup_nlp.storage.folders import MARK, digest_of, files_in
 
 pytestmark = pytest.mark.slow

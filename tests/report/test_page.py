@@ -15,9 +15,10 @@ from soup_nlp.cli.main import main
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report import page as page_module
+from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import SHARES
 from soup_nlp.report.folder import _title, write_folder
-from soup_nlp.report.page import MODES, make_scene, page, surface_cells
+from soup_nlp.report.page import MODES, make_pair, make_scene, pair_page, surface_cells
 from soup_nlp.report.pictures import _enlarged, pictures
 from soup_nlp.report.result import result_of
 from soup_nlp.report.summary import summary
@@ -30,7 +31,7 @@ def shown(small_run):
 
 @pytest.fixture(scope="module")
 def text(shown):
-    return page(shown, pictures(shown))
+    return pair_page(shown)
 
 
 def data_of(text):
@@ -69,10 +70,10 @@ def test_the_page_is_one_file_that_fetches_nothing(text):
     assert text.count("<script") == text.count("</script>") == 3
     assert len(text) < 2e6
     assert "status  &lt;fine&gt; &amp; dandy" in text
-    assert [mode["name"] for mode in data_of(text)["modes"]] == list(MODES)
+    assert [name for name, _ in data_of(text)["modes"]] == list(MODES)
     for word in ("What limits this result", "Verdict", "Components"):
         assert word in text
-    assert re.findall(r'data-name="(\w+)"', text)[:5] == [
+    assert [*data_of(text)["pairs"][0]["pictures"]][:5] == [
         "image_ref", "image_next", "superpixels", "components", "flow",
     ]  # fmt: skip
     assert re.search(r"rim = [\d.]+ px", text)
@@ -80,17 +81,18 @@ def test_the_page_is_one_file_that_fetches_nothing(text):
 
 def test_planes_and_motions_rebuild_both_frames(text, small_run):
     """The data of the page reproduce the reconstruction."""
-    s, run = data_of(text)["scene"], small_run
+    data, run = data_of(text), small_run
+    s, pose_next = data["pairs"][0], np.array(data["cameras"][1])
     scale, n = run.metrics["solution"].scale, len(run.soup)
     labels = unpack(s["labels"], "<u2", run.segmentation.labels.shape)
     np.testing.assert_array_equal(labels, run.segmentation.labels)
-    np.testing.assert_allclose(np.array(s["camera"])[:3, 3], scale * run.camera.centre, rtol=1e-9)
+    np.testing.assert_allclose(pose_next[:3, 3], scale * run.camera.centre, rtol=1e-9)
     planes = unpack(s["planes"], "<f4", (n, 3)).astype(float)
     ray = rays(np.array(s["K"]), pixel_grid(*labels.shape))
     points = ray / np.einsum("hwc,hwc->hw", planes[labels], ray)[..., None]
     # single precision, about 1e-7, grows where a plane is seen at a small angle
     np.testing.assert_allclose(points[..., 2], scale * run.reconstruction.depth_ref, rtol=1e-4)
-    for name, pose in (("motionCamera", np.eye(4)), ("motion", np.array(s["camera"]))):
+    for name, pose in (("motionCamera", np.eye(4)), ("motion", pose_next)):
         w, pivot, shift = (
             unpack(s[name], "<f4", (n, 9))
             .astype(float)
@@ -128,9 +130,8 @@ def test_curtains_are_cut(shown, small_run):
     assert surface[~alike(labels) & alike(part)].mean() > 0.5
 
 
-def test_large_images_are_thinned(shown, monkeypatch):
-    monkeypatch.setattr(page_module, "MOST_PIXELS", 256 * 128 / 8)
-    scene = make_scene(shown)
+def test_large_images_are_thinned(shown):
+    scene = make_pair(Chain.of(shown), 0, 256 * 128 / 8)
     assert scene["step"] == 3
     assert scene["labels"].shape == (43, 86)
     surface = surface_cells(shown, 3)
@@ -139,10 +140,10 @@ def test_large_images_are_thinned(shown, monkeypatch):
 
 
 def test_a_far_sky_is_left_out_at_first(shown):
-    scene = make_scene(shown)
-    assert scene["middle"] < scene["far"] <= scene["deepest"]
+    scene = make_scene(Chain.of(shown))
+    assert scene["middle"] < scene["far"] <= 1.001 * scene["deepest"]
     z = np.concatenate([np.full(900, 2.0), np.full(100, 1e6)])
-    assert page_module._far(z) == (8.0, 1e6)
+    assert page_module._far(z) == (8.008, 1e6)
 
 
 def test_a_folder_makes_the_same_page_again(folder, capsys):
@@ -164,7 +165,7 @@ def test_the_page_can_be_left_out(small_run, folder):
 def test_a_component_whose_depth_is_a_guess_is_striped(shown):
     def stripes(sigma):
         rec = replace(shown.reconstruction, sigma_ref=sigma)
-        own = pictures(replace(shown, reconstruction=rec))["components"]
+        own = pictures(Chain.of(replace(shown, reconstruction=rec)))["components"]
         return (own.image == 255).all(axis=2), own.title
 
     sigma = np.full(shown.labels.shape, 0.02)
@@ -184,14 +185,14 @@ def test_page_pictures_and_overview_begin_with_the_guess(guess, said, shown):
     sigma[: round(guess * sigma.size)] = 0.4
     rec = replace(shown.reconstruction, sigma_ref=sigma.reshape(shown.labels.shape))
     one = replace(shown, summary={**shown.summary, "certainty": shares}, reconstruction=rec)
-    drawn = pictures(one)
-    depth, header = drawn["depth_ref"].title, page(one, drawn).partition("</header>")[0]
+    drawn = pictures(Chain.of(one))
+    depth, header = drawn["depth_ref"].title, pair_page(one, drawn).partition("</header>")[0]
     sentence = f"{said} of the image is a guess: {SHARES['flat']}"
     assert depth.endswith(f"; pale = a guess ({said})") == bool(said)
     # two frames show the same guess, where both see it
     pale = [drawn[name].image.min(axis=2) >= 165 for name in ("depth_ref", "depth_next")]
-    for mask, known in zip(pale, one.guesses, strict=True):
-        assert mask[known].all()
+    for mask, frame in zip(pale, Chain.of(one), strict=True):
+        assert mask[frame.guess].all()
     assert pale[0].mean() == pytest.approx(guess, abs=0.05)
     assert (f"<p><strong>{sentence}</strong> &middot; " in header) == bool(said)
     assert _title(one) == (f"{one.name}: {sentence}" if said else one.name)

@@ -7,15 +7,18 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from helpers_result import BOARD, BOARD_Z, CAMERA, WALL_Z, K, board, small_result
+from helpers_result import BOARD, BOARD_Z, CAMERA, WALL_Z, K, board, small_result, toy_pairs
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from soup_nlp.data.formats.map_files import read_pfm
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.report.chain import Chain
+from soup_nlp.report.clouds import fuse, write_ply
 from soup_nlp.report.formats import FORMATS, write_formats
-from soup_nlp.report.models import surface_mesh, write_ply
+from soup_nlp.report.models import surface_mesh
 from soup_nlp.report.result import Result
+from soup_nlp.sequence.links import make_chain
 
 FLOAT32 = 1e-6
 """Relative rounding of what files hold in single precision."""
@@ -49,7 +52,8 @@ def test_clouds_leave_out_jumps_and_what_is_hidden(result):
 
 @pytest.mark.parametrize("frame", [0, 1])
 def test_ply_is_read_by_trimesh(tmp_path, result, frame):
-    assert write_formats(tmp_path, result, ["ply"]) == ["points_ref.ply", "points_next.ply"]
+    names = write_formats(tmp_path, Chain.of(result), ["ply"])
+    assert names == ["points_ref.ply", "points_next.ply"]
     path = tmp_path / ("points_ref.ply", "points_next.ply")[frame]
     cloud = trimesh.load(path)
     keep = result.sure
@@ -72,7 +76,7 @@ def test_ply_is_read_by_trimesh(tmp_path, result, frame):
 
 @pytest.mark.parametrize("frame", [0, 1])
 def test_glb_is_read_by_trimesh(tmp_path, result, frame):
-    write_formats(tmp_path, result, ["glb"])
+    write_formats(tmp_path, Chain.of(result), ["glb"])
     scene = trimesh.load(tmp_path / ("mesh_ref.glb", "mesh_next.glb")[frame])
     assert scene.metadata["unit"] == result.unit
     (mesh,) = scene.geometry.values()
@@ -116,7 +120,7 @@ def test_large_meshes_are_thinned(result, monkeypatch):
 
 def test_colmap_models_are_read_by_pycolmap(tmp_path, result):
     pycolmap = pytest.importorskip("pycolmap")
-    write_formats(tmp_path, result, ["colmap"])
+    write_formats(tmp_path, Chain.of(result), ["colmap"])
     model = pycolmap.Reconstruction(str(tmp_path / "colmap" / "sparse" / "0"))
     assert {image.name for image in model.images.values()} == {"ref.png", "next.png"}
     wall = result.sure & ~board()
@@ -127,7 +131,8 @@ def test_colmap_models_are_read_by_pycolmap(tmp_path, result):
         np.testing.assert_allclose(image.camera.calibration_matrix()[:2, 2], K[:2, 2] + 0.5)
         pose = image.cam_from_world().matrix()
         np.testing.assert_allclose(pose, (CAMERA.matrix if second else np.eye(4))[:3], atol=1e-9)
-        assert image.num_points3D == wall.sum()
+        # at the outline of the board, a pixel may be its
+        assert wall.sum() >= image.num_points3D > 0.99 * wall.sum()
         gaps = [
             np.linalg.norm(image.project_point(model.points3D[p.point3D_id].xyz) - p.xy)
             for p in image.points2D
@@ -147,11 +152,11 @@ def test_cameras_with_skew_have_no_colmap_model(tmp_path, result):
     skewed[0, 1] = 2
     tree = {"input": {**result.tree["input"], "K_next": skewed}}
     with pytest.raises(DataError, match="skew"):
-        write_formats(tmp_path, replace(result, tree=tree), ["colmap"])
+        write_formats(tmp_path, Chain.of(replace(result, tree=tree)), ["colmap"])
 
 
 def test_depth_is_read_by_numpy_opencv_and_pillow(tmp_path, result):
-    write_formats(tmp_path, result, ["npy", "pfm", "png"])
+    write_formats(tmp_path, Chain.of(result), ["npy", "pfm", "png"])
     scale = json.loads((tmp_path / "depth_png.json").read_text())["values_per_unit"]
     for name, depth in zip(("ref", "next"), result.depths):
         known = np.isfinite(depth)
@@ -160,14 +165,14 @@ def test_depth_is_read_by_numpy_opencv_and_pillow(tmp_path, result):
         found = cv2.imread(str(tmp_path / f"depth_{name}.pfm"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(found, np.where(known, depth, np.inf).astype(np.float32))
         np.testing.assert_array_equal(read_pfm(tmp_path / f"depth_{name}.pfm")[known], found[known])
-        found = np.asarray(Image.open(tmp_path / f"depth_{name}.png"), float) / scale[name]
-        np.testing.assert_allclose(found[known], depth[known], atol=0.5 / scale[name])
+        found = np.asarray(Image.open(tmp_path / f"depth_{name}.png"), float) / scale
+        np.testing.assert_allclose(found[known], depth[known], atol=0.5 / scale)
         assert not found[~known].any()
 
 
 def test_recordings_are_read_by_rerun(tmp_path, result):
     chunk = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk (extra: rerun)")
-    write_formats(tmp_path, result, ["rrd"])
+    write_formats(tmp_path, Chain.of(result), ["rrd"])
     rows: dict[str, int] = {}
     for part in chunk.RrdReader(str(tmp_path / "scene.rrd")).stream():
         rows[str(part.entity_path)] = rows.get(str(part.entity_path), 0) + part.num_rows
@@ -176,7 +181,7 @@ def test_recordings_are_read_by_rerun(tmp_path, result):
 
 
 def test_motions_and_trajectory(tmp_path, result):
-    write_formats(tmp_path, result, ["motions"])
+    write_formats(tmp_path, Chain.of(result), ["motions"])
     told = json.loads((tmp_path / "motions.json").read_text())
     np.testing.assert_allclose(told["camera"]["next_from_ref"], CAMERA.matrix, atol=1e-9)
     np.testing.assert_allclose(told["camera"]["position_in_ref"], CAMERA.centre, atol=1e-9)
@@ -196,11 +201,65 @@ def test_motions_and_trajectory(tmp_path, result):
     np.testing.assert_allclose(found, CAMERA.R.T, atol=1e-8)
 
 
+def test_masks_flow_cameras_and_poses_are_plain_files(tmp_path, result):
+    names = write_formats(tmp_path, Chain.of(result), ["masks", "flow", "npy", "kitti"])
+    assert set(names) == {p.name for p in tmp_path.iterdir()}
+    for name, share in (("ref", board().mean()), ("next", None)):
+        labels, moving = (np.asarray(Image.open(tmp_path / f"{k}_{name}.png")) for k in MASKS)
+        assert labels.dtype == moving.dtype == np.uint8
+        np.testing.assert_array_equal(moving, 255 * (labels > 0))
+        assert (moving > 0).mean() == pytest.approx(share or board().mean(), rel=0.3 * (not share))
+    uv = cv2.readOpticalFlow(str(tmp_path / "flow.flo"))
+    np.testing.assert_array_equal(uv, result.flow.astype(np.float32))
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / "K.txt"), K)
+    np.testing.assert_array_equal(np.load(tmp_path / "sigma_ref.npy"), np.float32(result.sigma))
+    first, second = np.loadtxt(tmp_path / "poses.txt").reshape(2, 3, 4)
+    np.testing.assert_allclose(first, np.eye(4)[:3])
+    np.testing.assert_allclose(second, np.linalg.inv(CAMERA.matrix)[:3], atol=1e-8)
+
+
+MASKS = "components", "moving"
+
+
+def test_transforms_project_points_where_the_cameras_see_them(tmp_path, result):
+    write_formats(tmp_path, Chain.of(result), ["transforms"])
+    told = json.loads((tmp_path / "transforms" / "transforms.json").read_text())
+    point = np.array([*result.points[0][30, 10] * [1, -1, -1], 1])  # on the wall, y up
+    where = [np.array([10, 30]), np.array([10, 30]) + result.reconstruction.flow[30, 10]]
+    for frame, at in zip(told["frames"], where, strict=True):
+        x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ point
+        uv = frame["fl_x"] * x / -z + frame["cx"], frame["fl_y"] * -y / -z + frame["cy"]
+        np.testing.assert_allclose(uv, at + 0.5, atol=1e-6)
+        image = np.asarray(Image.open(tmp_path / "transforms" / frame["file_path"]))
+        assert image.shape == (60, 80, 3)
+        mask = np.asarray(Image.open(tmp_path / "transforms" / frame["mask_path"]))
+        assert 0.5 < (mask == 255).mean() < 0.9
+
+
+def test_a_chain_has_every_format_of_a_pair(tmp_path):
+    chain = make_chain(toy_pairs())
+    formats = [name for name in FORMATS if name != "rrd"]
+    names = write_formats(tmp_path, chain, formats)
+    assert {name.partition("/")[0] for name in names} == {p.name for p in tmp_path.iterdir()}
+    for k in range(3):
+        found = np.load(tmp_path / "depth" / f"{k:04d}.npy")
+        np.testing.assert_array_equal(found, chain.depth(k).astype(np.float32))
+        cloud = trimesh.load(tmp_path / "points" / f"{k:04d}.ply")
+        mesh = trimesh.load(tmp_path / "mesh" / f"{k:04d}.glb")
+        # in the first camera's axes, y up in meshes
+        middle = np.median(cloud.vertices, axis=0)
+        found = np.median(mesh.to_geometry().vertices, axis=0) * [1, -1, -1]
+        np.testing.assert_allclose(found, middle, atol=0.3)
+    assert len(trimesh.load(tmp_path / "scene.ply").vertices) == len(fuse(chain))
+    for name in ("poses.txt", "trajectory.tum"):
+        assert len(np.loadtxt(tmp_path / name)) == 3
+
+
 def test_unknown_formats_are_refused(tmp_path, result):
     with pytest.raises(ConfigError, match="obj"):
-        write_formats(tmp_path, result, ["ply", "obj"])
+        write_formats(tmp_path, Chain.of(result), ["ply", "obj"])
     with pytest.raises(ConfigError, match="no format"):
-        write_formats(tmp_path, result, [])
+        write_formats(tmp_path, Chain.of(result), [])
     assert not list(tmp_path.iterdir())
     assert set(FORMATS) >= {"ply", "glb", "colmap", "npy", "pfm", "png", "rrd"}
 

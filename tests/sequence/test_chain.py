@@ -4,21 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_result import CAMERA, small_result, toy_pairs
-from soup_nlp.sequence.chain import (
-    Link,
+from helpers_result import CAMERA, K, small_result, toy_pairs
+
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.rotation import exp
+from soup_nlp.report.chain import Link
+from soup_nlp.report.clouds import fuse
+from soup_nlp.sequence.links import (
     SolvedPair,
-    carried,
     follow,
     link,
     make_chain,
     number,
     solve_scales,
 )
-from soup_nlp.sequence.fused import fuse, movers
-
-from soup_nlp.errors import DataError
-from soup_nlp.geometry.rotation import exp
 from soup_nlp.sequence.score import aligned
 
 pytestmark = pytest.mark.slow
@@ -76,7 +75,7 @@ def test_components_are_followed_by_overlap():
 def test_a_chain_has_one_scale_and_one_frame_of_reference():
     chain = make_chain(toy_pairs())
     np.testing.assert_allclose(chain.scales, [1, 2], rtol=1e-9)
-    np.testing.assert_allclose(chain.depth(1), 2 * chain.pairs[1].result.depths[0])
+    np.testing.assert_allclose(chain.depth(1), 2 * toy_pairs()[1].result.depths[0])
     np.testing.assert_allclose(
         chain.world_from_camera[1].matrix, np.linalg.inv(CAMERA.matrix), atol=1e-9
     )
@@ -92,18 +91,14 @@ def test_a_chain_has_one_scale_and_one_frame_of_reference():
 def test_the_static_scene_becomes_one_cloud():
     chain = make_chain(toy_pairs())
     cloud = fuse(chain)
-    both = sum(
-        int((p.result.sure & (p.result.components.of_pixel == 0)).sum()) for p in chain.pairs
-    )
+    both = sum(int(pair.static.sum()) for pair in chain.pairs)
     # both pairs see the same wall: far fewer points than pixels, from either frame
     assert 0 < len(cloud) <= both
-    assert set(cloud["label"]) <= {0, 1}
+    assert set(cloud["frame"]) <= {0, 1}
     # points of the second pair lie on the surface of the first
-    wall = chain.points(0)[chain.pairs[0].result.sure]
-    for point in cloud["points"][cloud["label"] == 1][::50]:
+    wall = chain.points(0)[chain.pairs[0].sure]
+    for point in cloud["points"][cloud["frame"] == 1][::50]:
         assert np.linalg.norm(wall - point, axis=1).min() < 0.05 * np.linalg.norm(point)
-    # the board is a track of three frames
-    assert set(movers(chain, 0)["label"]) == {1}
 
 
 def test_a_pair_without_parallax_is_bridged():
@@ -119,7 +114,7 @@ def test_a_pair_without_parallax_is_bridged():
         source_next=identity,
     )
     middle = replace(still, reconstruction=rec, components=replace(still.components, members=rest))
-    still = [SolvedPair(k, k + 1, middle, 0.0) for k in range(5)]
+    still = [SolvedPair(k, k + 1, middle) for k in range(5)]
     moving = replace(first, first=1, second=2), replace(second, first=3, second=4)
     # also before the first and after the last motion
     chain = make_chain([still[0], moving[0], still[2], moving[1], still[4]])
@@ -130,12 +125,23 @@ def test_a_pair_without_parallax_is_bridged():
     assert chain.scales[3] / chain.scales[1] == pytest.approx(2, rel=0.01)
 
 
-def test_labels_are_carried_to_the_next_frame():
-    result = small_result()
-    there = carried(result.components.of_pixel, result.reconstruction)
-    seen = result.reconstruction.source_next >= 0
-    assert (there[~seen] == -1).all()
-    assert set(np.unique(there[seen])) == {0, 1}
+def test_frames_of_a_chain_have_all_that_is_known_of_them():
+    chain = make_chain(toy_pairs())
+    for k, frame in enumerate(chain):
+        seen = np.isfinite(frame.depth)
+        assert seen.mean() > 0.9
+        assert set(np.unique(frame.components[seen])) == {0, 1}
+        # of what only the last frame shows, nothing is known
+        assert k < 2 or (frame.components[~seen] == -1).all()
+        assert np.isfinite(frame.sigma[seen]).all()
+        np.testing.assert_allclose(frame.points, chain.points(k), equal_nan=True)
+        np.testing.assert_array_equal(frame.K, K)
+    np.testing.assert_allclose(chain.points(0), chain.pairs[0].points[0])
+    for wrong in (3, -1, None):
+        with pytest.raises(IndexError, match="0 to 2"):
+            chain[wrong]
+        with pytest.raises(DataError):
+            chain.depth(wrong)
 
 
 def test_similarities_are_found_exactly():

@@ -3,18 +3,16 @@
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
-import trimesh
 from helpers_chromium import Chromium, find_chromium
 from helpers_files import sets
 from helpers_result import CAMERA, CERTAINTY, toy_pairs
-from soup_nlp.sequence.chain import make_chain
-from soup_nlp.sequence.fused import fuse
-from soup_nlp.sequence.page import chain_page, depth_pictures, guess_of, write_animation
 
+import soup_nlp
 from soup_nlp.bench import chain as chain_study
 from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
@@ -22,11 +20,15 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError, SolverError
 from soup_nlp.pipeline.case import prepare
+from soup_nlp.report.clouds import fuse
 from soup_nlp.report.figures import write_png
+from soup_nlp.report.models import POINTS
+from soup_nlp.report.pictures import pictures
 from soup_nlp.sequence import solve as solving
-from soup_nlp.sequence.folder import COLMAP_POINTS, chain_files, write_chain
+from soup_nlp.sequence.folder import chain_files, write_chain
 from soup_nlp.sequence.frames import Frames
-from soup_nlp.sequence.score import chain_exit_code, chain_lines, link_table
+from soup_nlp.sequence.links import make_chain
+from soup_nlp.sequence.score import chain_exit_code, chain_lines, chain_page, link_table
 from soup_nlp.sequence.solve import one_camera
 
 pytestmark = pytest.mark.slow
@@ -34,7 +36,7 @@ pytestmark = pytest.mark.slow
 
 def test_a_chain_is_written(tmp_path):
     chain = make_chain(toy_pairs())
-    write_chain(tmp_path, chain, "toy & co", ["a.png", "b.png", "</script>"])
+    chain = write_chain(tmp_path, chain, "toy & co", ["a.png", "b.png", "</script>"])
     files = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
     assert files == set(chain_files(3))
     told = json.loads((tmp_path / "chain.json").read_text())
@@ -44,12 +46,12 @@ def test_a_chain_is_written(tmp_path):
     heads, (row,) = link_table(told)
     assert heads == ["pairs", "ratio of scales", "spread (log)", "pixels", ""]
     assert row[:2] == ["0, 1", "2.000"]
-    assert chain_lines(chain, told)[1].split() == " ".join(heads).split()
-    assert "true ratio" not in (tmp_path / "chain.html").read_text()
+    assert chain_lines(chain)[1].split() == " ".join(heads).split()
+    assert "true ratio" not in (tmp_path / "report.html").read_text()
     # two frames have no link, so no head of a table
-    two = make_chain(toy_pairs()[:1])
-    assert chain_lines(two, {**told, "links": []})[1].startswith("tracks")
-    assert "spread (log)" not in chain_page(two, {**told, "links": []})
+    two = make_chain(toy_pairs()[:1], summary={**told, "links": []})
+    assert chain_lines(two)[1].startswith("tracks")
+    assert "spread (log)" not in chain_page(two)
     np.testing.assert_allclose([s["scale"] for s in told["scales"]], [1, 2], rtol=1e-9)
     for k in range(3):
         path = str(tmp_path / "depth" / f"{k:04d}.png")
@@ -58,21 +60,11 @@ def test_a_chain_is_written(tmp_path):
         np.testing.assert_allclose(
             found[known], chain.depth(k)[known], atol=0.51 / told["depth_png_scale"]
         )
-    # the board is one track, whose points are in the cloud
+    # the board is one track
     assert [t["track"] for t in told["tracks"]] == [1]
     assert [*told["tracks"][0]["path"]] == ["0", "1", "2"]
-    head = (tmp_path / "points" / "0001.ply").read_bytes().split(b"end_header")[0]
-    assert b"property float track" in head
     poses = np.loadtxt(tmp_path / "trajectory.tum")
     np.testing.assert_allclose(poses[1, 1:4], CAMERA.centre, atol=1e-8)
-    write_animation(tmp_path / "scene.glb", chain, told)
-    head = (tmp_path / "scene.glb").read_bytes()
-    tree = json.loads(head[20 : 20 + int.from_bytes(head[12:16], "little")])
-    assert [node["name"] for node in tree["nodes"]] == ["static scene", "track 1", "camera"]
-    # two channels for the track and two for the camera, each with a key for every frame
-    assert [k["target"]["node"] for k in tree["animations"][0]["channels"]] == [1, 1, 2, 2]
-    keys = [tree["accessors"][k["output"]]["count"] for k in tree["animations"][0]["samplers"]]
-    assert keys == [3] * 4
 
 
 def test_a_chain_says_which_depth_is_a_guess(tmp_path):
@@ -86,23 +78,23 @@ def test_a_chain_says_which_depth_is_a_guess(tmp_path):
 
     half, none = make_chain([sure[0], unsure(sure[1])]), make_chain([*map(unsure, sure)])
     for chain, share, code in ((make_chain(sure), 0, 0), (half, 50, 0), (none, 100, 1)):
-        write_chain(tmp_path, chain, "toy", ["a.png", "b.png", "c.png"])
+        chain = write_chain(tmp_path, chain, "toy", ["a.png", "b.png", "c.png"])
         told = json.loads((tmp_path / "chain.json").read_text())
         assert told["certainty"]["guess"] == pytest.approx(share / 100)
         said = f"{share}% of all images is a guess: a turn alone or a constant depth"
-        text = (tmp_path / "chain.html").read_text()
-        assert (f"<b>{said}" in text) == bool(share)
-        assert "<b></b>" not in text
+        text = (tmp_path / "report.html").read_text()
+        assert (f"<strong>{said}" in text) == bool(share)
+        assert "<strong></strong>" not in text
         assert f", {share}% a guess)" in str(chain)
-        lines = "\n".join(chain_lines(chain, told))
+        lines = "\n".join(chain_lines(chain))
         assert (f"{share}% is a guess" in lines) == bool(share)
         assert ("half of it to 7.0%" in lines) == (share < 100)
         assert chain_exit_code(chain)[0] == code
     assert chain_exit_code(none)[1].startswith(said)
     # of the last frame, the next one of an unsure pair, what no other frame shows is unknown
-    assert [guess_of(half, k).mean() for k in range(2)] == [0, 1]
-    np.testing.assert_array_equal(guess_of(half, 2), np.isfinite(half.depth(2)))
-    (first, second, _), _ = depth_pictures(half)
+    assert [half[k].guess.mean() for k in range(2)] == [0, 1]
+    np.testing.assert_array_equal(half[2].guess, np.isfinite(half.depth(2)))
+    first, second = (pictures(half, k)["depth_ref"].image for k in range(2))
     # what is unknown is grey
     assert second[np.isfinite(half.depth(1))].min() >= 165 > first.min()
     assert fuse(none).size == 0
@@ -115,15 +107,23 @@ def test_the_page_of_a_chain_opens(tmp_path):
     write_chain(tmp_path, make_chain(toy_pairs()), "toy & co", ["a.png", "b.png", "<b>c.png"])
     browser = Chromium(chromium, 1000, 700)
     try:
-        browser.open((tmp_path / "chain.html").as_uri())
+        browser.open((tmp_path / "report.html").as_uri())
         assert browser.value("document.querySelector('h1').textContent") == "toy & co"
-        first = browser.screenshot()
-        browser.value("time.value = 2; time.dispatchEvent(new Event('input'))")
-        browser.wait("document.getElementById('depth').naturalWidth == 80")
-        second = browser.screenshot()
-        now = browser.value("document.getElementById('now').textContent")
-        assert now == "frame 2: <b>c.png, 0% a guess"
-        assert (first != second).mean() > 0.01
+        shots = []
+        for time in (0, 1.5, 2):
+            browser.value(f"soupView.setTime({time})")
+            shots.append(browser.screenshot())
+            assert browser.value("document.querySelector('#gallery img').naturalWidth") == 80
+        assert all((a != b).mean() > 0.01 for a, b in pairwise(shots))
+        now = "document.getElementById('now').textContent"
+        assert browser.value(now) == "<b>c.png, time 2 of 2; 0 % a guess"
+        # the other pair adds its static points to what is shown and saved
+        size, alone = "soupView.ply().size", browser.value("soupView.ply().size")
+        browser.value("document.getElementById('all').click()")
+        browser.wait(f"{size} > 1.5 * {alone}")
+        assert "b.png, pixel (40, 30)" in browser.value(
+            "soupView.tell(80 * 30 + 40), document.getElementById('picked').textContent"
+        )
         assert browser.log == []
         assert [r for r in browser.requests if not r.startswith("file:")] == []
     finally:
@@ -184,14 +184,13 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     assert main(["check", str(out)]) == 0
     assert "camera poses by pairs and scales" in capsys.readouterr().out
-    assert main(["convert", str(out), "--to", "glb,colmap", "-o", str(tmp_path / "more")]) == 0
+    assert main(["convert", str(out), "--to", "ply,colmap", "-o", str(tmp_path / "more")]) == 0
     assert main(["view", str(out), "--renew", "--no-open"]) == 0
-    assert main(["convert", str(out), "--to", "pfm"]) == 2
-    assert "pairs/000_001" in capsys.readouterr().err
-    scene = trimesh.load(tmp_path / "more" / "scene.glb")
-    assert "static scene" in scene.graph.nodes_geometry
+    loaded = soup_nlp.load(out)
+    np.testing.assert_allclose(loaded.scales, [row["scale"] for row in told["scales"]])
+    assert loaded.name == told["name"]
     rows = (tmp_path / "more" / "colmap" / "sparse" / "0" / "points3D.txt").read_text()
-    assert len(rows.splitlines()) == 2 + min(COLMAP_POINTS, len(rows.splitlines()) - 2) > 1000
+    assert len(rows.splitlines()) == 2 + min(POINTS, len(rows.splitlines()) - 2) > 1000
     poses = (tmp_path / "more" / "colmap" / "sparse" / "0" / "images.txt").read_text()
     # two lines for each frame, also the last one, which sees points too
     assert len(poses.splitlines()) == 2 + 2 * 3
@@ -205,9 +204,6 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     for rule in (["--scale", "lsq"], ["--cap", "70"]):
         assert main(["evaluate", str(out), "--depth", str(tmp_path / "true"), *rule]) == 2
         assert f"found: {' '.join(rule)}" in capsys.readouterr().err
-    video = cv2.VideoCapture(str(tmp_path / "out" / "depth.mp4"))
-    assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
-    video.release()
     assert len(np.loadtxt(tmp_path / "out" / "trajectory.tum")) == 3
     # what is solved is not solved again
     rows = (tmp_path / "out" / "pairs.jsonl").read_text()
