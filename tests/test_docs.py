@@ -107,7 +107,7 @@ def test_files_keys_and_commands_that_are_named_exist(page):
     assert "energy.weights.orient" in known
     for key in re.findall(rf"(?:`|--set )((?:{SECTIONS})\.[a-z_.]+)(?=[`:= ])", text):
         # a picture flow.png is none
-        assert key in known or key.endswith(".png"), key
+        assert key in known or key.endswith((".png", ".flo")), key
     known = commands()
     assert {"solve", "bench speed"} <= known
     for command in re.findall(r"soup-nlp (bench [a-z][a-z-]+|[a-z]+)\b", text):
