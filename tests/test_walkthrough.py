@@ -12,6 +12,7 @@ import sys
 import webbrowser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers_files import write_pair
 
@@ -21,6 +22,12 @@ from soup_nlp.data.scenes.catalogue import render_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+PAGES = [
+    "README.md",
+    *(f"docs/{name}.md" for name in ("using", "python", "networks", "depth_prior")),
+]
+NETWORKS = {"docs/networks.md", "docs/depth_prior.md"}
+"""Pages that write a network in an ONNX file."""
 INSTALLATION = {"pip", "make"}
 """Programs of an installation, which `.ci/run` uses."""
 SOLVES = {"solve", "demo", "chain"}
@@ -45,9 +52,10 @@ def reader(tmp_path, monkeypatch):
     monkeypatch.setattr(Problem, "model_validate", lambda tree: validate(small(tree)))
     monkeypatch.setattr(webbrowser, "open", lambda address: True)
     (tmp_path / "clip").mkdir()
-    for frame in range(2):
+    for frame in (1, 0):
         pair = render_scene("orbit", width=192, height=96, frame=frame)
         write_pair(tmp_path / "clip", pair, [f"{frame}", f"{frame + 1}"])
+    np.save("prior.npy", pair.truth.depth_ref)
     for name, frame in (("a", 0), ("b", 1)):
         shutil.copy(tmp_path / "clip" / f"{frame}.png", tmp_path / f"{name}.png")
 
@@ -65,8 +73,11 @@ def run_line(words):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("reader")
-@pytest.mark.parametrize("page", ["README.md", "docs/using.md", "docs/python.md"])
+@pytest.mark.parametrize("page", PAGES)
 def test_a_page_runs_as_printed(page):
+    if page in NETWORKS:
+        for package in ("onnx", "onnxruntime"):
+            pytest.importorskip(package, reason=f"no {package}")
     names = {}
     for language, block in BLOCK.findall((ROOT / page).read_text(encoding="utf-8")):
         if language == "python":
