@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PAGES = [
     "README.md",
-    *(f"docs/{name}.md" for name in ("using", "python", "networks", "depth_prior")),
+    *(f"docs/{name}.md" for name in ("using", "python", "networks", "depth_prior", "family")),
 ]
 NETWORKS = {"docs/networks.md", "docs/depth_prior.md"}
 """Pages that write a network in an ONNX file."""
