@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Image
-from soup_nlp.data.formats.images import read_image
+from soup_nlp.data.formats.images import RAW, read_image
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.geometry.rotation import exp
@@ -28,7 +28,7 @@ Raw = dict[str, Any]
 IMAGES = (
     *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp", ".webp", ".avif"),
     # these are found, so that the message can say that they must be converted
-    *(".heic", ".heif"),
+    *(".heic", ".heif", *RAW),
 )
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 DEPTHS = (".png", ".npy", ".pfm", ".dpt")

@@ -128,6 +128,80 @@ def test_a_plausible_focal_length_of_exif_is_taken(
     assert made.focal_sigma == pair.focal_sigma == sigma
 
 
+# --- pictures that are not what they seem --------------------------------------------------------
+
+
+def tiff(path: Path, tags: dict[int, int], size: tuple[int, int] = (96, 64)) -> Path:
+    Image.fromarray(texture(*size)).save(path, "TIFF", tiffinfo=tags)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "tags"),
+    [
+        ("a.dng", {50706: 1}),
+        ("a.tif", {50706: 1}),
+        ("a.NEF", {}),
+        ("a.cr3", {}),
+        ("a.tiff", {254: 1}),
+        ("a.arw", {254: 1}),
+    ],
+)
+def test_a_raw_photo_is_refused(name: str, tags: dict[int, int], tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"raw photo[\s\S]*expected: [\s\S]*try: develop it"):
+        read_image(tiff(tmp_path / name, tags))
+
+
+@pytest.mark.parametrize("kind", ["gif", "tif", "webp", "png"])
+def test_the_first_of_several_pages_is_used(kind: str, tmp_path: Path) -> None:
+    one, other = (Image.fromarray(texture(seed=k)).quantize(64).convert("RGB") for k in (1, 2))
+    options = {"lossless": True} if kind == "webp" else {}
+    one.save(tmp_path / f"a.{kind}", save_all=True, append_images=[other], **options)
+    with pytest.warns(DataWarning, match=rf"a\.{kind}: holds 2 pages or frames; the first one"):
+        image = read_image(tmp_path / f"a.{kind}")
+    np.testing.assert_array_equal(image, np.asarray(one))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.jpg", {}),
+        ("b.jpg", {"progressive": True}),
+        ("a.tif", {"compression": "tiff_lzw"}),
+        ("b.tif", {"compression": "tiff_deflate"}),
+        ("c.tif", {"compression": "jpeg"}),
+    ],
+)
+def test_a_picture_damaged_inside_gives_a_warning(
+    name: str, options: dict[str, Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    Image.fromarray(texture(320, 240)).save(path, **options)
+    read_image(path)  # gives no warning
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 400] = np.random.default_rng(0).bytes(400)
+    path.write_bytes(content)
+    with pytest.warns(DataWarning, match=rf"{re.escape(name)}: is damaged"):
+        read_image(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("factor", [257, 16])
+def test_8_bits_beside_16_are_stretched_alike(factor: int, tmp_path: Path) -> None:
+    image = np.clip(texture().astype(int), 40, 200)
+    cv2.imwrite(str(tmp_path / "a.png"), image.astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "b.png"), (image * factor).astype(np.uint16))
+    with pytest.warns(DataWarning, match="16 bit beside 8 bit"):
+        eight, sixteen = read_images([tmp_path / "a.png", tmp_path / "b.png"])
+    if factor == 257:
+        np.testing.assert_array_equal(eight, sixteen)
+    assert eight.max() == 255
+    with warnings.catch_warnings(action="error"):
+        eight, _ = read_images([tmp_path / "a.png", tmp_path / "b.png"], white=257 * 255)
+    np.testing.assert_array_equal(eight, image[:, :, ::-1])
+
+
 # --- pictures of more than 8 bits ----------------------------------------------------------------
 
 

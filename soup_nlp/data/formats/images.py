@@ -5,14 +5,19 @@ Every reader raises `DataError` for a file that is missing, empty, truncated or 
 
 import contextlib
 import io
+import os
+import re
+import tempfile
+import threading
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
 
 from soup_nlp.arrays import Mask
 from soup_nlp.errors import DataError
@@ -21,6 +26,17 @@ from soup_nlp.storage.files import PathLike, read_bytes
 
 OUTER = (0.5, 99.5)
 """Percentiles of the values of 16-bit pictures that become black and white."""
+
+RAW = (
+    ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".srf", ".sr2", ".raf", ".rw2", ".rwl",
+    ".orf", ".pef", ".srw", ".3fr", ".fff", ".iiq", ".kdc", ".dcr", ".mrw", ".x3f", ".erf", ".gpr",
+)  # fmt: skip
+"""Suffixes of raw photos."""
+_RAW_TAGS = {"DNGVersion": 50706, "SubIFDs": 330}
+_DAMAGE = re.compile(
+    r"(?:corrupt|premature|inconsistent|invalid sos).*|(?<=TIFF_Error ).*", re.IGNORECASE
+)
+_STDERR = threading.Lock()
 
 
 class DataWarning(UserWarning):
@@ -52,9 +68,14 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
     since a small file can have many pixels of one colour.
     """
     content = read_bytes(path, what)
+    _refuse_raw(content, path, what)
+    pages = 1
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(content)) as header:
             size = header.size
+            check_image_size(*size, what, path)
+            # phones store a second picture behind a JPEG, for other screens
+            pages = 1 if header.format == "MPO" else getattr(header, "n_frames", 1)
     except Image.DecompressionBombError as error:
         raise DataError(
             f"{what} has an impossible size",
@@ -62,13 +83,65 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
             found=error,
             expected=f"at most {MAX_PIXELS} pixels",
         ) from None
+    except DataError:
+        raise
     except Exception:  # OpenCV may read formats that Pillow does not
-        size = (1, 1)
-    check_image_size(*size, what, path)
-    image = None
-    with contextlib.suppress(cv2.error):
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    return _decode_by_pillow(content, path, what) if image is None else np.asarray(image)
+        pages = 1
+    if pages > 1:
+        text = f"{path}: holds {pages} pages or frames; the first one is used"
+        warnings.warn(text, DataWarning, stacklevel=3)
+    image, said = _decode_by_opencv(content)
+    if said:
+        text = f"{path}: is damaged, so that parts of it may be wrong ({said}); copy it again"
+        warnings.warn(text, DataWarning, stacklevel=3)
+    return _decode_by_pillow(content, path, what) if image is None else image
+
+
+def _refuse_raw(content: bytes, path: PathLike, what: str) -> None:
+    """Raise DataError for a raw photo, of which decoders read the thumbnail."""
+    found = "its suffix" if Path(path).suffix.lower() in RAW else ""
+    if content[8:10] == b"CR":
+        found = "the mark of Canon"
+    with contextlib.suppress(Exception):  # of other files, or damaged
+        directory = TiffImagePlugin.ImageFileDirectory_v2(content[:8])
+        stream = io.BytesIO(content)
+        stream.seek(directory.next)
+        directory.load(stream)
+        tags = [name for name, tag in _RAW_TAGS.items() if tag in directory]
+        # NewSubfileType: a reduced picture of another one in the file
+        tags += ["NewSubfileType"] if int(directory.get(254, 0)) & 1 else []
+        found = f"TIFF tag {tags[0]}" if tags else found
+    if found:
+        raise DataError(
+            f"{what} is a raw photo or holds further pictures, and would give its thumbnail",
+            where=path,
+            found=found,
+            expected="one developed picture of 8 or 16 bits",
+            hint="develop it first, for example by RawTherapee, darktable or rawpy, and save it as"
+            " 16-bit TIFF or PNG",
+        )
+
+
+def _decode_by_opencv(content: bytes) -> tuple[NDArray[Any] | None, str]:
+    """Image as stored, None if OpenCV cannot decode it, and what is damaged.
+
+    Decoders of JPEG and TIFF print that to the standard error of the process only.
+    """
+    said = b""
+    with _STDERR, tempfile.TemporaryFile() as file, contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # there may be no standard error
+            saved = os.dup(2)
+            stack.callback(os.close, saved)
+            stack.callback(os.dup2, saved, 2)
+            os.dup2(file.fileno(), 2)
+        image = None
+        with contextlib.suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        stack.close()
+        file.seek(0)
+        said = file.read()
+    damage = _DAMAGE.search(said.decode(errors="replace"))
+    return None if image is None else np.asarray(image), damage.group()[:100] if damage else ""
 
 
 def _decode_by_pillow(content: bytes, path: PathLike, what: str) -> NDArray[np.uint8]:
@@ -139,7 +212,8 @@ def read_images(
 
     8 and 16 bit, grey, RGB and RGBA are accepted. Grey is repeated in the three channels, and alpha
     is dropped. 16-bit values v become 255 v / white; without `white`, the range of the values of
-    all pictures between the percentiles `OUTER` becomes 0 to 255. An image with an EXIF rotation is
+    all pictures between the percentiles `OUTER` becomes 0 to 255, 8-bit ones beside them (times
+    257) included. An image with an EXIF rotation is
     rejected unless `turn` is set, since its camera may be that of either orientation.
 
     Args:
@@ -157,6 +231,10 @@ def read_images(
         DataWarning: 16-bit images without `white`; the warning names the values.
     """
     images = [_colours(path, turn) for path in paths]
+    depths = {image.dtype for image in images}
+    if len(depths) > 1 and white is None:
+        # one stretch for all
+        images = [np.uint16(257) * x if x.dtype == np.uint8 else x for x in images]
     deep = [image for image in images if image.dtype == np.uint16]
     low, high = 0.0, float(white or 0)
     if deep and white is None:
@@ -165,8 +243,9 @@ def read_images(
         low, high = np.percentile(values, OUTER)
         least, most = min(x.min() for x in deep), max(x.max() for x in deep)
         names = ", ".join(str(path) for path in paths)
+        beside = " beside 8 bit, which are taken times 257" if len(depths) > 1 else ""
         warnings.warn(
-            f"{names}: 16 bit, values {least} to {most}; {low:.0f} to {high:.0f}"
+            f"{names}: 16 bit{beside}, values {least} to {most}; {low:.0f} to {high:.0f}"
             " become black to white; the key white of the input (4095 for 12 bits) sets 0 to white",
             DataWarning,
             stacklevel=3,
