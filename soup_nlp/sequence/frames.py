@@ -1,6 +1,7 @@
 """Frames of a sequence, of image files, a video or a rendered scene; key frames by parallax."""
 
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Image
-from soup_nlp.data.formats.images import RAW, read_image
+from soup_nlp.data.formats.images import RAW, DataWarning, read_image
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.geometry.rotation import exp
@@ -30,7 +31,11 @@ IMAGES = (
     # these are found, so that the message can say that they must be converted
     *(".heic", ".heif", *RAW),
 )
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
+VIDEOS = (
+    ".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mts", ".m2ts", ".ts", ".3gp", ".mpg",
+    ".mpeg", ".wmv", ".flv", ".gif", ".mxf", ".vob",
+)  # fmt: skip
+"""Suffixes by which a message knows a video; any file that is no image is tried as one."""
 DEPTHS = (".png", ".npy", ".pfm", ".dpt")
 """Suffixes of depth maps."""
 PROBED = 3
@@ -108,7 +113,7 @@ def find_images(source: Path) -> list[Path]:
             expected="a folder of images, a pattern in quotes, a video, or scene:NAME",
             hint=None if chosen or source.exists() else "check the name; nothing matches it",
         )
-    return sorted(chosen, key=lambda path: [_by_number(part) for part in path.parts])
+    return in_order(chosen)
 
 
 def find_depths(images: list[Path]) -> list[Path]:
@@ -137,7 +142,7 @@ def depth_files(folder: Path) -> list[Path]:
         raise DataError(
             "folder holds no depth maps", where=folder, expected="one for every frame of the chain"
         )
-    return sorted(depths, key=lambda path: _by_number(path.name))
+    return in_order(depths)
 
 
 def check_sizes(images: Sequence[Path], turn: bool) -> None:
@@ -182,13 +187,28 @@ def check_sequence(images: list[Path]) -> None:
         )
 
 
+def is_video(path: Path) -> bool:
+    """Whether a source of frames is to be read as a video: any file that is no image."""
+    suffix = path.suffix.lower()
+    return suffix in VIDEOS or (path.is_file() and suffix not in IMAGES)
+
+
 def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = None) -> list[Path]:
     """Write every `stride`-th frame of a video as PNG into a folder; returns their paths.
 
     Raises:
         DataError: the video cannot be read, or the folder holds other files of these names.
     """
-    path = require_file(path, "video")
+    # FFmpeg takes a name such as 10:05:07.mp4 for an address, and reads text as pictures of it
+    path = require_file(path, "video").absolute()
+    unreadable = {
+        "where": path,
+        "expected": "a video that FFmpeg reads, of two frames at least",
+        "hint": "convert it, for example by ffmpeg -i FILE video.mp4, or give a folder of images",
+    }
+    with path.open("rb") as file:
+        if b"\0" not in file.read(4096):
+            raise DataError("file is neither an image nor a video", found="text", **unreadable)
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -211,7 +231,7 @@ def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = N
         video.release()
         if len(names) < 2:
             raise DataError(
-                "video has fewer than two readable frames", where=path, found=len(names)
+                "video has fewer than two readable frames", found=len(names), **unreadable
             )
     return [folder / name for name in names]
 
@@ -222,9 +242,45 @@ def _shorter(path: Path) -> list[Path]:
     return [path.with_name(".".join(words[:k])) for k in range(1, len(words))]
 
 
-def _by_number(name: str) -> list[Any]:
-    """Sort key that orders numbers and decimals by value: 9, 9.5, 10."""
-    words = re.split(r"(\d+(?:\.\d+)?)", name)
+def in_order(paths: Sequence[Path]) -> list[Path]:
+    """Files by the numbers in their names.
+
+    Digits around a point are a decimal (9.25, 9.5, 10.0) or two numbers (0.8, 0.9, 0.10), the same
+    for all files. A decimal has no zero at its end, and a number none before it, unless all have
+    as many digits.
+
+    Warns:
+        DataWarning: both are possible, and the orders differ.
+    """
+    decimals, numbers = (
+        sorted(paths, key=lambda path: [_by_number(part, digits) for part in path.parts])
+        for digits in (r"(\d+(?:\.\d+)?)", r"(\d+)")
+    )
+    if decimals == numbers:
+        return decimals
+    varying = {
+        part for parts in zip(*(p.parts for p in paths)) if len({*parts}) > 1 for part in parts
+    }
+    tails = [tail for part in varying for tail in re.findall(r"\d+\.(\d+)", part)]
+    shortest = min(map(len, tails), default=0)
+    no_decimal = any(len(tail) > 1 and tail[-1] == "0" for tail in tails)
+    no_number = any(len(tail) > shortest and tail[0] == "0" for tail in tails)
+    if no_decimal != no_number:
+        return numbers if no_decimal else decimals
+    warnings.warn(
+        f"{paths[0].parent}: the order of the frames is not clear; taken as decimals:"
+        f" {', '.join(path.name for path in decimals[:4])} ..., not as numbers:"
+        f" {', '.join(path.name for path in numbers[:4])} ...; zeros before the numbers"
+        " make it clear",
+        DataWarning,
+        stacklevel=3,
+    )
+    return decimals
+
+
+def _by_number(name: str, digits: str) -> list[Any]:
+    """Sort key that orders what matches `digits` by value."""
+    words = re.split(digits, name)
     return [(1, Decimal(word), "") if k % 2 else (0, 0, word) for k, word in enumerate(words)]
 
 

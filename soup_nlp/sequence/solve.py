@@ -22,13 +22,13 @@ from soup_nlp.sequence.folder import ROWS, SINGLE, chain_files, write_chain
 from soup_nlp.sequence.frames import (
     MAX_STEP,
     PROBED,
-    VIDEOS,
     Frames,
     Raw,
     check_sequence,
     check_sizes,
     find_depths,
     find_images,
+    is_video,
     key_frames,
     video_frames,
 )
@@ -289,7 +289,7 @@ def _frames(
     end = most if step else None
     if not isinstance(source, str | Path):
         images = _files(source, out)[:: step or 1][:end]
-    elif (path := as_path(source, "frames", home=True)).suffix.lower() in VIDEOS:
+    elif is_video(path := as_path(source, "frames", home=True)):
         read = None if most is None or step else most * MAX_STEP
         images = video_frames(path, out / "frames", step or 1, end or read)
     else:

@@ -1,5 +1,8 @@
 """Frames of a sequence: files, videos and scenes; which of them are refused or left out."""
 
+import warnings
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ from soup_nlp.sequence.frames import (
     Frames,
     find_depths,
     find_images,
+    in_order,
+    is_video,
     key_frames,
     parallax,
     video_frames,
@@ -73,9 +78,46 @@ def test_frames_of_a_folder_a_pattern_and_a_video(tmp_path):
     found = video_frames(tmp_path / "a.avi", tmp_path / "frames", stride=2)
     levels = [cv2.imread(str(p)).mean() for p in found]
     np.testing.assert_allclose(levels, [0, 100, 200], atol=3)
-    (tmp_path / "b.mp4").write_bytes(b"no video")
-    with pytest.raises(DataError, match="video"):
-        video_frames(tmp_path / "b.mp4", tmp_path / "frames2")
+    whole = (tmp_path / "a.avi").read_bytes()
+    for content, match in ((b"text", "neither"), (b"RIFF\0", "fewer"), (whole[:6000], "fewer")):
+        (tmp_path / "b.mp4").write_bytes(content)
+        with pytest.raises(DataError, match=rf"{match}[\s\S]*expected: [\s\S]*try: "):
+            video_frames(tmp_path / "b.mp4", tmp_path / "frames2")
+
+
+@pytest.mark.parametrize(
+    "name", ["10:05:07.mp4", "00001.MTS", "a.ts", "clip", "file:a.3gp", "a.gif"]
+)
+def test_any_file_that_is_no_image_is_read_as_a_video(name, tmp_path, monkeypatch):
+    make_video(tmp_path / "a.avi", 3)
+    (tmp_path / "a.avi").rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert is_video(Path(name))
+    assert len(video_frames(Path(name), tmp_path / "frames")) == 3
+
+
+@pytest.mark.parametrize(
+    ("names", "warned"),
+    [
+        # numbers behind a point: no decimal ends with 0
+        (["cam0.8", "cam0.9", "cam0.10", "cam0.11"], False),
+        (["v1.9.1", "v1.10.1", "v1.20.1"], False),
+        (["05", "99", "100"], False),
+        # decimals: a number has no 0 before it
+        (["9.0", "9.05", "9.5", "10.0"], False),
+        (["1305031102.17", "1305031102.175", "1305031102.2"], True),
+        (["9.8", "9.9", "10.1", "10.5"], False),
+        # either
+        (["0.11", "0.8", "0.9"], True),
+        (["9", "9.25", "9.5", "10"], True),
+    ],
+)
+def test_numbers_around_a_point(names, warned, tmp_path):
+    paths = [tmp_path / "v1.10" / f"{name}.png" for name in names]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert in_order(paths[::-1]) == paths
+    assert ["is not clear" in str(w.message) for w in caught] == [True] * warned
 
 
 @pytest.mark.parametrize(
@@ -83,7 +125,6 @@ def test_frames_of_a_folder_a_pattern_and_a_video(tmp_path):
     [
         (["IMG_1.jpg", "._IMG_1.jpg", "IMG_2.jpg", ".x.png"], ["IMG_1.jpg", "IMG_2.jpg"]),
         (["x.jpg", "x.jpg.png", "y.jpg", "y.jpg.mask.png"], ["x.jpg", "y.jpg"]),
-        (["10.png", "9.5.png", "9.25.png", "9.png"], ["9.png", "9.25.png", "9.5.png", "10.png"]),
         (
             ["t1305031102175304321.png", "t1305031102175304320.png"],
             ["t1305031102175304320.png", "t1305031102175304321.png"],
