@@ -22,8 +22,18 @@ from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
-from soup_nlp.schema.section import Keys, Positive, Samples, Section, Seed, Share, explain, nearest
-from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.schema.section import (
+    Keys,
+    Positive,
+    Samples,
+    Section,
+    Seed,
+    Share,
+    explain,
+    nearest,
+    texts_expected,
+)
+from soup_nlp.solve.solver_options import SolverOptions, refuse_libraries
 from soup_nlp.start.start_options import StartOptions
 from soup_nlp.storage.files import MOST_YAML, as_path, is_file, is_folder, read_text
 
@@ -167,13 +177,17 @@ def shipped_problems() -> dict[str, Path]:
     return {path.stem: path for path in sorted(home.glob("*.yaml"))}
 
 
-def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
+def load_problem(
+    path: str | Path, overrides: Sequence[str] = (), *, solved: bool = True
+) -> Problem:
     """Read a problem file.
 
     Args:
         path: YAML file, or the bare name of a problem of the package, such as "street", whose
             relative paths start from the working folder.
         overrides: `a.b=value` with the value in YAML.
+        solved: Whether Ipopt may run. If so, the file must not name libraries or files of Ipopt,
+            since whoever wrote it would decide which code runs and which file is overwritten.
 
     Raises:
         ConfigError: the file is missing or not YAML, a key is unknown or given twice, a value is
@@ -189,6 +203,8 @@ def load_problem(path: str | Path, overrides: Sequence[str] = ()) -> Problem:
             found=type(raw).__name__,
             expected="keys such as input: {kind: motorcycle}",
         )
+    if solved:
+        refuse_libraries(raw.get("solver"), str(path))
     raw.setdefault("name", title(path.stem))
     raw.setdefault("base", str(base))
     return make_problem(raw, overrides, where=str(path), lines=lines)
@@ -255,13 +271,19 @@ def make_problem(
         expect(item, str, "override", "text such as 'solver.max_iter=200'")
     expect(where, str, "where", "a name for messages")
     tree = copy.deepcopy(dict(raw))
-    overridden = {_override(tree, item): f"--set {item}" for item in overrides}
-    lines = {**(lines or {}), **overridden}
+    overridden = {_override(tree, item): item for item in overrides}
+    lines = {**(lines or {}), **{keys: f"--set {item}" for keys, item in overridden.items()}}
     tree = with_preset(tree)
     try:
         return Problem.model_validate(tree)
     except ValidationError as error:
-        raise explain(error, Problem, tree, where, lines) from error
+        # --set input.index=000138 is text, though it looks like a number
+        texts = {keys: item.partition("=")[2].strip() for keys, item in overridden.items()}
+        words = [keys for keys in texts_expected(error, tree) if keys in texts]
+        if not words:
+            raise explain(error, Problem, tree, where, lines) from error
+        more = [f"{'.'.join(keys)}={json.dumps(texts[keys])}" for keys in words]
+        return make_problem(raw, [*overrides, *more], where, lines)
 
 
 USUAL = (

@@ -79,7 +79,7 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
     folder = as_path(folder, "exported folder", error=ExportError)
     recover(folder)
     manifest = read_manifest(folder)
-    case = prepare(load_problem(folder / "problem.yaml"))
+    case = prepare(load_problem(folder / "problem.yaml", solved=False))
     form = case.formulation(
         **manifest["formulation"], **manifest["smoothing"], hessian="exact", compiled=False
     )

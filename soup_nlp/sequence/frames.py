@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
-from functools import lru_cache
+from functools import lru_cache, partial
 from glob import glob
 from itertools import pairwise
 from pathlib import Path
@@ -201,14 +201,15 @@ def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = N
     """
     # FFmpeg takes a name such as 10:05:07.mp4 for an address, and reads text as pictures of it
     path = require_file(path, "video").absolute()
-    unreadable = {
-        "where": path,
-        "expected": "a video that FFmpeg reads, of two frames at least",
-        "hint": "convert it, for example by ffmpeg -i FILE video.mp4, or give a folder of images",
-    }
+    refuse = partial(
+        DataError,
+        where=path,
+        expected="a video that FFmpeg reads, of two frames at least",
+        hint="convert it, for example by ffmpeg -i FILE video.mp4, or give a folder of images",
+    )
     with path.open("rb") as file:
         if b"\0" not in file.read(4096):
-            raise DataError("file is neither an image nor a video", found="text", **unreadable)
+            raise refuse("file is neither an image nor a video", found="text")
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -230,9 +231,7 @@ def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = N
             index += 1
         video.release()
         if len(names) < 2:
-            raise DataError(
-                "video has fewer than two readable frames", found=len(names), **unreadable
-            )
+            raise refuse("video has fewer than two readable frames", found=len(names))
     return [folder / name for name in names]
 
 

@@ -27,6 +27,8 @@ DEFAULTS: Mapping[str, Any] = {
     "bound_frac": 1e-6,
     "mumps_permuting_scaling": 0,
     "watchdog_shortened_iter_trigger": 0,
+    # Ipopt would read ipopt.opt of the working folder, which may name a library
+    "option_file_name": "",
 }
 STILL = 2
 """Small changes of f in a row that are a stagnation."""

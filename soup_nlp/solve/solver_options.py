@@ -1,10 +1,26 @@
 """Options of the solver: stages, tolerances, limits."""
 
+from collections.abc import Mapping
 from typing import Annotated
 
 from pydantic import Field
 
+from soup_nlp.errors import ConfigError
 from soup_nlp.schema.section import Count, NonNegative, Positive, Section, Tolerance, Whole
+
+
+def refuse_libraries(section: object, where: str) -> None:
+    """Raise ConfigError for options of Ipopt by which a file could load code or write files."""
+    ipopt = section.get("ipopt") if isinstance(section, Mapping) else None
+    for key, value in ipopt.items() if isinstance(ipopt, Mapping) else ():
+        if str(key).endswith("lib") or str(key) in ("option_file_name", "output_file"):
+            raise ConfigError(
+                "a problem file must not name a library or a file of Ipopt",
+                where=f"{where}, key solver.ipopt.{key}",
+                found=value,
+                expected="options of numbers and words",
+                hint=f"leave it out; --set solver.ipopt.{key}=PATH is your own word",
+            )
 
 
 class SolverOptions(Section):

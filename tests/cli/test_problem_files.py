@@ -59,8 +59,8 @@ OF_ANOTHER_TAG = ("!!bool 5", "!!timestamp x", "!!int [1]", "!!float [1]")
         ("input: 3\n", ["key input", "found: 3", "a section with keys of its own"]),
         ("input: {kind: scene, scene: stret}\n", ["input.scene", "did you mean street?"]),
         (
-            "input: {kind: kitti2012, root: x, index: 138}\n",
-            ["key input.index", "found: 138", 'write it in quotes: "138"'],
+            "input: {kind: sintel, root: x, frame: 1, scene: 0138}\n",
+            ["key input.scene", "found: 138", "write it in quotes, with its leading zeros"],
         ),
         (
             "input: {kind: files, ref: a, next: b, intrinsics: [1, 2, 3]}\n",
@@ -108,6 +108,32 @@ def test_an_override_is_checked_like_the_file(override, parts):
         make_problem({"input": {"kind": "motorcycle"}}, [override])
     for part in parts:
         assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["hsllib", "pardisolib", "option_file_name", "output_file"])
+def test_a_file_names_no_library_of_ipopt(key, tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(f"{MOTORCYCLE}solver: {{ipopt: {{{key}: ./evil.so}}}}")
+    for overrides in ([], [f"solver.ipopt.{key}=mine.so"]):
+        with pytest.raises(ConfigError, match=rf"library[\s\S]*{key}[\s\S]*--set solver.ipopt"):
+            load_problem(path, overrides)
+    path.write_text(MOTORCYCLE)
+    assert load_problem(path, [f"solver.ipopt.{key}=mine.so"]).solver.ipopt == {key: "mine.so"}
+
+
+def test_a_text_of_digits_needs_no_quotes_on_the_command_line(tmp_path):
+    raw = {"input": {"kind": "kitti2015", "root": "."}}
+    for text in ("000138", "138", '"000138"'):
+        assert int(make_problem(raw, [f"input.index={text}"]).input.index) == 138
+    (tmp_path / "a.yaml").write_text("input: {kind: kitti2012, root: ., index: 000138}")
+    assert load_problem(tmp_path / "a.yaml").input.index == "000138"
+    raw = {"input": {"kind": "vkitti1", "root": ".", "frame": 1}}
+    assert make_problem(raw, ["input.scene=0001"]).input.scene == "0001"
+    with pytest.raises(ConfigError, match="in quotes"):
+        make_problem({**raw, "input": {**raw["input"], "scene": 1}})
+    # where a list would do as well
+    with pytest.raises(ConfigError, match="list"):
+        make_problem({"input": {"kind": "files", "ref": "a", "next": "b"}}, ["input.intrinsics=5"])
 
 
 def test_show_prints_what_users_turn_and_what_differs(capsys):

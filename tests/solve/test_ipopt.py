@@ -170,7 +170,10 @@ def test_a_wrong_ipopt_option_is_a_solver_error(options):
     assert "textbook" in str(caught.value)
 
 
-def test_options_reach_ipopt(tmp_path):
+def test_options_reach_ipopt(tmp_path, monkeypatch):
+    # Ipopt's own file of options in the working folder is not read
+    (tmp_path / "ipopt.opt").write_text("max_iter 0\nhsllib ./evil.so\n")
+    monkeypatch.chdir(tmp_path)
     nlp, log = hs071(), tmp_path / "ipopt.log"
     Ipopt(nlp, {"mu_init": 0.123})(x0=nlp.x0, watch=Watch(log_file=str(log)))
     text = log.read_text()
@@ -178,6 +181,7 @@ def test_options_reach_ipopt(tmp_path):
     assert "lg(mu)" in text
     stage = Ipopt(nlp, {"mu_init": 0.123})(x0=nlp.x0)
     assert stage.history["mu"][0] == pytest.approx(0.123)
+    assert stage.converged
 
 
 def test_the_iteration_limit_keeps_the_best_iterate():

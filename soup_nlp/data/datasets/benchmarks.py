@@ -4,7 +4,7 @@ import re
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator
+from pydantic import BeforeValidator
 
 from soup_nlp.data.datasets.layout import Folder, PairInput, Resolve, make_pair
 from soup_nlp.data.formats.camera_files import check_intrinsics, read_cam, read_rows
@@ -60,10 +60,10 @@ DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
 DEFAULT_SCENE = "alley_1"
 
 
-def _is_pair_number(index: str) -> str:
-    if not re.fullmatch(r"[0-9]{1,6}", index):
-        raise ValueError("1 to 6 digits, such as '27' or '000027'")
-    return index
+def _pair_number(index: object) -> str:
+    if isinstance(index, bool) or not re.fullmatch(r"[0-9]{1,6}", str(index)):
+        raise ValueError("1 to 6 digits, such as 27 or '000027'")
+    return f"{int(str(index)):06d}"
 
 
 class KittiInput(PairInput):
@@ -77,16 +77,15 @@ class KittiInput(PairInput):
     """Kind of input."""
     root: str
     """Folder that holds training/."""
-    index: Annotated[str, AfterValidator(_is_pair_number)]
-    """Six digits in quotes, such as "000138"."""
+    index: Annotated[str, BeforeValidator(_pair_number)]
+    """Number of the pair, such as 138 or "000138"."""
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
         names, calib, projections, disparities = _KITTI[self.kind]
         folder = Folder(path(self.root), KITTI_LAYOUT.format(*_KITTI[self.kind]), "training")
-        name = f"{int(self.index):06d}"
-        images = [folder.need(f"{names}/{name}_{k}.png") for k in (10, 11)]
-        calibration = folder.need(f"{calib}/{name}.txt")
+        images = [folder.need(f"{names}/{self.index}_{k}.png") for k in (10, 11)]
+        calibration = folder.need(f"{calib}/{self.index}.txt")
         left, right = read_rows(calibration, projections, 12).reshape(2, 3, 4)
         K = left[:, :3].copy()
         baseline = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
@@ -97,7 +96,7 @@ class KittiInput(PairInput):
                 found=f"{baseline:g} m",
                 expected="a positive length (0.53 to 0.55 m in KITTI)",
             )
-        file = f"{{}}/{name}_10.png".format
+        file = f"{{}}/{self.index}_10.png".format
         disparity = folder.read(read_depth_png16, file(disparities), scale=KITTI_DISPARITY)
         objects = folder.read(decode, file("obj_map"), what="object map")
         truth = Truth(
@@ -105,7 +104,7 @@ class KittiInput(PairInput):
             flow=folder.read(read_flow, file("flow_occ")),
             components=None if objects is None else objects.astype(np.int32),
         )
-        return make_pair(images, [K, K], truth, f"{self.kind}_{name}")
+        return make_pair(images, [K, K], truth, f"{self.kind}_{self.index}")
 
 
 class SceneFrames(PairInput):
