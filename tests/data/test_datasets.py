@@ -162,7 +162,7 @@ def test_kitti_errors(tmp_path: Path, kind: str) -> None:
     with raises(rf"000008_10\.png[\s\S]*expected: training/{images}[\s\S]*{calibration}"):
         load(kind, root, index="8")
     for index in ("seven", "-7", ""):
-        with pytest.raises(ConfigError, match=r"input\.index[\s\S]*such as '27' or '000027'"):
+        with pytest.raises(ConfigError, match=r"input\.index[\s\S]*such as 27 or '000027'"):
             load(kind, root, index=index)
     for text, match in {
         CAMERAS.format(left, "P9"): f"lacks the numbers of {right}:",
