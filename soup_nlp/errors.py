@@ -86,6 +86,21 @@ class StoppedError(SoupError):
     """A run was told to stop before it had a start, so that there is nothing to keep."""
 
 
+def one_line(value: object, what: str) -> str:
+    """A text that names something, if it fits on a line of a file, a page or a terminal.
+
+    Raises:
+        DataError: it is no text of 1 to 100 printable characters.
+    """
+    if not (isinstance(value, str) and 0 < len(value) <= 100 and value.isprintable()):
+        raise DataError(
+            f"{what} is no short text",
+            found=printable(repr_of(value), 60),
+            expected="1 to 100 printable characters on one line",
+        )
+    return value
+
+
 def expect(value: object, kinds: type | tuple[type, ...], what: str, make: str) -> None:
     """Raise DataError unless an argument has an accepted type.
 

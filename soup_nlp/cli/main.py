@@ -42,7 +42,7 @@ def print_warning(
     from soup_nlp.data.formats.images import DataWarning
 
     if issubclass(category, DataWarning):
-        print(f"warning: {message}", file=sys.stderr)
+        print(f"warning: {printable(message)}", file=sys.stderr)
 
 
 def report_bug(error: BaseException) -> int:

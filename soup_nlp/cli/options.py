@@ -20,7 +20,7 @@ from rich.progress import Progress as Bars
 from soup_nlp.config.presets import PRESETS
 from soup_nlp.config.problem import Problem as ProblemFile
 from soup_nlp.data.formats.images import DataWarning
-from soup_nlp.errors import ConfigError, StoppedError
+from soup_nlp.errors import ConfigError, StoppedError, printable
 from soup_nlp.schema.limits import MAX_SEED
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.progress import Progress
@@ -283,11 +283,11 @@ class SolveLog(logging.Handler):
 
     def _warn(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         if issubclass(category, DataWarning):
-            self._announce_once(f"warning: {message}", warning=True)
+            self._announce_once(f"warning: {printable(message)}", warning=True)
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message of the logger of the package, unless it was printed before."""
-        self._announce_once(record.getMessage())
+        self._announce_once(printable(record.getMessage()))
 
     def _announce_once(self, line: str, warning: bool = False) -> None:
         if line not in self._announced:

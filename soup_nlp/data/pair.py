@@ -23,7 +23,7 @@ from soup_nlp.data.accept import (
 from soup_nlp.data.formats.cameras import estimated_cameras
 from soup_nlp.data.formats.images import read_images
 from soup_nlp.data.formats.map_files import UNKNOWN_FLOW, flow_layout, read_flow
-from soup_nlp.errors import DataError, expect, repr_of
+from soup_nlp.errors import DataError, expect, one_line, repr_of
 
 SHORTEST = 0.05
 """Smallest focal length relative to the side of the image (168 degrees of view)."""
@@ -167,6 +167,7 @@ class Truth:
     unit: str = "m"
 
     def __post_init__(self) -> None:
+        one_line(self.unit, "unit of the truth")
         for name, (axes, kinds) in _PARTS.items():
             value = getattr(self, name)
             if value is None:
@@ -254,7 +255,7 @@ class Pair:
 
     def __post_init__(self, fov: float | None) -> None:
         put = partial(object.__setattr__, self)
-        expect(self.name, str, "name of the pair", "text")
+        one_line(self.name, "name of the pair")
         truths = "soup_nlp.Truth(depth_ref=..., ...) or None"
         expect(self.truth, (Truth, NoneType), "truth of the pair", truths)
         # files may have EXIF, and 16-bit files have one range of values

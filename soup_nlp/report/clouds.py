@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.errors import printable
 from soup_nlp.geometry.camera import project
 from soup_nlp.report.chain import AXES, STILL, Chain, Frame
 from soup_nlp.storage.files import PathLike, write_bytes
@@ -43,7 +44,7 @@ def write_ply(
         rgb: (..., 3) uint8 colours, same leading shape.
         normals: (..., 3) unit normals, same leading shape, or None.
         scalars: (...) numbers by the name of their property, such as "confidence".
-        comments: Lines of the header, ASCII.
+        comments: Lines of the header.
 
     Returns:
         The number of points written.
@@ -63,14 +64,14 @@ def write_ply(
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        *(f"comment {line}" for line in comments),
+        *(f"comment {printable(line)}" for line in comments),
         f"element vertex {len(table)}",
         *(f"property float {name}" for name in floats),
         *(f"property uchar {name}" for name in ("red", "green", "blue")),
         "end_header",
     ]
     text = "\n".join(header) + "\n"
-    write_bytes(path, text.encode("ascii", "replace") + table.tobytes())
+    write_bytes(path, text.encode("ascii", "backslashreplace") + table.tobytes())
     return len(table)
 
 

@@ -15,6 +15,7 @@ from PIL import Image as Pil
 from PIL import ImageDraw, ImageFont
 
 from soup_nlp.arrays import AnyFloat, Image
+from soup_nlp.errors import printable
 from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.storage.files import PathLike, write_bytes
 
@@ -121,6 +122,7 @@ def _write(
     side: str = "l",
 ) -> None:
     """Draw text with its left end, middle or right end (`side`) at (x, y), shrunk to `room`."""
+    text = printable(text)  # Pillow measures no lines
     wide = _font(points).getlength(text)
     font = _font(points * min(1.0, room / max(wide, 1.0)))
     ImageDraw.Draw(sheet).text((x, y), text, fill="black", font=font, anchor=f"{side}m")

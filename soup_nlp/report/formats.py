@@ -145,7 +145,7 @@ def write_tum(path: Path, chain: Chain) -> None:
     lines = [
         "# timestamp tx ty tz qx qy qz qw: position and orientation of the camera in the first"
         " frame's camera coordinates",
-        f"# axes: {AXES}; timestamp: frame number; unit: {chain.unit}",
+        printable(f"# axes: {AXES}; timestamp: frame number; unit: {chain.unit}"),
     ]
     for k, pose in enumerate(chain.world_from_camera):
         lines.append(f"{k} " + " ".join(f"{x:.9g}" for x in (*pose.t, *pose.quaternion)))

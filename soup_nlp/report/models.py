@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, printable
 from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.surface import triangles, whole_cells
 from soup_nlp.report.chain import STILL, Chain, Frame
@@ -132,7 +132,7 @@ def write_colmap(folder: Path, chain: Chain) -> None:
         )
     ]
     head = [
-        f"# {chain.name}; unit: {chain.unit}",
+        printable(f"# {chain.name}; unit: {chain.unit}"),
         "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
     ]
     write_text(model / "points3D.txt", "\n".join([*head, *rows]) + "\n")

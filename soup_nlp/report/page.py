@@ -98,10 +98,15 @@ def preformatted(lines: Sequence[str]) -> str:
     return "<pre>" + escape("\n".join(lines)) + "</pre>"
 
 
+class Markup(str):
+    """HTML of the program itself, which is not escaped."""
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in HTML; cells are HTML."""
+    """A table in HTML; cells are text, or `Markup`."""
     top = "".join(f"<th>{escape(h)}</th>" for h in head)
-    body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
+    cells = [[c if isinstance(c, Markup) else escape(c) for c in row] for row in rows]
+    body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in cells)
     return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
 
 
@@ -193,10 +198,10 @@ def _components(result: Result) -> str:
         name = "0, the camera's motion" if part.label == 0 else str(part.label)
         rows.append(
             [
-                swatch(colours[part.label]) + name,
+                Markup(swatch(colours[part.label]) + escape(name)),
                 f"{part.pixels / result.labels.size:.1%}",
-                f"{motion.angle:.2f}&deg;",
-                f"{shift:.3g} {escape(result.length)}",
+                f"{motion.angle:.2f}\N{DEGREE SIGN}",
+                f"{shift:.3g} {result.length}",
                 f"{part.residual_px:.2g} px",
             ]
         )

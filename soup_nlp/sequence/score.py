@@ -1,6 +1,7 @@
 """Errors of a chain: depth with one scale for all or one for each frame, and the camera path."""
 
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluate.metrics import MEDIAN, UNSCALED, depth_metrics
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import certainty_lines, guess_line
-from soup_nlp.report.page import headline, page, paths, preformatted, table
+from soup_nlp.report.page import Markup, headline, page, paths, preformatted, table
 from soup_nlp.report.verdict import sectioned
 from soup_nlp.sequence.links import MAX_GUESSED
 
@@ -175,7 +176,7 @@ def chain_page(chain: Chain) -> str:
     """The page of a chain."""
     rows = [
         [
-            f'<i style="background:{colour}"></i>' + name,
+            Markup(f'<i style="background:{escape(colour)}"></i>{escape(name)}'),
             f"{first} to {first + len(points) - 1}",
             f"{length:.3g}",
         ]

@@ -140,7 +140,7 @@ def read_text(
 
 
 def parse_json(text: str) -> Any:
-    """The value of a JSON text, with escaped control characters in strings.
+    """The value of a JSON text; its strings are made printable on one line.
 
     Raises:
         ValueError: it is not JSON, is nested too deeply, or has a number that is no float64.
@@ -174,7 +174,7 @@ def _whole(text: str) -> int:
 
 
 def _plain(value: Any, level: int) -> Any:
-    """The value with control characters of strings escaped.
+    """The value with its strings on one line each, control characters escaped.
 
     Raises:
         ValueError: it is nested too deeply.
@@ -182,7 +182,7 @@ def _plain(value: Any, level: int) -> Any:
     if level > DEEPEST:
         raise ValueError(f"brackets are nested more than {DEEPEST} deep")
     if isinstance(value, str):
-        return "\n".join(printable(line) for line in value.split("\n"))
+        return printable(value)
     if isinstance(value, Mapping):
         return {printable(key): _plain(item, level + 1) for key, item in value.items()}
     if isinstance(value, list):

@@ -1,0 +1,59 @@
+"""Names and units with lines, escapes and HTML: refused at the door, harmless at every exit."""
+
+import json
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from soup_nlp.cli.main import print_warning
+from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.data.pair import Pair, Truth
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.report.clouds import write_ply
+from soup_nlp.report.figures import strip
+from soup_nlp.report.formats import write_tum
+from soup_nlp.report.page import Markup, table
+from soup_nlp.report.pictures import Picture
+from soup_nlp.storage.files import read_json
+
+HOSTILE = "m\nend_header\r\x1b[31m\u2028\u202e<img src=x onerror=alert(1)>\x85\ud800"
+IMAGE = np.zeros((8, 8, 3), np.uint8)
+
+
+@pytest.mark.parametrize("text", [HOSTILE, "", "a\nb", "\x1b[31m", "\u202e", "x" * 101, 3, None])
+def test_a_name_or_unit_is_one_line_of_text(text: object) -> None:
+    with pytest.raises(DataError, match=r"unit of the truth[\s\S]*expected: 1 to 100 printable"):
+        Truth(unit=text)
+    with pytest.raises(DataError, match=r"name of the pair[\s\S]*expected: 1 to 100 printable"):
+        Pair(IMAGE, IMAGE, (8, 8, 3.5, 3.5), name=text)
+
+
+def test_text_of_a_stored_file_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(json.dumps({"unit": HOSTILE, HOSTILE: [HOSTILE]}))
+    stored = read_json(tmp_path / "a.json", "a")
+    for text in (stored["unit"], *stored, *stored[[*stored][1]]):
+        assert text.isprintable()
+
+
+def test_text_leaves_no_file_broken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    count = write_ply(tmp_path / "a.ply", np.ones((5, 3)), np.ones((5, 3)), comments=[HOSTILE])
+    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    assert count == 5
+    assert len(body) == 5 * (12 + 3)
+    assert [line.split()[0] for line in header.decode("ascii").splitlines()].count("comment") == 1
+    chain = SimpleNamespace(unit=HOSTILE, world_from_camera=[RigidMotion(np.eye(3), np.zeros(3))])
+    write_tum(tmp_path / "a.tum", chain)
+    lines = (tmp_path / "a.tum").read_text().splitlines()
+    assert [line[0] for line in lines] == ["#", "#", "0"]
+    cells = table([HOSTILE], [[HOSTILE, Markup("<i></i>")]])
+    assert "<img" not in cells
+    assert "<i></i>" in cells
+    assert strip([Picture("depth", HOSTILE, IMAGE)], HOSTILE).size
+    with warnings.catch_warnings():
+        print_warning(HOSTILE.replace("\ud800", ""), DataWarning)
+    said = capsys.readouterr().err
+    assert said.removesuffix("\n").isprintable()
