@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from soup_nlp.arrays import Float
+from soup_nlp.data.formats.images import interlaced
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
 
@@ -89,7 +90,9 @@ def guess_words(shares: Mapping[str, float], of: str = "") -> str:
 
 
 def _parts(shares: Mapping[str, float], names: tuple[str, ...]) -> str:
-    return ", ".join(f"{shares[k]:.0%} {SHARES[k]}" for k in names if shares.get(k, 0.0) >= LEAST)
+    """The shares that are worth a mention, or else the largest one."""
+    large = [f"{shares[k]:.0%} {SHARES[k]}" for k in names if shares.get(k, 0.0) >= LEAST]
+    return ", ".join(large) or f"mostly {SHARES[max(names, key=lambda k: shares.get(k, 0.0))]}"
 
 
 def found_words(run: Run) -> list[str]:
@@ -190,6 +193,13 @@ def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
     if _unmatched(float(usable.mean()), shares["guess"]):
         # what the little flow suggests (no parallax, a wrong camera) is no cause
         return ["two frames of the same scene, closer in time: hardly anything is in both"]
+    if any(map(interlaced, (run.pair.image_ref, run.pair.image_next))):
+        out.append("frames that are not interlaced (ffmpeg -i FILE -vf yadif)")
+    if shares.get("fixed", 0.0) >= LEAST:
+        out.append(
+            "frames without what stands still in the image while the camera moves (a watermark, a"
+            " logo, the bonnet of its car)"
+        )
     if usable.mean() < USABLE:
         fast = length > FAST * uv.shape[1]
         out.append("frames closer in time" if fast else "a better flow (--flow)")

@@ -202,6 +202,18 @@ def test_8_bits_beside_16_are_stretched_alike(factor: int, tmp_path: Path) -> No
     np.testing.assert_array_equal(eight, image[:, :, ::-1])
 
 
+def test_an_interlaced_picture_gives_a_warning(tmp_path: Path) -> None:
+    pair = render_scene("orbit", 0, 320, 136)
+    both = pair.image_ref.copy()
+    both[1::2] = pair.image_next[1::2]
+    for image, combed in ((pair.image_ref, False), (both, True)):
+        Image.fromarray(image).save(tmp_path / "a.png")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_image(tmp_path / "a.png")
+        assert ["looks interlaced" in str(w.message) for w in caught] == [True] * combed
+
+
 # --- pictures of more than 8 bits ----------------------------------------------------------------
 
 

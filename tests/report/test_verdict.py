@@ -78,6 +78,16 @@ def test_hints_name_what_would_help(small_run):
     (told,) = findings.hints(small_run, {**shares, "rest": 0.9})
     assert "moves aside" in told
     assert findings.hints(small_run, dict.fromkeys(shares, 0.0)) == []
+    (told,) = findings.hints(small_run, {**dict.fromkeys(shares, 0.0), "fixed": 0.02})
+    assert "a watermark" in told
+    combed = np.random.default_rng(0).integers(0, 40, small_run.pair.image_ref.shape, np.uint8)
+    combed[::2] += 100
+    pair = replace(small_run.pair, image_ref=combed)
+    (told,) = findings.hints(replace(small_run, pair=pair), dict.fromkeys(shares, 0.0))
+    assert "not interlaced" in told
+    # a small guess of many small parts has a reason, too
+    small = {**dict.fromkeys(shares, 0.0), "guess": 0.006, "unseen": 0.004, "weak": 0.002}
+    assert findings.guess_words(small).endswith(": mostly no usable flow")
     weak = {**dict.fromkeys(shares, 0.0), "weak": 0.4}
     assert findings.hints(seen(small_run, focal=0.1), weak) == []
     (told,) = findings.hints(seen(small_run, focal=0.3), weak)
