@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.camera_files import check_intrinsics, read_intrinsics
 from soup_nlp.data.formats.images import read_image
-from soup_nlp.data.formats.map_files import known_depth, read_depth
+from soup_nlp.data.formats.map_files import known_depth, read_prior
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import check_image_size
@@ -83,7 +83,7 @@ def prior_of(source: object) -> Float:
         DataError: it is neither a map nor the path of a map file.
     """
     if is_path(source):
-        return read_depth(Path(str(source)), 1.0)
+        return read_prior(Path(str(source)))
     values = array_of(source, "depth prior", "prior", "numbers (H, W), or a path")
     return known_depth(values, "prior")
 

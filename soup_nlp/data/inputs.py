@@ -34,7 +34,7 @@ class PriorOptions(Section):
     """A depth prior of the reference frame."""
 
     source: str | None = None
-    """File of a depth (.npy .pfm .dpt, 16-bit .png) or of a network (.onnx); null for no prior."""
+    """File of a depth (.npy .npz .pfm .dpt .png) or of a network (.onnx); null for no prior."""
     kind: Literal["metric", "relative", "inverse", "ordinal"] | None = None
     """What the values are: metric (depth in the unit of length), relative (depth up to scale),
     inverse (inverse depth up to scale and shift) or ordinal (numbers that only rise with depth);
@@ -84,7 +84,13 @@ def pair_with_prior(pair: Pair, source: object, where: str) -> Pair:
             expected="a map of the whole image, at any size",
         )
     if not np.isfinite(prior).any():
-        raise DataError("depth prior is unknown everywhere", where=where)
+        raise DataError(
+            "depth prior is unknown everywhere",
+            where=where,
+            found="only 0, NaN and infinite values",
+            expected="positive numbers where it is known",
+            hint="is it the right file, and of the reference image?",
+        )
     if prior.shape != pair.size:
         prior = cv2.resize(prior, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
     return replace(pair, depth_prior=prior)
@@ -114,7 +120,7 @@ class FilesInput(FramesInput):
     intrinsics_next: Camera | str | None = None
     """Camera of the next frame, in the same forms; null for that of the reference frame."""
     depth: str | None = None
-    """True depth of the reference frame, for measuring only (.dpt .npy .pfm .png)."""
+    """True depth of the reference frame, for measuring only (.dpt .npy .npz .pfm .png)."""
     depth_next: str | None = None
     """True depth of the next frame."""
     undistort: bool = False

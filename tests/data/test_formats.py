@@ -13,7 +13,7 @@ from PIL import Image
 
 from soup_nlp.data.formats import camera_files
 from soup_nlp.data.formats import map_files as fmt
-from soup_nlp.data.formats.images import read_image, read_mask
+from soup_nlp.data.formats.images import DataWarning, read_image, read_mask
 
 K = np.array([[688.0, 0.0, 511.5], [0.0, 688.5, 217.5], [0.0, 0.0, 1.0]])
 
@@ -33,6 +33,13 @@ def npy(values: object) -> bytes:
     """Content of a .npy file."""
     stream = io.BytesIO()
     np.save(stream, np.asarray(values))
+    return stream.getvalue()
+
+
+def npz(**arrays: np.ndarray) -> bytes:
+    """Content of a .npz file."""
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
     return stream.getvalue()
 
 
@@ -77,6 +84,11 @@ MALFORMED = [
     ("flow", "a.npy", npy(np.ones((3, 4, 2))) + b"x", "left over"),
     ("flow", "a.npy", npy(np.zeros((3, 4))), "wrong shape"),
     ("depth", "a.npy", npy(np.zeros((2, 2, 1))), "wrong shape"),
+    ("depth", "a.npy", npy(np.ones((1, 5, 6))), r"wrong shape[\s\S]*numpy\.squeeze"),
+    ("depth", "a.npy", npy(-np.ones((5, 6))), r"negative everywhere[\s\S]*give its negative"),
+    ("depth", "a.npz", b"PK", "no .npz"),
+    ("depth", "a.npz", npz(a=np.ones((2, 2)), b=np.ones((2, 2))), r"one map[\s\S]*a \(2, 2\), b"),
+    ("depth", "a.npz", npz(depth=np.ones(2)), "wrong shape"),
     ("depth", "a.png", np.zeros((4, 4), np.uint8), "16-bit PNG with 1 channel"),
     ("depth", "a.pfm", b"PF\n1 1\n-1.0\n" + bytes(12), "damaged header"),
     ("depth", "a.pfm", b"P5\n1 1\n255\n0", "damaged header"),
@@ -214,6 +226,27 @@ def test_pfm_golden_bytes(tmp_path: Path, scale: bytes, order: str, comment: byt
     head = b"Pf\n" + comment + b"3 2\n" + comment + scale + b"\n"
     path = put(tmp_path / "a.pfm", head + rows[::-1].tobytes())
     np.testing.assert_array_equal(fmt.read_pfm(path), rows)
+
+
+def test_a_prior_is_read_from_more_files_than_a_depth(tmp_path: Path) -> None:
+    depth = np.array([[1.0, 2.0], [0.0, 200.0]])
+    known = np.where(depth > 0, depth, np.nan)
+    np.savez(tmp_path / "a.npz", depth=depth, K=np.eye(3))
+    np.savez(tmp_path / "b.npz", depth)
+    for name in ("a.npz", "b.npz"):
+        np.testing.assert_array_equal(fmt.read_depth(tmp_path / name), known)
+        np.testing.assert_array_equal(fmt.read_prior(tmp_path / name), known)
+    grey = depth.astype(np.uint8)
+    for name, image in (("a.png", grey), ("b.png", np.dstack([grey] * 3))):
+        with pytest.warns(DataWarning, match=r"8 bits has 4 different values; assumed: its grey"):
+            out = fmt.read_prior(stored(tmp_path / name, image))
+        np.testing.assert_array_equal(out, known)
+    deep = stored(tmp_path / "c.png", depth.astype(np.uint16))
+    np.testing.assert_array_equal(fmt.read_prior(deep), known)
+    colour = stored(tmp_path / "d.png", np.dstack([grey, grey, grey + 1]))
+    for path, match in ((colour, "in colour"), (tmp_path / "none.png", "missing")):
+        with raises(match):
+            fmt.read_prior(path)
 
 
 def test_kitti_disparity_and_vkitti_depth(tmp_path: Path) -> None:

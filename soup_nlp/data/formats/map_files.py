@@ -224,13 +224,32 @@ def read_confidence(path: PathLike) -> NDArray[Any]:
 
 
 def known_depth(depth: NDArray[Any], path: PathLike) -> Float:
-    """The depth as float64 with NaN where it is not positive and finite."""
+    """The depth as float64 with NaN where it is not positive and finite.
+
+    Raises:
+        DataError: it has another shape, or is negative everywhere.
+    """
     if depth.ndim != 2 or depth.size == 0:
+        one = np.squeeze(depth).ndim == 2
         raise DataError(
-            "depth has the wrong shape", where=path, found=depth.shape, expected="(H, W)"
+            "depth has the wrong shape",
+            where=path,
+            found=depth.shape,
+            expected="(H, W)",
+            hint="numpy.squeeze(depth) takes it out of its batch" if one else None,
         )
     check_image_size(depth.shape[1], depth.shape[0], "depth", path)
     out = np.array(depth, dtype=np.float64)
+    finite = out[np.isfinite(out)]
+    if finite.size and finite.min() < 0 >= finite.max():
+        raise DataError(
+            "depth is negative everywhere",
+            where=path,
+            found=f"values {finite.min():.4g} to {finite.max():.4g}",
+            expected="positive numbers, 0 or NaN where unknown",
+            hint="give its negative: it seems to be z of axes that point back (OpenGL), or a"
+            " disparity of the other sign (a depth prior of kind inverse)",
+        )
     out[~(np.isfinite(out) & (out > 0))] = np.nan
     return out
 
@@ -284,7 +303,9 @@ def read_vkitti_depth(path: PathLike) -> Float:
 
 
 def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIMETRES) -> Float:
-    """Read a depth by the suffix of its file: .dpt (Sintel), .npy, .pfm or 16-bit .png.
+    """Read a depth by the suffix of its file: .dpt (Sintel), .npy, .npz, .pfm or 16-bit .png.
+
+    A .npz holds one array (H, W), or one of the name depth.
 
     Args:
         path: The file.
@@ -304,7 +325,47 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
     readers: dict[str, Reader] = {
         ".dpt": lambda p: _read_pieh(p, "depth file"),
         ".npy": lambda p: npy_array(read_bytes(p, "depth file"), p, "depth file"),
+        ".npz": _one_map,
         ".pfm": read_pfm,
         ".png": by_scale,
     }
     return known_depth(_by_suffix(path, readers, "depth"), path)
+
+
+def _one_map(path: PathLike) -> NDArray[Any]:
+    """The array named depth of a .npz file, or the only one of two axes."""
+    arrays = read_npz(path, "depth file")
+    maps = [a for name, a in arrays.items() if name == "depth" or np.squeeze(a).ndim == 2]
+    if len(maps) != 1 and "depth" not in arrays:
+        raise DataError(
+            "depth file does not hold one map",
+            where=path,
+            found=", ".join(f"{name} {a.shape}" for name, a in arrays.items()) or "no array",
+            expected="one array (H, W), or one of the name depth",
+        )
+    return arrays.get("depth", maps[0])
+
+
+def read_prior(path: PathLike) -> Float:
+    """The values of a depth prior: a depth file of any scale, or an 8-bit grey picture.
+
+    Warns:
+        DataWarning: the values are those of an 8-bit picture.
+    """
+    if Path(path).suffix.lower() != ".png":
+        return read_depth(path, 1.0)
+    image = decode(path, "depth prior")
+    if image.dtype != np.uint8:
+        return read_depth(path, 1.0)
+    # a grey picture may be stored in colour
+    grey = image if image.ndim == 2 else image[:, :, 0]
+    if image.ndim == 3 and (image[:, :, :3] != grey[:, :, None]).any():
+        raise DataError(
+            "depth prior is a picture in colour",
+            where=path,
+            expected="numbers (.npy, .npz, .pfm, 16-bit .png), or a grey picture",
+            hint="write the values themselves: colours cannot be turned back into depth",
+        )
+    taken = "its grey values, of which black is unknown; a file of numbers is more exact"
+    assumed(path, f"a depth prior of 8 bits has {len(np.unique(grey))} different values", taken)
+    return known_depth(grey, path)
