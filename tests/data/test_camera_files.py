@@ -219,6 +219,7 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "ORB-SLAM3 fisheye": (FOUR + 'Camera.type: "KannalaBrandt8"', "another model"),
     "OpenSfM": (json.dumps({"v2": {"projection_type": "spherical", **GROUP}}), "another model"),
     "COLMAP fisheye": ("1 OPENCV_FISHEYE 320 240 256 257 160 120 0 0 0 0", "another model"),
+    "COLMAP of other length": ("1 OPENCV 320 240 256 257 160 120 0.1", "5 parameters"),
     "Mei": ("model_type: MEI\nmirror_parameters:\n  xi: 0.9\n" + FOUR, "another model"),
     "other distortion model": (FOUR + "distortion_model: division\nk1: 0.1", "another model"),
     "radial list": (json.dumps({**GROUP, "radial_distortion": [0.1, 0.2]}), "of another model"),

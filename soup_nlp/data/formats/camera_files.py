@@ -114,7 +114,7 @@ def read_camera(path: PathLike) -> tuple[Float, Float]:
 
 
 def _four(K: Float) -> str:
-    return ",".join(f"{x:g}" for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    return ",".join(f"{x:.9g}" for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
 
 def _plain(values: list[float], where: PathLike) -> tuple[Float, Float]:

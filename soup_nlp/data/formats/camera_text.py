@@ -178,7 +178,10 @@ def _colmap(camera: str, model: str, values: str) -> Iterator[Leaf]:
     """A row of cameras.txt; the centre of COLMAP's first pixel is (0.5, 0.5), here (0, 0)."""
     path, words = (f"camera {camera}",), list(_split(values))
     yield (*path, "camera_model"), [model]
-    for name, word in zip(_COLMAP.get(model, "").split(), words):
+    names = _COLMAP.get(model, "").split()
+    if names and len(words) != len(names):
+        raise ValueError(f"{len(words)} parameters of a camera {model} of COLMAP, not {len(names)}")
+    for name, word in zip(names, words):
         if name[0] == "c":
             with contextlib.suppress(ValueError):
                 word = repr(float(word) - 0.5)
