@@ -158,7 +158,6 @@ class FilesInput(FramesInput):
             [path(self.ref), path(self.next)],
             [K for K, _ in lenses],
             truth,
-            "files",
             self.white,
             fov=self.fov,
             focal_sigma=self.focal_sigma,

@@ -104,7 +104,7 @@ class KittiInput(PairInput):
             flow=folder.read(read_flow, file("flow_occ")),
             components=None if objects is None else objects.astype(np.int32),
         )
-        return make_pair(images, [K, K], truth, f"{self.kind}_{self.index}")
+        return make_pair(images, [K, K], truth)
 
 
 class SceneFrames(PairInput):
@@ -157,8 +157,7 @@ class VkittiInput(SceneFrames):
         depths = [folder.read(read_vkitti_depth, file(depth, number)) for number in numbers]
         flows = [file(flow, self.frame)] if self.step == 1 else []
         truth = Truth(depths[0], depths[1], folder.read(read_vkitti_flow, *flows))
-        name = f"{self.kind}_{self.scene}_{self.variation}_{self.frame:05d}"
-        return make_pair(images, cameras, truth, name)
+        return make_pair(images, cameras, truth)
 
 
 class SintelInput(SceneFrames):
@@ -197,5 +196,4 @@ class SintelInput(SceneFrames):
             where = folder.path / f"invalid/{names[0]}.png"
             check_size("mask and flow", invalid.shape, flow.shape, where)
             flow[invalid] = np.nan
-        truth = Truth(depths[0], depths[1], flow)
-        return make_pair(images, cameras, truth, f"sintel_{self.scene}_{self.frame:04d}")
+        return make_pair(images, cameras, Truth(depths[0], depths[1], flow))

@@ -92,8 +92,7 @@ class FolderInput(FramesInput):
             unit=self.unit,
         )
         cameras = [K, K if K_next is None else K_next]
-        name = folder.path.resolve().name
-        return make_pair(images, cameras, truth, name, self.white, cropped=self.cropped)
+        return make_pair(images, cameras, truth, self.white, cropped=self.cropped)
 
 
 def _refuse_result(folder: Folder) -> None:
@@ -170,9 +169,8 @@ class TumInput(PairInput):
             near = [entry for entry in depths if abs(entry[0] - time) <= _TUM_SLACK]
             best = [name for _, name in sorted(near, key=lambda entry: abs(entry[0] - time))[:1]]
             maps.append(folder.read(read_depth, *best, scale=self.depth_scale, usual=TUM_SCALE))
-        name = f"{folder.path.resolve().name}_{self.frame}"
         files = [folder.need(images[k][1]) for k in numbers]
-        return make_pair(files, [K, K], Truth(maps[0], maps[1]), name)
+        return make_pair(files, [K, K], Truth(maps[0], maps[1]))
 
 
 def _tum_camera(folder: Path) -> Float:
@@ -249,5 +247,4 @@ class MotorcycleInput(PairInput):
             K_ref=intrinsics(focal, focal, cx, cy),
             K_next=intrinsics(focal, focal, cx + doffs, cy),
             truth=truth,
-            name="motorcycle",
         )

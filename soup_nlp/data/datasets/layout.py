@@ -110,7 +110,6 @@ def make_pair(
     images: Sequence[Path],
     cameras: Sequence[Float | None],
     truth: Truth,
-    name: str,
     white: int | None = None,
     *,
     fov: float | None = None,
@@ -125,7 +124,6 @@ def make_pair(
         cameras: (3, 3) intrinsics of both frames, pixels; None is estimated (`estimated_cameras`).
             If both are None, images are rotated by their EXIF orientation.
         truth: Truth from its files.
-        name: Name of the pair.
         white: Value of white in 16-bit images, see `read_images`.
         fov: Horizontal field of view, degrees, if the cameras are not known.
         focal_sigma: Standard deviation of the log focal length of `fov`.
@@ -144,6 +142,6 @@ def make_pair(
     check_cameras(matrices, pictures, images, cropped)
     for k, coefficients in enumerate(distortion):
         pictures[k], matrices[k] = undistorted(pictures[k], matrices[k], coefficients)
-    truth_or_none = truth if truth.known() else None
     images_and_cameras = pictures[0], pictures[1], matrices[0], matrices[1]
-    return Pair(*images_and_cameras, truth=truth_or_none, name=name, focal_sigma=focal_sigma)
+    known = truth if truth.known() else None
+    return Pair(*images_and_cameras, truth=known, focal_sigma=focal_sigma)
