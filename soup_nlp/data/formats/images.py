@@ -71,11 +71,10 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
     """
     content = read_bytes(path, what)
     _refuse_raw(content, path, what)
-    pages = 1
+    size, pages = (1, 1), 1
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(content)) as header:
             size = header.size
-            check_image_size(*size, what, path)
             # phones store a second picture behind a JPEG, for other screens
             pages = 1 if header.format == "MPO" else getattr(header, "n_frames", 1)
     except Image.DecompressionBombError as error:
@@ -85,10 +84,9 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
             found=error,
             expected=f"at most {MAX_PIXELS} pixels",
         ) from None
-    except DataError:
-        raise
     except Exception:  # OpenCV may read formats that Pillow does not
         pages = 1
+    check_image_size(*size, what, path)
     if pages > 1:
         text = f"{path}: holds {pages} pages or frames; the first one is used"
         warnings.warn(text, DataWarning, stacklevel=3)
@@ -129,17 +127,17 @@ def _decode_by_opencv(content: bytes) -> tuple[NDArray[Any] | None, str]:
 
     Decoders of JPEG and TIFF print that to the standard error of the process only.
     """
-    said = b""
-    with _STDERR, tempfile.TemporaryFile() as file, contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # there may be no standard error
+    image, said = None, b""
+    file: Any = io.BytesIO()
+    with _STDERR, contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # there may be no standard error, or no folder for files
+            file = stack.enter_context(tempfile.TemporaryFile())
             saved = os.dup(2)
             stack.callback(os.close, saved)
             stack.callback(os.dup2, saved, 2)
             os.dup2(file.fileno(), 2)
-        image = None
         with contextlib.suppress(cv2.error):
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        stack.close()
         file.seek(0)
         said = file.read()
     damage = _DAMAGE.search(said.decode(errors="replace"))
