@@ -104,20 +104,31 @@ print((exported / "soup.sol").read_text().splitlines()[0])
 # ## The same without a file
 #
 # `soup_nlp.nlp` gives the program as CasADi expressions. Here Ipopt solves it from the
-# initialisation, in tangent coordinates, with less smoothing in every call and the majorant Hessian
-# (theta = 0), whose model lies above every norm.
+# initialisation, in tangent coordinates, by the stages of `soup-nlp solve`: less smoothing with the
+# majorant Hessian (theta = 0), whose model lies above every norm, then more of the curvature along
+# each residual, at last the exact Hessian.
 
 # %%
-nlp = soup_nlp.nlp(folder / "orbit.yaml", coordinates="tangent", hessian="gauss-newton")
 quiet = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
-solver = ca.nlpsol("s", "ipopt", nlp.problem, {"ipopt.mu_init": 1e-6, **quiet, **nlp.derivatives})
-start = nlp.start
-for eps in (0.3, 0.03, 0.01):
-    p = nlp.parameters(eps=eps, eps_pixel=eps, theta=0.0, ridge=0.0)
-    answer = solver(**{**start, "p": p})
-    start["x0"] = answer["x"]
+
+
+def solve_tangent(point, hessian, mu, **parameters):
+    """Ipopt on the tangent program from a point; returns the program and the answer."""
+    nlp = soup_nlp.nlp(folder / "orbit.yaml", coordinates="tangent", hessian=hessian)
+    options = {"ipopt.mu_init": mu, **quiet, **nlp.derivatives}
+    solver = ca.nlpsol("s", "ipopt", nlp.problem, options)
+    start = nlp.start if point is None else {**nlp.start, "x0": point}
+    return nlp, solver(**{**start, "p": nlp.parameters(**parameters)})
+
+
+point = None
+for eps, theta in ((0.3, 0), (0.03, 0), (0.01, 0), (0.01, 0.5), (0.01, 0.9), (0.01, 0.98)):
+    smoothing = {"eps": eps, "eps_pixel": eps, "theta": theta, "ridge": 0.0}
+    nlp, answer = solve_tangent(point, "gauss-newton", 1e-6, **smoothing)
+    point = answer["x"]
+nlp, answer = solve_tangent(point, "exact", 1e-8)
 soup = nlp.soup(answer["x"])
-print(f"smoothed energy {float(answer['f']):.4f}")
+print(f"smoothed energy {float(answer['f']):.6f}")
 
 # %% [markdown]
 # ## Check and import
