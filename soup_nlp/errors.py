@@ -86,7 +86,7 @@ class StoppedError(SoupError):
     """A run was told to stop before it had a start, so that there is nothing to keep."""
 
 
-def one_line(value: object, what: str) -> str:
+def one_line(value: object, what: str, where: str) -> str:
     """A text that names something, if it fits on a line of a file, a page or a terminal.
 
     Raises:
@@ -95,8 +95,10 @@ def one_line(value: object, what: str) -> str:
     if not (isinstance(value, str) and 0 < len(value) <= 100 and value.isprintable()):
         raise DataError(
             f"{what} is no short text",
+            where=where,
             found=printable(repr_of(value), 60),
             expected="1 to 100 printable characters on one line",
+            hint="leave out line ends and control characters",
         )
     return value
 

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from rich.progress import Progress as Bars
 
 from soup_nlp.config.presets import PRESETS
 from soup_nlp.config.problem import Problem as ProblemFile
+from soup_nlp.config.problem import shipped_problems
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, StoppedError, printable
 from soup_nlp.schema.limits import MAX_SEED
@@ -30,6 +31,16 @@ from soup_nlp.storage.rows import Row, failed, reason
 def option(text: str, *names: str, panel: str | None = None, **rules: Any) -> Any:
     """An option with its help, in a panel of the help page."""
     return typer.Option(*names, help=text, rich_help_panel=panel, **rules)
+
+
+def starting(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Completion of the last of comma-separated words; without any, shells complete files."""
+
+    def complete(incomplete: str) -> list[str]:
+        head, comma, last = incomplete.rpartition(",")
+        return [head + comma + word for word in words() if word.startswith(last)]
+
+    return complete
 
 
 in_input, in_size, in_method, in_output = (
@@ -57,14 +68,18 @@ MaxSize = Annotated[
 ]
 Set = Annotated[Words, in_method("Set any key, e.g. solver.max_iter=200.", "--set")]
 PresetName = Annotated[
-    str | None, in_method(f"Options below the problem's own: {', '.join(PRESETS)}.")
+    str | None,
+    in_method(
+        f"Options below the problem's own: {', '.join(PRESETS)}.",
+        autocompletion=starting(lambda: PRESETS),
+    ),
 ]
 Out = Annotated[Path, in_output("Output folder.", "--out", "-o")]
 Quiet = Annotated[bool, in_output("Print no progress, only warnings.", "--quiet", "-q")]
 OTHERS = "Also replace files of your own, and the result of another input."
 Overwrite = Annotated[bool, in_output(OTHERS, "--overwrite")]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
-Problem = Annotated[Path, typer.Argument(help=PROBLEM)]
+Problem = Annotated[Path, typer.Argument(help=PROBLEM, autocompletion=starting(shipped_problems))]
 Folder = Annotated[Path, typer.Argument(help="Folder of a result or a chain.")]
 Presolve = Annotated[bool, option("Start at the presolve's answer, not at the initialisation.")]
 FORMULATIONS = "gauge/norm, e.g. unit-translation/epigraph; may be repeated."

@@ -14,7 +14,10 @@ from soup_nlp.storage.files import is_folder
 
 
 def show(
-    problem: Annotated[Path | None, typer.Argument(help=options.PROBLEM)] = None,
+    problem: Annotated[
+        Path | None,
+        typer.Argument(help=options.PROBLEM, autocompletion=options.starting(shipped_problems)),
+    ] = None,
     overrides: options.Set = None,
     preset: options.PresetName = None,
     all_options: Annotated[bool, option("Every key, also the unusual ones.", "--all")] = False,
@@ -38,7 +41,10 @@ def show(
 def list_(
     folder: Annotated[Path | None, typer.Argument(help="Folder of other problem files.")] = None,
 ) -> None:
-    """Print the problems that come with the package, or of a folder."""
+    """Print the problems, scenes and formats of the package, or the problems of a folder."""
+    from soup_nlp.data.scenes.catalogue import SCENES
+    from soup_nlp.report.formats import FORMATS
+
     if folder is not None and not is_folder(folder):
         raise ConfigError("no such folder", where=folder, hint="soup-nlp list without a folder")
     files = {str(p): p for p in sorted(folder.glob("*.yaml"))} if folder else shipped_problems()
@@ -46,5 +52,7 @@ def list_(
         print(f"{printable(name):<14} {description(path)}")
     if folder is None:
         print("\nsoup-nlp solve NAME; templates take --set input.root=DIR, folder input.path=DIR")
+        print(f"soup-nlp chain scene:NAME, of {', '.join(SCENES)}")
+        print(f"soup-nlp convert RESULT --to {','.join(FORMATS)}")
     elif not files:
         print(f"no problem files (*.yaml) in {printable(str(folder))}")

@@ -12,8 +12,9 @@ import typer
 
 from soup_nlp.cli import options
 from soup_nlp.cli.options import Text, in_input, in_method, in_output, option
-from soup_nlp.config.problem import Problem, load_problem, make_problem, title
+from soup_nlp.config.problem import Problem, load_problem, make_problem, shipped_problems, title
 from soup_nlp.data.flow.sources import is_path
+from soup_nlp.data.scenes.catalogue import SCENES
 from soup_nlp.errors import ConfigError, DataError, SoupError
 from soup_nlp.pipeline.run import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
@@ -34,7 +35,12 @@ in_flow, in_prior = partial(option, panel="Flow"), partial(option, panel="Depth 
 
 def solve(
     source: Annotated[
-        list[Path] | None, typer.Argument(metavar="PROBLEM | REF NEXT", help=SOURCE)
+        list[Path] | None,
+        typer.Argument(
+            metavar="PROBLEM | REF NEXT",
+            help=SOURCE,
+            autocompletion=options.starting(shipped_problems),
+        ),
     ] = None,
     intrinsics: options.Intrinsics = None,
     fov: options.Fov = None,
@@ -45,7 +51,7 @@ def solve(
     ] = None,
     flow_backward: Annotated[Text, in_flow("Flow from next to ref; gives the confidence.")] = None,
     flow_confidence: Annotated[Text, in_flow(".npy in [0, 1], or a grey picture.")] = None,
-    depth_prior: Annotated[Text, in_prior("Depth of ref: .npy, .pfm, .png, .onnx.")] = None,
+    depth_prior: Annotated[Text, in_prior("Depth of ref: .npy, .npz, .pfm, .png, .onnx.")] = None,
     depth_prior_kind: Annotated[
         Text, in_prior("metric, relative, inverse, ordinal; default: by the flow.")
     ] = None,
@@ -214,7 +220,11 @@ def demo(
 
 def chain(
     source: Annotated[
-        list[str], typer.Argument(help="Folder, images, 'pattern/*.jpg', video, or scene:NAME.")
+        list[str],
+        typer.Argument(
+            help="Folder, images, 'pattern/*.jpg', video, or scene:NAME.",
+            autocompletion=options.starting(lambda: [f"scene:{name}" for name in SCENES]),
+        ),
     ],
     out: Annotated[Path | None, options.out_option("out/chain-SOURCE")] = None,
     intrinsics: options.Intrinsics = None,

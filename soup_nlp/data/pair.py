@@ -167,7 +167,7 @@ class Truth:
     unit: str = "m"
 
     def __post_init__(self) -> None:
-        one_line(self.unit, "unit of the truth")
+        one_line(self.unit, "unit of the truth", "unit (input.unit)")
         for name, (axes, kinds) in _PARTS.items():
             value = getattr(self, name)
             if value is None:
@@ -255,7 +255,7 @@ class Pair:
 
     def __post_init__(self, fov: float | None) -> None:
         put = partial(object.__setattr__, self)
-        one_line(self.name, "name of the pair")
+        one_line(self.name, "name of the pair", "name")
         truths = "soup_nlp.Truth(depth_ref=..., ...) or None"
         expect(self.truth, (Truth, NoneType), "truth of the pair", truths)
         # files may have EXIF, and 16-bit files have one range of values

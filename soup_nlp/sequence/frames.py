@@ -103,6 +103,8 @@ def find_images(source: Path) -> list[Path]:
     if root == source:
         images = [path for path in chosen if path.suffix.lower() in IMAGES]
         chosen = [path for path in images if path.match(LAYOUT)] or images
+    # cameras write a raw photo beside the developed one
+    chosen = [path for path in chosen if path.suffix.lower() not in RAW] or chosen
     names = {*chosen}
     chosen = [p for p in chosen if names.isdisjoint(_shorter(p))]
     if len(chosen) < 2:

@@ -208,14 +208,24 @@ def test_help_has_the_first_line_of_the_docstring(home):
     assert text.splitlines()[0] == first_line(home)
 
 
-def test_completion_knows_the_commands(monkeypatch):
-    words = {"_SOUP_NLP_COMPLETE": "complete_bash", "COMP_WORDS": "soup-nlp so", "COMP_CWORD": "1"}
-    for key, value in words.items():
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("so", "solve"),
+        ("solve moto", "motorcycle"),
+        ("show kitti2015", "kitti2015"),
+        ("convert out --to ply,col", "ply,colmap"),
+        ("show street --preset pa", "paper"),
+    ],
+)
+def test_completion_knows_commands_problems_and_formats(line, word, monkeypatch):
+    words = {"_SOUP_NLP_COMPLETE": "complete_bash", "COMP_WORDS": f"soup-nlp {line}"}
+    for key, value in (words | {"COMP_CWORD": str(len(line.split()))}).items():
         monkeypatch.setenv(key, value)
     code = "import sys; sys.argv = ['soup-nlp']; from soup_nlp.cli.main import main; main()"
     run = [sys.executable, "-c", code]
     done = subprocess.run(run, capture_output=True, text=True, check=False)
-    assert done.stdout.split() == ["solve"]
+    assert done.stdout.split() == [word]
 
 
 def test_public_names_are_there_after_any_import():

@@ -125,6 +125,8 @@ def test_numbers_around_a_point(names, warned, tmp_path):
     [
         (["IMG_1.jpg", "._IMG_1.jpg", "IMG_2.jpg", ".x.png"], ["IMG_1.jpg", "IMG_2.jpg"]),
         (["x.jpg", "x.jpg.png", "y.jpg", "y.jpg.mask.png"], ["x.jpg", "y.jpg"]),
+        (["x.jpg", "x.dng", "y.jpg", "y.DNG"], ["x.jpg", "y.jpg"]),
+        (["x.dng", "y.DNG"], ["x.dng", "y.DNG"]),
         (
             ["t1305031102175304321.png", "t1305031102175304320.png"],
             ["t1305031102175304320.png", "t1305031102175304321.png"],
