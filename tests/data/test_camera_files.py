@@ -127,6 +127,7 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
         [],
     ),
     "twelve coefficients": (FOUR + f"distortion: {[0.1] * 12}", [0.1] * 12),
+    "no fisheye": (json.dumps({**GROUP, "is_fisheye": False, "fisheye": {"k1": 0}}), []),
     "no distortion": (FOUR + "focal_length: 4.2 mm\ndistortion: null", []),
     "RealSense": (
         json.dumps({"fx": 256, "fy": 257, "ppx": 159.5, "ppy": 119.5,
@@ -220,6 +221,8 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "OpenSfM": (json.dumps({"v2": {"projection_type": "spherical", **GROUP}}), "another model"),
     "COLMAP fisheye": ("1 OPENCV_FISHEYE 320 240 256 257 160 120 0 0 0 0", "another model"),
     "COLMAP of other length": ("1 OPENCV 320 240 256 257 160 120 0.1", "5 parameters"),
+    "instant-ngp fisheye": (json.dumps({**GROUP, "is_fisheye": True}), "another model"),
+    "fisheye group": (json.dumps({**GROUP, "fisheye": {"k1": 0.1}}), "another model"),
     "Mei": ("model_type: MEI\nmirror_parameters:\n  xi: 0.9\n" + FOUR, "another model"),
     "other distortion model": (FOUR + "distortion_model: division\nk1: 0.1", "another model"),
     "radial list": (json.dumps({**GROUP, "radial_distortion": [0.1, 0.2]}), "of another model"),

@@ -168,8 +168,11 @@ def check_model(named: Sequence[Leaf], where: PathLike) -> None:
         of_model = re.fullmatch(_MODEL, last) or (re.fullmatch(_LIST, last) and not numbers)
         strict = last not in ("model", "type", "lens", "projection")
         other = re.search(_OTHER, value) or (strict and not re.search(_PINHOLE, value))
-        parameter = re.fullmatch(_OTHER_MODEL, last) and value not in ("0", "0.0")
-        if (of_model and not numbers and other) or (parameter and numbers):
+        # is_fisheye: true, fisheye.k1: 0.1, xi: 0.2
+        parameter = re.fullmatch(_OTHER_MODEL, last) and numbers
+        named_other = re.search("fish|equidist|kannala|omni", ".".join(names).lower())
+        given = value not in ("", "0", "0.0", "false", "none", "null", "no")
+        if (of_model and not numbers and other) or (given and (parameter or named_other)):
             raise refused(
                 "camera file holds a camera of another model, such as a fisheye lens",
                 where,
