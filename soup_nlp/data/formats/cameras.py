@@ -32,14 +32,11 @@ def estimated_cameras(
 ) -> tuple[list[Float], float]:
     """Intrinsics of pictures, with square pixels and the principal point in the middle.
 
-    Each picture has its own size, orientation and lens. A picture without EXIF gets the focal
-    length of another picture, relative to the longer side.
-
     Args:
-        paths: The files, for their EXIF; None for a picture without a file.
+        paths: The files, for their EXIF; None for a picture without a file. A picture without EXIF
+            gets the focal length of another one, relative to the longer side.
         images: The pictures, (H, W, 3), rotated by their EXIF orientation.
-        fov: Horizontal field of view of the first picture, degrees; None for the focal length of
-            EXIF, or else `GUESS` times the longer side.
+        fov: Horizontal field of view of the first picture, degrees; None for EXIF or `GUESS`.
 
     Returns:
         (3, 3) intrinsics of each picture, pixels, and the standard deviation of the log focal
@@ -49,8 +46,7 @@ def estimated_cameras(
         ConfigError: the field of view is not between 0 and 180 degrees.
 
     Warns:
-        DataWarning: `fov` is missing (the warning names the origin of the focal length) or
-            implausible, or a focal length of EXIF is implausible.
+        DataWarning: the origin of a focal length without `fov`; one that is implausible.
     """
     exif_focals = [exif_focal(path, image) for path, image in zip(paths, images, strict=True)]
     first_exif = next((focal for focal in exif_focals if focal), None)
@@ -71,25 +67,22 @@ def estimated_cameras(
                 stacklevel=2,
             )
         relative = [first * focal / relative[0] for focal in relative]
-    out: list[Float] = []
-    for path, exif, focal, (width, height) in zip(paths, exif_focals, relative, sizes, strict=True):
-        focal *= max(width, height)
-        out.append(intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2))
-        if fov is None and (len(out) == 1 or not np.array_equal(out[0], out[-1])):
-            other = (
-                "the EXIF of the other frame" if first_exif else f"{GUESS} times the longer side"
-            )
-            text = (
-                f"{path or 'image'}: no intrinsics; focal length {focal:.0f} px from"
-                f" {'EXIF' if exif else other} ({_degrees(focal / width):.0f} degrees of view"
-                " horizontally), principal point in the middle"
-            )
-            if not first_exif:
-                text += (
-                    ". The flow corrects it where it determines it; a wrong focal length stretches"
-                    " and bends depth: give --intrinsics or --fov"
-                )
-            warnings.warn(text, DataWarning, stacklevel=2)
+    sides = [focal * max(size) for focal, size in zip(relative, sizes)]
+    out = [intrinsics(f, f, (w - 1) / 2, (h - 1) / 2) for f, (w, h) in zip(sides, sizes)]
+    alike = all(np.array_equal(K, out[0]) for K in out)
+    other = "the EXIF of the other frame" if first_exif else f"{GUESS} times the longer side"
+    doubt = (
+        ". The flow corrects it where it determines it; a wrong focal length stretches and bends"
+        " depth: give --intrinsics or --fov"
+    )
+    for k, focal in enumerate(sides[: 0 if fov is not None else 1 if alike else None]):
+        warnings.warn(
+            f"{paths[k] or 'image'}: no intrinsics; focal length {focal:.0f} px from"
+            f" {'EXIF' if exif_focals[k] else other} ({_degrees(focal / sizes[k][0]):.0f} degrees of"
+            f" view horizontally), principal point in the middle{'' if first_exif else doubt}",
+            DataWarning,
+            stacklevel=2,
+        )
     return out, 0.0 if first_exif or fov is not None else GUESS_SIGMA
 
 
@@ -101,8 +94,7 @@ def _degrees(focal: float) -> float:
 def exif_focal(path: PathLike | None, image: Image) -> float | None:
     """Focal length of EXIF relative to the longer side of a picture; None if not determined.
 
-    It follows from the equivalent for 35 mm film, or else from the focal length in millimetres and
-    the resolution of the sensor. An implausible focal length is ignored with a warning.
+    An implausible one is ignored with a warning.
     """
     tags = {} if path is None else exif_tags(path)
     candidates = [_number(tags, Base.FocalLengthIn35mmFilm) / _LONGER_35, _by_sensor(tags, image)]
@@ -121,10 +113,9 @@ def exif_focal(path: PathLike | None, image: Image) -> float | None:
 
 
 def _by_sensor(tags: Mapping[int, Any], image: Image) -> float:
-    """Focal length over the width of the sensor; 0 if unknown.
+    """Focal length over the width of the sensor; 0 if unknown, as of a cropped or reduced picture.
 
-    The sides of a cropped picture differ from those in EXIF. Where a program reduced a picture and
-    its size in EXIF, but not the resolution in EXIF, the width is that of no existing sensor.
+    Where a program reduced the size in EXIF, but not the resolution, no existing sensor has it.
     """
     short, long = sorted(image.shape[:2])
     low, high = sorted(_number(tags, x) for x in (Base.ExifImageWidth, Base.ExifImageHeight))
@@ -164,14 +155,13 @@ def check_cameras(
 ) -> None:
     """Check the intrinsics (3, 3) of both frames, once where they are the same.
 
-    `cropped` says that the images are parts of larger ones: their principal points are anywhere.
+    Principal points of `cropped` images, which are parts of larger ones, may be anywhere.
 
     Raises:
         DataError: a principal point is outside of the image.
 
     Warns:
-        DataWarning: a principal point is far from the middle, fx and fy differ much, or the
-            intrinsics are those of another resolution.
+        DataWarning: intrinsics are implausible; the warning names the likely cause.
     """
     alike = images[0].shape == images[1].shape and np.array_equal(cameras[0], cameras[1])
     for K, image, where in list(zip(cameras, images, names))[: 1 if alike else 2]:
