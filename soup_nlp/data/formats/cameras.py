@@ -78,8 +78,8 @@ def estimated_cameras(
     for k, focal in enumerate(sides[: 0 if fov is not None else 1 if alike else None]):
         warnings.warn(
             f"{paths[k] or 'image'}: no intrinsics; focal length {focal:.0f} px from"
-            f" {'EXIF' if exif_focals[k] else other} ({_degrees(focal / sizes[k][0]):.0f} degrees of"
-            f" view horizontally), principal point in the middle{'' if first_exif else doubt}",
+            f" {'EXIF' if exif_focals[k] else other} ({_degrees(focal / sizes[k][0]):.0f} degrees"
+            f" of view horizontally), principal point in the middle{'' if first_exif else doubt}",
             DataWarning,
             stacklevel=2,
         )
