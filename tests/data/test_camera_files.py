@@ -70,6 +70,11 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
     ),
     "ROS 1 message": (f"K: [{ROWS}]\nD: [0.0, 0.0]\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]", []),
     "ROS 2": (f"header:\n  frame_id: c\nk: [{ROWS}]\nd: [0.1, 0, 0, 0, 0]\np: [250]", [0.1]),
+    "ROS 2 messages": (
+        2 * "header:\n  stamp:\n    sec: 1\nk:\n- 256.0\n- 0.0\n- 159.5\n- 0.0\n- 257.0\n- 119.5\n"
+        "- 0.0\n- 0.0\n- 1.0\nd: []\n---\n",
+        [],
+    ),
     "oST": (
         "# oST version 5.0\n[image]\nwidth\n320\nheight\n240\n[narrow_stereo]\ncamera matrix\n"
         "256 0 159.5\n0 257 119.5\n0 0 1\n\ndistortion\n-0.3 0.1 0 0 0\n\nrectification\n1 0 0\n"

@@ -87,12 +87,18 @@ def _json(text: str) -> Any:
 
 def _yaml(text: str) -> Any:
     """The tree of a YAML text with all values as written; None for other text."""
-    trees: list[Any] = [None]
-    # OpenCV's header is no YAML
-    text = re.sub(r"^%YAML.*$", "", text, flags=re.MULTILINE)
-    with contextlib.suppress(ValueError):
-        parse_yaml(text, see=lambda node: trees.append(_tree(node)))
-    return trees[-1]
+    trees: list[Any] = []
+    # OpenCV's header and tag are no YAML, and ROS prints a line behind every message
+    text = text.replace("!!opencv-matrix", "")
+    parts = re.split(r"^(?:%YAML.*|---|\.\.\.)\s*$", text, flags=re.MULTILINE)
+    try:
+        for part in parts:
+            parse_yaml(part, see=lambda node: trees.append(_tree(node)))
+    except ValueError:
+        return None
+    if trees and all(isinstance(tree, _Pairs) for tree in trees):
+        return _Pairs(pair for tree in trees for pair in tree)
+    return trees[0] if len(trees) == 1 else None
 
 
 def _tree(node: yaml.Node) -> Any:
