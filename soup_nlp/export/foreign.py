@@ -26,7 +26,6 @@ from soup_nlp.solve.ipopt import Stage
 from soup_nlp.solve.kkt import residuals
 from soup_nlp.solve.stages import Solution, multipliers
 from soup_nlp.storage.files import as_path
-from soup_nlp.storage.folders import recover
 
 SAME = 1e-7
 """Largest relative difference of the fingerprints of an export and of the present problem."""
@@ -77,7 +76,6 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
         SoupError: the input of the problem cannot be used.
     """
     folder = as_path(folder, "exported folder", error=ExportError)
-    recover(folder)
     manifest = read_manifest(folder)
     case = prepare(load_problem(folder / "problem.yaml", solved=False))
     form = case.formulation(

@@ -4,7 +4,7 @@ Energy, constraints, depth and scores are recomputed from the arrays by `evaluat
 shares no code with the solver. Every file is compared with the SHA-256 of it when it was written.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from soup_nlp.evaluate.scoring import DEPTHS, SURE
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.report.layout import require_layout
 from soup_nlp.storage.files import as_path, read_json
-from soup_nlp.storage.folders import MARK, digest_of, mark_of, recover
+from soup_nlp.storage.folders import SUMS, digest_of, read_sums
 from soup_nlp.storage.store import read_h5, require
 
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
@@ -92,7 +92,7 @@ class CheckReport:
         written = sum(r.how == WRITTEN for r in self.rows)
         lines = [f"     {len(self.rows) - written} claims are recomputed from the arrays"]
         if written:
-            lines.append(f"     {written} are compared with their SHA-256 in {MARK}")
+            lines.append(f"     {written} are compared with their SHA-256 in {SUMS}")
         return "\n".join([head, *map(str, self.rows), *lines, *(f"     left: {x}" for x in LEFT)])
 
 
@@ -117,7 +117,6 @@ def check_folder(folder: str | Path) -> CheckReport:
         DataError: a file, a claim or an array is missing or malformed.
     """
     folder = as_path(folder, "result folder")
-    recover(folder)
     claims = read_json(folder / "summary.json", "summary.json")
     stored = Stored(folder, claims, read_h5(folder / "result.h5"))
     try:
@@ -228,12 +227,18 @@ def _compared(tree: Mapping[str, Any], name: str) -> tuple[Float, Float]:
 
 
 def _written(r: Stored) -> Iterator[Claim]:
-    """Every file by its SHA-256 in the mark of the folder."""
-    notes, files = {}, mark_of(r.folder).files
-    if not {"summary.json", "result.h5"} <= files.keys():
-        notes["files as written"] = f"no SHA-256 of this result: {MARK} is missing or damaged"
+    """Every file by its SHA-256 in the list of the folder."""
+    yield from written(r.folder, {"summary.json", "result.h5"})
+
+
+def written(folder: Path, needed: Set[str]) -> Iterator[Claim]:
+    """Every file of a folder's list, which must have the needed ones, by its SHA-256."""
+    notes, sums = {}, read_sums(folder)
+    files = sums.files if sums else {}
+    if not needed <= files.keys():
+        notes["files as written"] = f"no SHA-256 of this result: {SUMS} is missing or damaged"
     for name in sorted(files):
-        path, note = r.folder / name, "missing"
+        path, note = folder / name, "missing"
         if path.is_file():
             note = "" if digest_of(path) == files[name] else "changed"
         notes[f"{name} as written"] = note

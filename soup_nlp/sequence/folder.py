@@ -11,7 +11,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.report.chain import AXES, Chain
-from soup_nlp.report.check import CheckReport, Claim, check_folder
+from soup_nlp.report.check import CheckReport, Claim, check_folder, written
 from soup_nlp.report.formats import check_formats, write_depths, write_formats, write_tum
 from soup_nlp.report.page import pair_page
 from soup_nlp.report.result import PAGE, Result
@@ -24,6 +24,8 @@ from soup_nlp.storage.rows import failed, read_rows
 
 CHAIN = "chain.json"
 """File that makes a folder that of a chain."""
+PAIRS = "pairs"
+"""Folder with the results of the pairs."""
 ROWS = "pairs.jsonl"
 """File with a row for each pair of a sequence."""
 SAME = 1e-6
@@ -42,11 +44,11 @@ def is_chain(folder: Path) -> bool:
         return is_file(folder / CHAIN)
     rows = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
     broken = sorted(key for key, row in rows.items() if failed(row))
-    stored = sorted(key for key in rows if is_file(folder / "pairs" / key / "result.h5"))
+    stored = sorted(key for key in rows if is_file(folder / PAIRS / key / "result.h5"))
     solved = [key for key in stored if key not in broken]
     hint = "the same soup-nlp chain command goes on where it stopped"
     if solved:
-        hint += f"; soup-nlp view {quote(str(folder / 'pairs' / solved[0]))} shows a single pair"
+        hint += f"; soup-nlp view {quote(str(folder / PAIRS / solved[0]))} shows a single pair"
     raise DataError(
         "chain is not finished",
         where=folder,
@@ -90,7 +92,7 @@ def read_chain(folder: Path) -> Chain:
     except (KeyError, TypeError, ValueError) as error:
         raise DataError("chain.json cannot be read", where=folder, found=error) from error
     solved = [
-        read_pair(a, b, folder / "pairs" / f"{a:03d}_{b:03d}")
+        read_pair(a, b, folder / PAIRS / f"{a:03d}_{b:03d}")
         for a, b in [*((k, k + 1) for k in range(count - 1)), *over]
     ]
     return make_chain(solved[: count - 1], solved[count - 1 :], contents)
@@ -106,7 +108,7 @@ def check(folder: Path) -> CheckReport:
         return check_folder(folder)
     chain, claims = read_chain(folder), []
     for k in range(len(chain.pairs)):
-        pair = folder / "pairs" / f"{k:03d}_{k + 1:03d}"
+        pair = folder / PAIRS / f"{k:03d}_{k + 1:03d}"
         right = float(check_folder(pair).ok)
         claims.append(Claim(f"pair {pair.name}: every claim", 1.0, right))
     poses = np.array([m.matrix for m in chain.world_from_camera])
@@ -120,7 +122,7 @@ def check(folder: Path) -> CheckReport:
         gap = float(np.abs(claimed - found).max()) if claimed.shape == found.shape else np.inf
         tolerance = SAME * float(np.abs(found).max(initial=1.0))
         claims.append(Claim(name, 0.0, np.nan_to_num(gap, nan=np.inf), tolerance))
-    return CheckReport(tuple(claims))
+    return CheckReport((*claims, *written(folder, {*chain_files(len(chain))})))
 
 
 def chain_of(folder: Path) -> Chain:
@@ -156,7 +158,7 @@ def renew_page(folder: Path) -> Path:
     """Make the page of a result or a chain again from its arrays; returns its file.
 
     Raises:
-        DataError: the folder holds neither, or cannot be written.
+        DataError: the folder holds neither or a page that was changed, or cannot be written.
     """
     found = load(folder)
     try:
@@ -165,7 +167,7 @@ def renew_page(folder: Path) -> Path:
         raise DataError(
             "result lacks what a page shows", where=folder, found=repr(error), hint="solve it again"
         ) from error
-    with staged(folder, overwrite=True) as new:
+    with staged(folder) as new:
         write_text(new / PAGE, text)
     return folder / PAGE
 

@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import write_png
 from soup_nlp.report.folder import run
-from soup_nlp.sequence.folder import ROWS, SINGLE, chain_files, write_chain
+from soup_nlp.sequence.folder import CHAIN, PAIRS, ROWS, SINGLE, chain_files, write_chain
 from soup_nlp.sequence.frames import (
     MAX_STEP,
     PROBED,
@@ -33,9 +33,10 @@ from soup_nlp.sequence.frames import (
     video_frames,
 )
 from soup_nlp.sequence.links import SolvedPair, make_chain, read_pair
-from soup_nlp.storage.files import as_path
+from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import Job, Row, Say, attempt, failed, measure_all, read_rows
+from soup_nlp.storage.versions import code_version
 
 SCENE = "scene:"
 """Prefix of the name of a rendered scene."""
@@ -110,12 +111,27 @@ def solve_chain(
     # a wrong key or scene is found before the first pair is solved
     _problem(chosen, 0, overrides)
     count = len(chosen)
-    claim(folder, chain_files(count), overwrite, subject)
+    # nothing is called so, but no file or link of the user may be in its way
+    claim(folder, [*chain_files(count), f"{PAIRS}/-"], overwrite, subject, ROWS)
     which = [(k, k + 1) for k in range(count - 1)]
     over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
     if begin:
         begin(chosen, len(which) + len(over))
     chosen = one_camera(chosen, overrides)
+    named_pairs = _named_pairs(chosen, [*which, *over], overrides)
+    # a pair that is solved otherwise ends the chain that it was part of
+    others = named_pairs.keys() - _kept(named_pairs, folder)
+    stale = any((folder / PAIRS / key).exists() for key in others)
+    if stale and is_file(folder / CHAIN) and not overwrite:
+        raise DataError(
+            "output folder holds a chain that was solved otherwise",
+            where=folder,
+            expected="the same images, camera, options and version of the program",
+            hint="choose another --out, or --overwrite",
+        )
+    with staged(folder, whole=stale, overwrite=overwrite, subject=subject):
+        # from here on, the folder is this chain's
+        pass
     pairs = solve_pairs(chosen, [*which, *over], folder, overrides, workers, say)
     chain = make_chain(pairs[: len(which)], pairs[len(which) :])
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
@@ -143,18 +159,13 @@ def solve_pairs(
     Raises:
         SolverError: a pair cannot be solved.
     """
-    jobs = []
-    overrides = [*OF_PAIRS, *overrides]
-    paths = [folder.resolve() / "pairs" / f"{first:03d}_{second:03d}" for first, second in which]
-    # the last row of a pair describes its folder
-    last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
-    for pair, path in zip(which, paths, strict=True):
-        raw = {"name": path.name, "input": frames.pair(*pair), "base": str(Path.cwd())}
-        name = {"key": path.name, "input": raw["input"], "overrides": overrides}
-        stored = last.get(path.name, {})
-        same = (path / "result.h5").is_file() and all(stored.get(k) == name[k] for k in name)
-        work = partial(attempt, partial(_solve, raw, tuple(overrides), path))
-        jobs.append(Job(name, work, stale=not same))
+    jobs, named_pairs = [], _named_pairs(frames, which, overrides)
+    kept = _kept(named_pairs, folder)
+    paths = [folder.resolve() / PAIRS / key for key in named_pairs]
+    for path, name in zip(paths, named_pairs.values(), strict=True):
+        raw = {"name": path.name, "input": name["input"], "base": str(Path.cwd())}
+        work = partial(attempt, partial(_solve, raw, tuple(name["overrides"]), path))
+        jobs.append(Job(name, work, stale=path.name not in kept))
 
     def report(done: int, total: int, row: Row) -> None:
         # those of a worker process would be printed as Python prints them
@@ -173,6 +184,29 @@ def solve_pairs(
             hint="the others are kept: the same command goes on",
         )
     return [read_pair(*pair, path) for pair, path in zip(which, paths, strict=True)]
+
+
+def _named_pairs(
+    frames: Frames, which: Sequence[tuple[int, int]], overrides: Sequence[str]
+) -> dict[str, Raw]:
+    """What identifies each pair, by the name of its folder."""
+    keys = {f"{first:03d}_{second:03d}": (first, second) for first, second in which}
+    every = [*OF_PAIRS, *overrides]
+    return {k: {"key": k, "input": frames.pair(*p), "overrides": every} for k, p in keys.items()}
+
+
+def _kept(named_pairs: Mapping[str, Raw], folder: Path) -> set[str]:
+    """Names of the pairs whose results are stored and need not be solved again."""
+    # the last row of a pair describes its folder
+    last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
+    return {
+        key
+        for key, name in named_pairs.items()
+        if is_file(folder / PAIRS / key / "result.h5")
+        and not failed(last.get(key, {}))
+        and last.get(key, {}).get("code") == code_version()
+        and all(last[key].get(k) == value for k, value in name.items())
+    }
 
 
 def _solve(raw: Raw, overrides: tuple[str, ...], folder: Path) -> Row:

@@ -3,7 +3,9 @@
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -159,9 +161,15 @@ class _Iterations:
 class Ipopt:
     """Ipopt set up once for an NLP; call it with parameters and a start as often as needed."""
 
-    def __init__(self, nlp: NLP, options: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        nlp: NLP,
+        options: Mapping[str, Any] | None = None,
+        below: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        """Set up; `options` are the user's, `below` those of the stage that they replace."""
         self.nlp = nlp
-        self.options = dict(options or {})
+        self.options, self.below = dict(options or {}), below
         # CasADi does not keep a callback alive
         self.functions = Functions(nlp)
 
@@ -174,10 +182,13 @@ class Ipopt:
             "dual_inf_tol": tol,
             "print_level": 0,
             "sb": "yes",
+            **self.below,
             **self.options,
         }
         if log_file:
-            ipopt |= {"output_file": log_file, "file_print_level": 5, "file_append": "yes"}
+            # without its log where that cannot be opened
+            with suppress(OSError), open(log_file, "a"):
+                ipopt |= {"output_file": log_file, "file_print_level": 5, "file_append": "yes"}
         options = {
             "ipopt": ipopt,
             "grad_f": functions.grad_f,
@@ -197,7 +208,7 @@ class Ipopt:
                 "Ipopt could not be set up",
                 where=self.nlp.name,
                 found=str(error).strip().splitlines()[-1],
-                hint="check the names of the options under solver",
+                hint="check the names of the options under solver" if self.options else None,
             ) from error
 
     def __call__(

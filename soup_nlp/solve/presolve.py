@@ -188,7 +188,7 @@ class Presolve:
         """
         o, nlp = self.o, program.nlp
         nlp = nlp if hessian is None else replace(nlp, hessian_kind=hessian)
-        solver = Ipopt(nlp, {**KEEP, **(options or {}), **o.ipopt})
+        solver = Ipopt(nlp, o.ipopt, {**KEEP, **(options or {})})
         for planned in stages:
             if self.stages and self._stopped():
                 break

@@ -220,7 +220,7 @@ class _Solve:
     def ipopt(self, nlp: NLP, first: dict[str, Any], far: bool) -> Stage:
         """The last stage, from a point with multipliers if there are any."""
         o, limit = self.o, self.o.max_iter
-        solver = Ipopt(nlp, {**(WARM if "lam_g0" in first else {}), **o.ipopt})
+        solver = Ipopt(nlp, o.ipopt, WARM if "lam_g0" in first else {})
         self.laps.end("build")
         if far:
             limit = min(limit, o.far_iterations)

@@ -1,65 +1,71 @@
-"""Output folders: all files of a command appear at once; those of the user are kept.
+"""Output folders: a result appears whole or not at all, and what is the user's stays.
 
 A command first checks the names that it will write (`claim`). Later it writes its files into a
-hidden folder in the target (`staged`). One rename marks that folder as complete; its files are then
-renamed to their places. After a kill, a later call finishes the renaming (`recover`). A lock on the
-folder makes processes that write into the same folder wait for each other.
+temporary folder beside the target, which then takes the target's name (`staged`). In a folder that
+goes on, as where a format is added to a result, every file takes its name by itself.
 
-The hidden file MARK lists the files in a folder that the program made, with their SHA-256. A file
-that is not listed, or that was changed, belongs to the user: it is never removed, and overwritten
-only with `overwrite`. The mark also has the subject of the result, such as the frames that were
-solved.
+SUMS lists the files that the program made in a folder, as `sha256sum -c` reads them. A file that is
+not listed, or was changed since, belongs to the user: it is kept, and overwritten only with
+`overwrite`. The first line names the subject of the result, such as the frames that were solved.
 """
 
 import fcntl
 import hashlib
-import json
 import os
+import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from soup_nlp.errors import DataError
-from soup_nlp.storage.files import PathLike, as_path, read_text
-from soup_nlp.storage.system import deferred_signals, sweep, temporary_folder
+from soup_nlp.errors import DataError, printable
+from soup_nlp.storage.files import PathLike, as_path, read_text, write_text
+from soup_nlp.storage.system import deferred_signals
 
-MARK = ".soup_nlp"
-"""Hidden file of a folder with results: `Mark` as JSON, its subject under "of"."""
-_STAGE = f"{MARK}-"
-"""First part of the names of temporary folders; the number of their process follows."""
-_COMPLETE = f"{_STAGE}complete-"
-"""The same of those whose files are being moved to their places."""
+SUMS = "SHA256SUMS"
+"""File with the SHA-256 of the files that the program made in a folder."""
+_HEAD = "# soup-nlp "
+"""First line of SUMS, before the subject; `sha256sum -c` ignores it."""
+UNFINISHED = "unfinished-soup-nlp-"
+"""First part of the names of temporary folders; one of a process that was killed stays."""
 
 
-class Mark(NamedTuple):
+class Sums(NamedTuple):
     """SHA-256 by name of the files that the program made in a folder, and subject of the result."""
 
     files: dict[str, str]
     subject: str = ""
 
 
-def mark_of(folder: Path) -> Mark:
-    """The mark of a folder; empty if there is no valid one."""
-    path = folder / MARK
+def read_sums(folder: Path) -> Sums | None:
+    """The list of a folder; None if the program has made nothing there."""
+    path = folder / SUMS
     try:
-        if path.is_symlink():
-            return Mark({})
-        mark = json.loads(read_text(path, MARK))
-        # a damaged mark must not name files outside the folder
-        inside = [n for n in mark["files"] if not PurePosixPath(n).is_absolute() and ".." not in n]
-        return Mark({str(n): str(mark["files"][n]) for n in inside}, str(mark.get("of", "")))
-    except (DataError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return Mark({})
+        text = "" if path.is_symlink() else read_text(path, SUMS)
+    except DataError:
+        return None
+    head, _, lines = text.partition("\n")
+    if not head.startswith(_HEAD):
+        return None
+    rows = re.findall(r"^([0-9a-f]{64})  (\S.*)$", lines, re.MULTILINE)
+    # a damaged list must not name files outside the folder
+    inside = {n: d for d, n in rows if not PurePosixPath(n).is_absolute() and ".." not in n}
+    return Sums(inside, head.removeprefix(_HEAD).strip())
+
+
+def write_sums(folder: Path, sums: Sums) -> None:
+    """Write the list of a folder, see `read_sums`."""
+    lines = [f"{digest}  {name}" for name, digest in sorted(sums.files.items())]
+    write_text(folder / SUMS, "\n".join([f"{_HEAD}{printable(sums.subject)}", *lines, ""]))
 
 
 def files_in(folder: Path) -> list[str]:
-    """Names of all files below a folder, without the mark."""
+    """Names of all files below a folder, without the list."""
     paths = [path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()]
-    return sorted(p.relative_to(folder).as_posix() for p in paths if p != folder / MARK)
+    return sorted(p.relative_to(folder).as_posix() for p in paths if p != folder / SUMS)
 
 
 def digest_of(path: Path) -> str:
@@ -68,29 +74,33 @@ def digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _state(folder: Path, name: str) -> str:
-    """What a folder holds under a name.
+def _state(folder: Path, name: str, made: dict[str, str]) -> str:
+    """What a folder holds under a name: nothing, made (by the program), foreign, or blocked.
 
-    "nothing", "made" by the program, "foreign", or "blocked": by a folder, or by a file or link
-    above it.
+    A name is blocked by a folder, or by a file or link above it.
     """
     path, above = folder / name, [folder / p for p in PurePosixPath(name).parents[:-1]]
     if any(p.is_symlink() or (p.exists() and not p.is_dir()) for p in above):
         return "blocked"
-    if path.is_symlink() or path.is_file():
-        made = not path.is_symlink() and mark_of(folder).files.get(name) == digest_of(path)
-        return "made" if made else "foreign"
-    return "blocked" if path.is_dir() else "foreign" if path.exists() else "nothing"
+    if path.is_file() and not path.is_symlink():
+        return "made" if name in made and made[name] == digest_of(path) else "foreign"
+    blocked = path.is_dir() and not path.is_symlink()
+    return "blocked" if blocked else "foreign" if os.path.lexists(path) else "nothing"
 
 
 def default_folder(name: str, subject: str) -> Path:
     """`out/NAME`, or the first of `out/NAME-2`, ... that holds no result of another subject."""
     names = chain([name], (f"{name}-{k}" for k in count(2)))
-    return next(p for n in names if mark_of(p := Path("out") / n).subject in ("", subject))
+    found = ((p, read_sums(p)) for p in (Path("out") / n for n in names))
+    return next(p for p, sums in found if sums is None or sums.subject in ("", subject))
 
 
 def claim(
-    folder: PathLike, names: Iterable[str], overwrite: bool = False, subject: str = ""
+    folder: PathLike,
+    names: Iterable[str],
+    overwrite: bool = False,
+    subject: str = "",
+    journal: str = "",
 ) -> Path:
     """Check that these files may be written into an output folder, and return it.
 
@@ -100,23 +110,38 @@ def claim(
         folder: The output folder.
         names: Files that will be written.
         overwrite: Allow files of the user with these names, and the result of another subject.
-        subject: Subject of the new result, see `Mark`.
+        subject: Subject of the new result, see `Sums`.
+        journal: File that the command appends to: one that is there must be of this program.
 
     Raises:
         DataError: the folder cannot be written, holds a file of the user or a folder with one of
             the names, or is the result of another subject.
     """
-    with _locked(folder) as target:
-        existing = next(p for p in (target, *target.parents) if os.path.lexists(p))
-        # fails where nothing can be written
-        tempfile.TemporaryFile(dir=existing).close()
-        before = mark_of(target).subject
-        states = {name: _state(target, name) for name in names}
-        foreign = [name for name, state in states.items() if state in ("foreign", "blocked")]
-        hint = "choose another --out, or --overwrite"
-        if subject and before not in ("", subject) and not overwrite:
+    hint = "choose another --out, or --overwrite"
+    with _named_errors(folder):
+        target = Path(os.path.realpath(as_path(folder, "output folder")))
+        if os.path.ismount(target):
+            hint = "choose a folder below it"
+            raise DataError("output folder is a mount point", where=folder, hint=hint)
+        for place in (target, next(p for p in target.parents if os.path.lexists(p))):
+            if os.path.lexists(place):
+                # fails where nothing can be written
+                tempfile.TemporaryFile(dir=place).close()
+        before = read_sums(target)
+        files, old = before or Sums({})
+        if subject and old not in ("", printable(subject)) and not overwrite:
             what = "output folder holds the result of something else"
-            raise DataError(what, where=folder, found=before, expected=subject, hint=hint)
+            raise DataError(what, where=folder, found=old, expected=subject, hint=hint)
+        states = {name: _state(target, name, files) for name in names}
+        if before is None:
+            states[SUMS] = _state(target, SUMS, {})
+        kept = [target / name for name, state in states.items() if state == "blocked"]
+        if journal and _state(target, journal, {}) != "nothing":
+            # a journal grows, so that it is not listed
+            own = before is not None and _state(target, journal, {}) == "foreign"
+            kept += [] if own and not (target / journal).is_symlink() else [target / journal]
+        foreign = [name for name, state in states.items() if state == "foreign"]
+        foreign += [path.relative_to(target).as_posix() for path in kept]
         if foreign and not overwrite:
             raise DataError(
                 "output folder holds files that would be overwritten and that this program did not"
@@ -124,11 +149,11 @@ def claim(
                 where=folder,
                 found=", ".join(foreign),
                 expected="a new or empty folder, or that of an earlier result",
-                hint=hint,
+                hint=f"move them away, {hint}",
             )
-        for name in (name for name in foreign if states[name] == "blocked"):
-            what = "cannot write over a folder, or below a file or link"
-            raise DataError(what, where=target / name)
+        if kept:
+            what = "cannot write over a folder, below a file or link, or into another one's file"
+            raise DataError(what, where=kept[0], hint="choose another --out")
     return Path(folder)
 
 
@@ -136,9 +161,9 @@ def claim(
 def staged(
     folder: PathLike, whole: bool = False, overwrite: bool = False, subject: str = ""
 ) -> Iterator[Path]:
-    """An empty folder whose files are moved into `folder` when the block ends without exception.
+    """An empty folder whose files are those of `folder` when the block ends without exception.
 
-    On an exception the files of `folder` do not change, and no new folder is left.
+    On an exception `folder` does not change, and no new folder is left.
 
     Args:
         folder: The output folder.
@@ -150,94 +175,93 @@ def staged(
         DataError: a file cannot be written, or a file of the user has the name of a new one.
     """
     target = Path(os.path.realpath(as_path(folder, "output folder")))
-    fresh = [p for p in (target, *target.parents) if not os.path.lexists(p)]
+    fresh = [p for p in target.parents if not os.path.lexists(p)]
     with _named_errors(folder):
-        target.mkdir(parents=True, exist_ok=True)
-        recover(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        place = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=target.parent))
+        # unlike the temporary folder, it has the usual permissions
+        new = place / "new"
         try:
-            with temporary_folder(target, _STAGE) as stage:
-                yield stage
-                claim(target, files_in(stage), overwrite)
-                with _locked(target), deferred_signals():
-                    _commit(stage, target, whole, subject)
+            new.mkdir()
+            yield new
+            claim(target, files_in(new), overwrite)
+            with _locked(target.parent), deferred_signals():
+                _commit(new, target, whole, subject)
         except DataError as error:
             # name the final path instead of the temporary one
-            if not isinstance(error.where, Path) or not error.where.is_relative_to(stage):
+            if not isinstance(error.where, Path) or not error.where.is_relative_to(new):
                 raise
-            final = target / error.where.relative_to(stage)
+            final = target / error.where.relative_to(new)
             raise DataError(error.what, where=final, found=error.found, hint=error.hint) from error
         finally:
+            if not (place / "old").exists():
+                shutil.rmtree(place, ignore_errors=True)
             with suppress(OSError):
                 # fails for a folder that is not empty
                 for path in fresh:
                     path.rmdir()
 
 
-def _commit(stage: Path, target: Path, whole: bool, subject: str) -> None:
-    """Mark a temporary folder as complete and move its files to their places."""
-    new, before = {name: digest_of(stage / name) for name in files_in(stage)}, mark_of(target)
-    for name in before.files.keys() & new.keys():
-        if _state(target, name) == "made":
-            shutil.copymode(target / name, stage / name)
+def _commit(new: Path, target: Path, whole: bool, subject: str) -> None:
+    """Give new files their names."""
+    names, before = files_in(new), read_sums(target)
+    made, old = before or Sums({})
+    digests = {name: digest_of(new / name) for name in names}
     # a file that was changed stays listed, so that it is known to be changed
-    files = new if whole else before.files | new
-    of = {"of": subject or before.subject} if subject or before.subject else {}
-    mark = json.dumps({**of, "files": dict(sorted(files.items()))}, indent=1)
-    (stage / MARK).write_text(mark + "\n", encoding="utf-8")
-    for name in (*new, MARK):
+    write_sums(new, Sums(digests if whole else made | digests, subject or old))
+    for name in (*names, SUMS):
         # wait until the file is on disk: some systems report a full disk only here
-        with (stage / name).open("rb") as file:
+        with (new / name).open("rb") as file:
             os.fsync(file.fileno())
-    # from here on, the new files are the result
-    os.replace(stage, target / stage.name.replace(_STAGE, _COMPLETE))
-    _finish(target)
+    if not target.exists():
+        os.rename(new, target)
+        return
+    shutil.copymode(target, new)
+    gone = {n for n in made if whole and _state(target, n, made) == "made"} - digests.keys()
+    # a shell stays in its working folder
+    if whole and before is not None and not Path.cwd().is_relative_to(target):
+        _exchange(new, target, {*digests, *gone, SUMS})
+        return
+    for name in gone:
+        (target / name).unlink()
+    for name in (*names, SUMS):
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(new / name, target / name)
 
 
-def recover(folder: Path) -> None:
-    """Move the files of complete temporary folders to their places; remove incomplete ones.
+def _exchange(new: Path, target: Path, replaced: Set[str]) -> None:
+    """Put a folder in the place of another one, whose other files it gets.
 
-    The incomplete folders of running processes are kept.
+    A kill in between leaves the other folder beside the target.
     """
-    with _locked(folder):
-        pass
+    shared = {parent for name in replaced for parent in PurePosixPath(name).parents}
+    kept = set()
+    for name in set(files_in(target)) - replaced:
+        path = PurePosixPath(name)
+        # a folder with nothing but the user's files moves at once
+        kept.add(next(p for p in (*reversed(path.parents), path) if p not in shared))
+    old = new.with_name("old")
+    os.rename(target, old)
+    try:
+        os.rename(new, target)
+    except OSError:
+        os.rename(old, target)
+        raise
+    for path in kept:
+        (target / path).parent.mkdir(parents=True, exist_ok=True)
+        os.rename(old / path, target / path)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 @contextmanager
-def _locked(folder: PathLike) -> Iterator[Path]:
-    """The real path of an output folder, recovered, and locked until the block ends.
-
-    A kill releases the lock. A missing folder is not locked, nor one in a file system that has no
-    locks, where another process may be moving the same files.
-    """
-    target = Path(os.path.realpath(as_path(folder, "output folder")))
-    with ExitStack() as stack, _named_errors(folder):
+def _locked(folder: Path) -> Iterator[None]:
+    """Other processes that write into folders of this one wait; not where there are no locks."""
+    with ExitStack() as stack:
         with suppress(OSError):
-            handle = os.open(target, os.O_RDONLY | os.O_DIRECTORY)
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
             stack.callback(os.close, handle)
             fcntl.flock(handle, fcntl.LOCK_EX)
-        _finish(target)
-        yield target
-
-
-def _finish(folder: Path) -> None:
-    """See `recover`."""
-    for stage in folder.glob(f"{_COMPLETE}*"):
-        if stage.is_symlink():
-            continue
-        # the mark is moved last: without it, every file was moved
-        if (stage / MARK).is_file():
-            for name in mark_of(folder).files.keys() - mark_of(stage).files.keys():
-                if _state(folder, name) == "made":
-                    (folder / name).unlink(missing_ok=True)
-                    with suppress(OSError):
-                        # removes empty folders only
-                        os.removedirs((folder / name).parent)
-            for name in (*files_in(stage), MARK):
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                with suppress(FileNotFoundError):
-                    os.replace(stage / name, folder / name)
-        shutil.rmtree(stage, ignore_errors=True)
-    sweep(folder, _STAGE)
+        yield
 
 
 @contextmanager

@@ -229,7 +229,8 @@ def _opened(path: PathLike) -> Iterator[h5py.File]:
     """An open file; errors of h5py in the block become DataErrors."""
     require_file(path, "result file")
     try:
-        with h5py.File(path, "r") as file:
+        # file systems of clusters often have no locks
+        with h5py.File(path, "r", locking=False) as file:
             yield file
     except BROKEN as error:
         raise DataError(

@@ -3,14 +3,12 @@
 import ctypes
 import errno
 import os
-import re
-import shutil
 import signal
 import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -123,38 +121,6 @@ def end_with_parent() -> None:
         ctypes.CDLL(None).prctl(pr_set_pdeathsig, int(signal.SIGKILL))
 
 
-_in_use: set[Path] = set()
-"""Temporary folders of this process."""
-
-
-@contextmanager
-def temporary_folder(parent: Path, prefix: str) -> Iterator[Path]:
-    """An empty folder that is removed when the block ends, or after a kill by a later call.
-
-    The number of this process follows the prefix in its name. It may be renamed in the block, and
-    is then kept.
-    """
-    sweep(parent, prefix)
-    with tempfile.TemporaryDirectory(
-        prefix=f"{prefix}{os.getpid()}-", dir=parent, ignore_cleanup_errors=True
-    ) as name:
-        _in_use.add(Path(name))
-        try:
-            yield Path(name)
-        finally:
-            _in_use.discard(Path(name))
-
-
-def sweep(parent: Path, prefix: str) -> None:
-    """Remove temporary folders of ended processes, also if this process has the same number."""
-    for path in parent.glob(f"{prefix}*"):
-        number = re.match(r"(\d{1,9})-", path.name.removeprefix(prefix))
-        if number is None or path in _in_use:
-            continue
-        if int(number[1]) == os.getpid() or not psutil.pid_exists(int(number[1])):
-            shutil.rmtree(path, ignore_errors=True)
-
-
 @contextmanager
 def scratch() -> Iterator[Path]:
     """A temporary folder in the system's folder for these.
@@ -162,15 +128,11 @@ def scratch() -> Iterator[Path]:
     Raises:
         DataError: it cannot be made.
     """
-    root = Path(tempfile.gettempdir())
-    with ExitStack() as stack:
-        try:
-            folder = stack.enter_context(temporary_folder(root, f"soup_nlp-{os.getuid()}-"))
-        except OSError as error:
-            raise DataError(
-                "no temporary folder can be made",
-                where=root,
-                found=error.strerror,
-                hint="set TMPDIR",
-            ) from error
-        yield folder
+    try:
+        folder = tempfile.TemporaryDirectory(prefix="soup_nlp-", ignore_cleanup_errors=True)
+    except OSError as error:
+        where = tempfile.gettempdir()
+        what = "no temporary folder can be made"
+        raise DataError(what, where=where, found=error.strerror, hint="set TMPDIR") from error
+    with folder as name:
+        yield Path(name)

@@ -18,7 +18,7 @@ from soup_nlp.errors import StoppedError
 from soup_nlp.pipeline import case as cases
 from soup_nlp.pipeline.run import run
 from soup_nlp.report import folder as folders
-from soup_nlp.storage.folders import MARK
+from soup_nlp.storage.folders import SUMS
 from soup_nlp.storage.progress import interruptible
 
 pytestmark = pytest.mark.slow
@@ -67,7 +67,7 @@ def test_before_a_start_it_ends_at_once(owner, stage, tmp_path, monkeypatch, cap
     assert "interrupt received" in error
     assert "before there was a start" in error
     assert not (tmp_path / "out" / "summary.json").exists()
-    assert sorted(os.listdir(tmp_path / "out")) == [MARK, folders.FAILED]
+    assert sorted(os.listdir(tmp_path / "out")) == [SUMS, folders.FAILED]
     assert "interrupted" in (tmp_path / "out" / folders.FAILED).read_text()
 
 

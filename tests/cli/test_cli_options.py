@@ -15,7 +15,7 @@ from helpers_files import sets, write_flo, write_pair
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.storage.folders import MARK
+from soup_nlp.storage.folders import SUMS, Sums, write_sums
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("solves_once")]
 
@@ -85,8 +85,8 @@ def test_a_result_folder_is_an_output_but_no_input(solved, tmp_path, capsys):
     foreign(tmp_path / "pair")
     assert main([*args, "--out", str(out)]) in (0, 1)
     assert main(["solve", str(out / "config.yaml"), "--out", str(out), "-q"]) in (0, 1)
-    # without the mark the files have no known origin
-    (out / MARK).unlink()
+    # without the list the files have no known origin
+    (out / SUMS).unlink()
     assert main([*args, "--out", str(out)]) == 2
     assert main([*args, "--out", str(out), "--overwrite"]) in (0, 1)
     for path in (tmp_path / "pair").iterdir():
@@ -95,13 +95,13 @@ def test_a_result_folder_is_an_output_but_no_input(solved, tmp_path, capsys):
     marked.mkdir()
     for path in [*(tmp_path / "pair").iterdir(), out / "depth_ref.png"]:
         (marked / path.name).write_bytes(path.read_bytes())
-    (marked / MARK).touch()
+    write_sums(marked, Sums({}))
     for folder in (out, marked):
         assert main(["solve", str(folder / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
         said = capsys.readouterr().err
         assert "holds a result" in said
-        assert f"delete {MARK} where no solve has left files" in said
-    (out / MARK).unlink()
+        assert f"delete {SUMS} where no solve has left files" in said
+    (out / SUMS).unlink()
     assert main(["solve", str(out / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
     assert "found: summary.json of a solve" in capsys.readouterr().err
 

@@ -17,7 +17,7 @@ from soup_nlp.export.sol import write_sol
 from soup_nlp.model import oracle
 from soup_nlp.model.layout import TangentLayout
 from soup_nlp.solve.stages import solve_soup
-from soup_nlp.storage.folders import MARK
+from soup_nlp.storage.folders import SUMS
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +35,7 @@ def test_a_second_export_removes_the_files_of_the_first(tmp_path):
     assert write(tmp_path, "--superpixels", "12", "-q", "--overwrite") == 0
     names = {p.name for p in tmp_path.iterdir()}
     own = {"soup.nl", "soup.col", "soup.row", "problem.yaml", "manifest.json"}
-    assert names == own | {"mine.casadi", "mine.txt", MARK}
+    assert names == own | {"mine.casadi", "mine.txt", SUMS}
 
 
 def test_sizes_of_equal_number_have_their_own_folders(tmp_path, capsys):

@@ -18,7 +18,7 @@ from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import WRITTEN, CheckReport, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.sequence.folder import convert
-from soup_nlp.storage.folders import MARK, digest_of, files_in
+from soup_nlp.storage.folders import SUMS, Sums, digest_of, files_in, write_sums
 
 pytestmark = pytest.mark.slow
 
@@ -46,10 +46,9 @@ def folder(solved, tmp_path) -> Path:
     return tmp_path / "copy"
 
 
-def mark(folder: Path) -> None:
-    """Make the mark valid for the files as they are now."""
-    digests = {name: digest_of(folder / name) for name in files_in(folder)}
-    (folder / MARK).write_text(json.dumps({"files": digests}))
+def relist(folder: Path) -> None:
+    """Make the list valid for the files as they are now."""
+    write_sums(folder, Sums({name: digest_of(folder / name) for name in files_in(folder)}))
 
 
 def bad(report: CheckReport) -> list[str]:
@@ -65,14 +64,14 @@ def test_every_claim_of_a_result_holds(solved):
 def test_every_file_is_covered(solved):
     rows = [row for row in check_folder(solved).rows if row.how == WRITTEN]
     said = [row.name.removesuffix(" as written") for row in rows]
-    assert said == sorted({p.name for p in solved.iterdir()} - {MARK})
+    assert said == sorted({p.name for p in solved.iterdir()} - {SUMS})
 
 
 @pytest.mark.parametrize("change", ["flipped", "missing", "longer"])
 def test_a_changed_file_is_noticed(change, folder):
     # without these two there is nothing to check
     needed = {"result.h5", "summary.json"} if change != "longer" else set()
-    names = {p.name for p in folder.iterdir()} - {MARK} - needed
+    names = {p.name for p in folder.iterdir()} - {SUMS} - needed
     if change == "flipped":
         # a change by HDF5 itself has valid checksums
         with h5py.File(folder / "result.h5", "a") as file:
@@ -103,10 +102,10 @@ FORGED = {
 
 @pytest.mark.parametrize("place", FORGED)
 def test_forged_arrays_are_recomputed(place, folder):
-    """With a valid mark."""
+    """With a valid list."""
     with h5py.File(folder / "result.h5", "a") as file:
         file[place][...] = 1.01 * file[place][...]
-    mark(folder)
+    relist(folder)
     report = check_folder(folder)
     assert FORGED[place] in bad(report)
     assert f"FAIL {FORGED[place]}" in str(report)
@@ -117,9 +116,8 @@ def test_forged_arrays_are_recomputed(place, folder):
 
 
 @pytest.mark.parametrize("kept", [[], ["depth_ref.png"]])
-def test_a_folder_without_a_valid_mark_is_noticed(kept, folder):
-    files = {name: digest_of(folder / name) for name in kept}
-    (folder / MARK).write_text(json.dumps({"files": files}))
+def test_a_folder_without_a_valid_list_is_noticed(kept, folder):
+    write_sums(folder, Sums({name: digest_of(folder / name) for name in kept}))
     assert bad(check_folder(folder)) == ["files as written"]
 
 

@@ -184,8 +184,20 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     assert main(["check", str(out)]) == 0
     assert "camera poses by pairs and scales" in capsys.readouterr().out
+    for name in ("depth/0000.png", "trajectory.tum"):
+        data = (out / name).read_bytes()
+        (out / name).write_bytes(data[:-20] + bytes([data[-20] ^ 1]) + data[-19:])
+        assert main(["check", str(out)]) == 1
+        assert f"{name} as written" in capsys.readouterr().out.split("FAIL")[-1]
+        (out / name).write_bytes(data)
     assert main(["convert", str(out), "--to", "ply,colmap", "-o", str(tmp_path / "more")]) == 0
     assert main(["view", str(out), "--renew", "--no-open"]) == 0
+    page = (out / "report.html").read_bytes()
+    (out / "report.html").write_bytes(page + b"mine")
+    assert main(["view", str(out), "--renew", "--no-open"]) == 2
+    assert (out / "report.html").read_bytes() == page + b"mine"
+    (out / "report.html").write_bytes(page)
+    capsys.readouterr()
     loaded = soup_nlp.load(out)
     np.testing.assert_allclose(loaded.scales, [row["scale"] for row in told["scales"]])
     assert loaded.name == told["name"]
@@ -224,6 +236,40 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     (tmp_path / "out" / "chain.json").write_text("mine")
     assert main(call) == 2
     assert main([*call, "--overwrite"]) == 0
+    # nor are its pairs replaced under it
+    other = [*call, "--set", "segmentation.superpixels=20"]
+    assert main(other) == 2
+    assert "solved otherwise" in capsys.readouterr().err
+    with monkeypatch.context() as m:
+        m.setattr(solving, "measure_all", ended)
+        assert main([*other, "--overwrite"]) == 130
+    assert main(["check", str(out)]) == 2
+    assert "chain is not finished" in capsys.readouterr().err
+    assert main(call) == 0
+
+
+def ended(*_, **__):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("kind", ["rows", "link of rows", "link of pairs"])
+def test_a_chain_does_not_write_into_what_is_the_users(kind, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(solving, "measure_all", None)
+    out, mine = tmp_path / "out", tmp_path / "mine"
+    out.mkdir()
+    if kind == "rows":
+        (out / "pairs.jsonl").write_text("mine")
+    elif kind == "link of rows":
+        mine.write_text("mine")
+        (out / "pairs.jsonl").symlink_to(mine)
+    else:
+        mine.mkdir()
+        (out / "pairs").symlink_to(mine)
+    before = sorted(tmp_path.rglob("*"))
+    for more in ([], ["--overwrite"]):
+        assert main(["chain", "scene:street", "--frames", "3", "-o", str(out), "-q", *more]) == 2
+        assert str(out) in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch, capsys):

@@ -168,6 +168,16 @@ def test_a_wrong_ipopt_option_is_a_solver_error(options):
     with pytest.raises(SolverError) as caught:
         Ipopt(nlp, options)(x0=nlp.x0)
     assert "textbook" in str(caught.value)
+    assert "the names of the options" in str(caught.value)
+    with pytest.raises(SolverError) as caught:
+        Ipopt(nlp, {}, options)(x0=nlp.x0)
+    assert "the names of the options" not in str(caught.value)
+
+
+def test_a_log_that_cannot_be_opened_is_left_out(tmp_path):
+    nlp = hs071()
+    log = tmp_path / "removed by another process" / "ipopt.log"
+    assert Ipopt(nlp)(x0=nlp.x0, watch=Watch(log_file=str(log))).converged
 
 
 def test_options_reach_ipopt(tmp_path, monkeypatch):

@@ -3,8 +3,12 @@
 import json
 import os
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -67,6 +71,27 @@ def test_h5_round_trip(tmp_path):
     assert depth == {"units": "scene", "description": "z", "shape_letters": "H,W"}
     assert R == {"units": "m", "description": "length of R", "shape_letters": ""}
     assert labels == {"units": "1", "description": "", "shape_letters": ""}
+
+
+NOLOCK = Path(__file__).resolve().parents[2] / ".." / "shared" / "cases" / "nolock.c"
+
+
+@pytest.mark.skipif(not (shutil.which("gcc") and NOLOCK.is_file()), reason="no gcc, or no source")
+def test_a_file_system_without_locks(tmp_path):
+    library = tmp_path / "nolock.so"
+    command = ["gcc", "-shared", "-fPIC", "-o", str(library), str(NOLOCK), "-ldl"]
+    subprocess.run(command, check=True)
+    text = (
+        "import sys; from soup_nlp.storage import folders, store\n"
+        "with folders.staged(sys.argv[1]) as new: store.write_h5(new / 'r.h5', {'x': 1.0}, {})\n"
+        "assert store.read_h5(sys.argv[1] + '/r.h5')['x'] == 1\n"
+    )
+    words = [sys.executable, "-c", text, str(tmp_path / "out")]
+    environment = {**os.environ, "LD_PRELOAD": str(library)}
+    locked = "import fcntl; fcntl.flock(0, fcntl.LOCK_EX)"
+    assert subprocess.run([sys.executable, "-c", locked], env=environment).returncode == 1
+    environment.pop("HDF5_USE_FILE_LOCKING", None)
+    assert subprocess.run(words, env=environment).returncode == 0
 
 
 def test_h5_compresses_only_large_arrays(tmp_path):

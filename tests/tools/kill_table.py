@@ -2,7 +2,7 @@
 
 Every command first runs undisturbed. Then it runs again and again and gets a signal: half of the
 times at any moment, half of the times while its files are being written. Afterwards the folder
-must hold the old result or the new one, whole, and one more run must leave no temporary files.
+must hold the old result or the new one, whole, and only SIGKILL may leave a temporary folder.
 
 `tests/tools/kill_table.py --disk` runs every command on file systems of its own instead (tmpfs,
 which needs the right to mount): as large as its files and the space that they take while they are
@@ -34,7 +34,7 @@ from soup_nlp.config.problem import load_problem
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import write_sol
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.storage.folders import digest_of, mark_of, recover
+from soup_nlp.storage.folders import SUMS, UNFINISHED, digest_of, read_sums
 
 TINY = [
     "input.width=64", "input.height=48", "flow.source=truth", "segmentation.superpixels=12",
@@ -133,8 +133,7 @@ def exit_code(process: ForkProcess) -> int:
 
 def busy(folder: Path) -> bool:
     """Whether files are being written for a folder."""
-    places = [folder.parent, folder] if folder.is_dir() else [folder.parent]
-    return any(".soup_nlp-" in name for place in places for name in os.listdir(place))
+    return bool(unfinished(folder.parent, folder / "pairs"))
 
 
 def disturbed(
@@ -173,16 +172,21 @@ def broken(folder: Path) -> list[str]:
     """Files of a folder's list that are missing or are not the listed ones."""
     if not folder.is_dir():
         return []
-    recover(folder)
-    listed = mark_of(folder).files
+    listed = files_of(folder)
     wrong = [
         n for n, d in listed.items() if not (folder / n).is_file() or digest_of(folder / n) != d
     ]
-    inner = [p for p in (folder / "pairs").glob("[!.]*") if p.is_dir()]
+    inner = [p for p in (folder / "pairs").glob("[!u]*") if p.is_dir()]
     wrong += [f"pairs/{p.name}/{name}" for p in inner for name in broken(p)]
     there = (p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
     own = {str(p) for p in there if p.parts[0] != "pairs" and p.suffix != ".jsonl"}
-    return wrong + sorted(n for n in own - listed.keys() if not n.startswith(".soup_nlp"))
+    return wrong + sorted(own - listed.keys() - {SUMS})
+
+
+def files_of(folder: Path) -> dict[str, str]:
+    """The list of files of a folder."""
+    sums = read_sums(folder)
+    return sums.files if sums else {}
 
 
 Rows = list[dict[str, object]]
@@ -196,7 +200,7 @@ def told(rows: Rows, **row: object) -> None:
 
 def unfinished(*folders: Path) -> list[str]:
     """Temporary files of the program in some folders."""
-    return [n for p in folders if p.is_dir() for n in os.listdir(p) if ".soup_nlp-" in n]
+    return [n for p in folders for n in (os.listdir(p) if p.is_dir() else ()) if UNFINISHED in n]
 
 
 def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
@@ -223,10 +227,18 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
                     when = f"writing + {delay:.3f} s" if writing else f"{delay:.2f} s"
                     bad = broken(folder)
                     told(rows, command=name, signal=word, when=when, ended=how, broken=bad)
-                ended = f"exit {run(command.words)[0]}"
-                left = unfinished(root, folder, folder / "pairs") + os.listdir(root / "tmp")
-                bad = broken(folder)
-                told(rows, command=name, signal="none", ended=ended, broken=bad, left=left)
+                    left = unfinished(root, folder / "pairs") + os.listdir(root / "tmp")
+                    if how != "SIGKILL":
+                        rows[-1]["left"] = left
+                    for path in (
+                        root / "tmp",
+                        *(p for p in (root, folder / "pairs") if p.is_dir()),
+                    ):
+                        for rest in path.iterdir():
+                            if path.name == "tmp" or rest.name.startswith(UNFINISHED):
+                                shutil.rmtree(rest)
+                ended, bad = f"exit {run(command.words)[0]}", broken(folder)
+                told(rows, command=name, signal="none", ended=ended, broken=bad)
         finally:
             del os.environ["TMPDIR"]
     return rows
@@ -248,7 +260,7 @@ def disk(place: Path, size: int) -> Iterator[None]:
 def listed(folder: Path) -> dict[str, dict[str, str]]:
     """The list of files of a folder and of the results in it."""
     places = [folder, *(folder / "pairs").glob("*")]
-    return {str(p): dict(mark_of(p).files) for p in places if p.is_dir()}
+    return {str(p): files_of(p) for p in places if p.is_dir()}
 
 
 def fill(folder: Path) -> None:

@@ -21,7 +21,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Positive, Whole
 from soup_nlp.storage.files import read_json, read_text
-from soup_nlp.storage.folders import MARK
+from soup_nlp.storage.folders import SUMS, read_sums
 
 LAYOUT = (
     "frame_0.png, frame_1.png, K.txt; optional K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, "
@@ -97,17 +97,17 @@ class FolderInput(FramesInput):
 
 def _refuse_result(folder: Folder) -> None:
     """Raise DataError for a folder with a result."""
-    marked, summary = folder.find(MARK) is not None, None
+    marked, summary = read_sums(folder.path) is not None, None
     with suppress(DataError):
         summary = read_json(folder.path / "summary.json", "summary.json")
     if marked or (isinstance(summary, dict) and "problem_hash" in summary):
         raise DataError(
             "input folder holds a result, whose depth and flow would pass for truth",
             where=folder.path,
-            found=f"the hidden file {MARK} of a solve" if marked else "summary.json of a solve",
+            found=f"{SUMS} of a solve" if marked else "summary.json of a solve",
             expected="a folder with inputs only",
             hint="move the frames, K.txt and the truth to a folder of their own"
-            + (f"; delete {MARK} where no solve has left files" if marked else ""),
+            + (f"; delete {SUMS} where no solve has left files" if marked else ""),
         )
 
 

@@ -1,28 +1,35 @@
-"""Output folders are written whole or not at all, and never overwrite files of the user."""
+"""Output folders are written whole or not at all, and what is the user's stays."""
 
-import json
 import os
-import stat
+import signal
+import subprocess
+import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kill_table import full_disks, table
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.report.folder import write_failure
 from soup_nlp.storage.folders import (
-    MARK,
+    SUMS,
+    UNFINISHED,
+    Sums,
     claim,
     default_folder,
     digest_of,
     files_in,
-    mark_of,
+    read_sums,
     staged,
+    write_sums,
 )
+from soup_nlp.storage.system import deferred_signals, scratch
 
 
 def put(folder: Path, files: Mapping[str, str]) -> None:
@@ -47,8 +54,8 @@ def write(
 
 
 def content(folder: Path) -> dict[str, str]:
-    """Texts by name of a folder's files, without the mark."""
-    return {p.name: p.read_text() for p in folder.iterdir() if p.name != MARK}
+    """Texts by name of a folder's files, without the list."""
+    return {p.name: p.read_text() for p in folder.iterdir() if p.name != SUMS}
 
 
 NAMES = st.sets(st.sampled_from(["a", "b", "c/x", "c/d/y"]), min_size=1)
@@ -76,7 +83,7 @@ def test_results_and_files_of_the_user_share_a_folder(steps):
                 # what the user changed stays listed until the next whole result
                 listed = set(files) if whole else listed | files.keys()
                 made = files if whole else made | files
-                assert mark_of(target).files.keys() == listed
+                assert read_sums(target).files.keys() == listed
             found = {name: (target / name).read_text() for name in files_in(target)}
             assert found == made | mine
             assert all(any(p.iterdir()) for p in target.rglob("*") if p.is_dir())
@@ -162,20 +169,51 @@ def test_foreign_files_are_not_overwritten(kind, tmp_path):
         assert (tmp_path / "elsewhere").read_text() == "precious"
 
 
-def test_a_symbolic_mark_is_not_followed(tmp_path):
+def test_sha256sum_reads_the_list(tmp_path):
+    write(tmp_path / "out", a="1", **{"b/c": "2"})
+    check = partial(subprocess.run, ["sha256sum", "--strict", "-c", SUMS], cwd=tmp_path / "out")
+    assert check().returncode == 0
+    (tmp_path / "out" / "b" / "c").write_text("3")
+    assert check().returncode == 1
+
+
+@pytest.mark.parametrize("kind", ["file", "link", "dangling link"])
+def test_a_list_of_the_user_is_kept(kind, tmp_path):
     target, victim = tmp_path / "out", tmp_path / "victim"
     target.mkdir()
-    victim.write_text("{}")
-    (target / MARK).symlink_to(victim)
-    claim(target, ["a"])
-    write(target, a="1")
-    assert victim.read_text() == "{}"
-    assert not (target / MARK).is_symlink()
-    assert mark_of(target).files.keys() == {"a"}
-    (target / MARK).unlink()
-    (target / MARK).symlink_to("nowhere")
-    write(target, False, b="1")
-    assert sorted(os.listdir(tmp_path)) == ["out", "victim"]
+    write_sums(tmp_path, Sums({}))
+    text = (tmp_path / SUMS).read_text()
+    (tmp_path / SUMS).rename(victim)
+    if kind == "file":
+        (target / SUMS).write_text("mine")
+    else:
+        (target / SUMS).symlink_to(victim if kind == "link" else "nowhere")
+    with pytest.raises(DataError, match=f"found: {SUMS}"):
+        claim(target, ["a"])
+    write(target, overwrite=True, a="1")
+    assert victim.read_text() == text
+    assert not (target / SUMS).is_symlink()
+    assert read_sums(target).files.keys() == {"a"}
+
+
+@pytest.mark.parametrize("kind", ["file", "link", "folder"])
+def test_a_journal_of_the_user_is_not_continued(kind, tmp_path):
+    target = tmp_path / "out"
+    target.mkdir()
+    journal = target / "rows"
+    if kind == "folder":
+        journal.mkdir()
+    elif kind == "link":
+        journal.symlink_to(tmp_path / "elsewhere")
+    else:
+        journal.write_text("mine")
+    for overwrite in (False, True):
+        with pytest.raises(DataError, match="rows"):
+            claim(target, ["a"], overwrite, "s", "rows")
+    if kind == "file":
+        # in a folder of the program it is the program's
+        write(target, a="1")
+        claim(target, ["a"], False, "s", "rows")
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -191,36 +229,29 @@ def test_a_link_on_the_way_leads_out_of_the_folder(overwrite, tmp_path):
     assert sorted(os.listdir(tmp_path / "out")) == ["d", "f"]
 
 
-def test_a_mark_owns_nothing_outside_its_folder(tmp_path):
+def test_a_list_owns_nothing_outside_its_folder(tmp_path):
     (tmp_path / "victim").write_text("1")
     write(tmp_path / "out", a="1")
-    listed = json.loads((tmp_path / "out" / MARK).read_text())
+    listed = read_sums(tmp_path / "out").files
     for name in ("../victim", str(tmp_path / "victim")):
-        listed["files"][name] = digest_of(tmp_path / "victim")
-    (tmp_path / "out" / MARK).write_text(json.dumps(listed))
+        listed[name] = digest_of(tmp_path / "victim")
+    write_sums(tmp_path / "out", Sums(listed))
     write(tmp_path / "out", b="2")
     assert (tmp_path / "victim").read_text() == "1"
     assert content(tmp_path / "out") == {"b": "2"}
 
 
-@pytest.mark.parametrize("text", ["", "x", "[]", '{"files": 3}', '{"files": {"a": {}}}', "\x00"])
-def test_a_broken_mark_owns_nothing(text, tmp_path):
-    (tmp_path / MARK).write_text(text)
-    (tmp_path / "a").write_text("precious")
-    with pytest.raises(DataError, match="overwritten"):
-        claim(tmp_path, ["a"])
-
-
 @pytest.mark.parametrize("name", ["link", "real", "."])
-def test_the_folder_itself_is_kept(name, tmp_path, monkeypatch):
+def test_a_folder_may_be_a_link_or_the_working_folder(name, tmp_path, monkeypatch):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")
     monkeypatch.chdir(tmp_path / "real" if name == "." else tmp_path)
-    before = os.stat(name).st_ino
     for text in "12":
         write(claim(name, ["a"]), a=text)
     assert content(tmp_path / "real") == {"a": "2"}
-    assert os.stat(name).st_ino == before
+    if name == ".":
+        assert Path.cwd() == tmp_path / "real"
+        assert os.listdir() == sorted(["a", SUMS], key=os.listdir().index)
     assert (tmp_path / "link").is_symlink()
 
 
@@ -261,11 +292,152 @@ def test_files_of_the_user_are_refused_before_anything_is_computed(
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_permissions_are_those_of_the_old_files(tmp_path):
+# --- kills, signals, several processes and full disks ---------------------------------------------
+
+
+def test_a_disk_that_reports_late_that_it_is_full(tmp_path, monkeypatch):
     target = tmp_path / "out"
-    target.mkdir(0o750)
     write(target, a="1")
-    (target / "a").chmod(0o604)
-    write(target, a="2")
-    assert stat.S_IMODE((target / "a").stat().st_mode) == 0o604
-    assert stat.S_IMODE(target.stat().st_mode) == 0o750
+
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as m:
+        m.setattr(os, "fsync", full)
+        with pytest.raises(DataError, match=r"cannot be written[\s\S]*found: No space left"):
+            write(target, a="2")
+    assert content(target) == {"a": "1"}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+KILLED = """
+import os, shutil, signal, sys
+from soup_nlp.storage.folders import staged
+moves = int(sys.argv[2])
+def killing(function):
+    def wrapped(*args, **options):
+        global moves
+        if not moves:
+            os.kill(os.getpid(), signal.SIGKILL)
+        moves -= 1
+        function(*args, **options)
+    return wrapped
+os.rename, shutil.rmtree = killing(os.rename), killing(shutil.rmtree)
+with staged(sys.argv[1], True) as new:
+    for name in "acd":
+        (new / name).write_text("2")
+"""
+
+
+@pytest.mark.parametrize("moves", range(5))
+def test_a_kill_leaves_the_old_or_the_new_result(moves, tmp_path):
+    """Killed before a move: old folder aside, new one in its place, the user's file, clean up."""
+    target = tmp_path / "out"
+    write(target, a="1", b="1")
+    put(target, {"mine": "mine"})
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(target), str(moves)])
+    assert ended.returncode == -signal.SIGKILL
+    (aside,) = tmp_path.glob(f"{UNFINISHED}*")
+    (mine,) = tmp_path.rglob("mine")
+    assert mine.read_text() == "mine"
+    assert mine.parent == (aside / "old" if moves in (1, 2) else target)
+    found = content(aside / "old" if moves == 1 else target)
+    found.pop("mine", None)
+    assert found == ({"a": "1", "b": "1"} if moves < 2 else {"a": "2", "c": "2", "d": "2"})
+
+
+WRITER = """
+import sys
+from soup_nlp.storage.folders import staged
+for k in range(20):
+    with staged(sys.argv[1]) as new:
+        (new / f"{sys.argv[2]}{k}").write_text("1")
+        (new / sys.argv[2]).write_text(str(k))
+"""
+
+
+def test_processes_that_write_into_one_folder_lose_no_files(tmp_path):
+    target = tmp_path / "out"
+    writers = [
+        subprocess.Popen([sys.executable, "-c", WRITER, str(target), name]) for name in "abc"
+    ]
+    assert [writer.wait() for writer in writers] == [0, 0, 0]
+    expected = {f"{name}{k}": "1" for name in "abc" for k in range(20)} | dict.fromkeys("abc", "19")
+    assert content(target) == expected
+    assert read_sums(target).files == {name: digest_of(target / name) for name in expected}
+
+
+def test_scratch_folders_of_other_processes_stay(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    # of a process in another container, as far as anyone can tell
+    other = tmp_path / "soup_nlp-x"
+    other.mkdir()
+    with scratch() as first, scratch() as second:
+        assert first != second
+        assert first.is_dir()
+    assert os.listdir(tmp_path) == [other.name]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits(number):
+    seen = []
+    old = signal.signal(number, lambda *_: seen.append(True))
+    try:
+        with deferred_signals():
+            signal.raise_signal(number)
+            signal.raise_signal(number)
+            assert not seen
+        assert seen == [True]
+    finally:
+        signal.signal(number, old)
+
+
+LIMITED = """
+import resource, sys
+from soup_nlp.cli.main import main
+from soup_nlp.errors import DataError
+from soup_nlp.storage.folders import staged
+from soup_nlp.storage.files import write_json
+from soup_nlp.storage.store import write_h5
+import numpy as np
+resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
+try:
+    with staged(sys.argv[1], True) as new:
+        write_json(new / "small.json", {})
+        write_h5(new / "r.h5", {"x": np.random.default_rng(0).random(20_000)}, {})
+except DataError as error:
+    print(error)
+    sys.exit(2)
+"""
+
+
+def test_a_file_that_cannot_be_written_ends_in_an_error(tmp_path):
+    target = tmp_path / "out"
+    write(target, a="1")
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(target)], capture_output=True, text=True
+    )
+    assert done.returncode == 2, done.stderr
+    assert "cannot be written" in done.stdout
+    assert f"where: {target / 'r.h5'}\n" in done.stdout
+    assert content(target) == {"a": "1"}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+# --- kills and full disks; `tests/tools/kill_table.py --kills 60` makes the whole table --------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows_of", [partial(table, 2), full_disks], ids=["kills", "full disks"])
+def test_kills_and_full_disks_leave_whole_folders(rows_of):
+    try:
+        rows = rows_of(["export"])
+    except subprocess.CalledProcessError as error:
+        pytest.skip(f"file systems cannot be mounted here: {error}")
+    # SIGKILL, SIGTERM and an undisturbed run; a disk with room, without any, and of half the size
+    assert len(rows) == 3
+    for row in rows:
+        assert not row["broken"], row
+        # SIGKILL leaves its temporary folder
+        assert not row.get("left") or row.get("killed"), row
+        assert row.get("earlier kept") or row.get("disk") != "taken", row
