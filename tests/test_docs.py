@@ -131,6 +131,17 @@ def test_the_readme_is_short():
     assert all(len(line) <= 200 for line in lines)
 
 
+def test_the_documents_are_short():
+    written = [
+        *PAGES,
+        ROOT / "CHANGELOG.md",
+        ROOT / "results/NOTES.md",
+        ROOT / "results/speed/NOTES.md",
+    ]
+    words = {page.name: len(page.read_text(encoding="utf-8").split()) for page in written}
+    assert sum(words.values()) <= 30_000, words
+
+
 STORED = {
     **{k: [f"{k}-s0-1024x436"] for k in ("street", "room", "banner")},
     "motorcycle": ["motorcycle"],
