@@ -138,7 +138,7 @@ def test_the_documents_are_short():
         ROOT / "results/NOTES.md",
         ROOT / "results/speed/NOTES.md",
     ]
-    words = {page.name: len(page.read_text(encoding="utf-8").split()) for page in written}
+    words = {str(page): len(page.read_text(encoding="utf-8").split()) for page in written}
     assert sum(words.values()) <= 30_000, words
 
 
