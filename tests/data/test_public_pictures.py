@@ -148,8 +148,14 @@ def tiff(path: Path, tags: dict[int, int], size: tuple[int, int] = (96, 64)) -> 
     ],
 )
 def test_a_raw_photo_is_refused(name: str, tags: dict[int, int], tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"raw photo[\s\S]*expected: [\s\S]*try: develop it"):
+    with pytest.raises(DataError, match=r"raw or HDR photo[\s\S]*expected: [\s\S]*try: develop it"):
         read_image(tiff(tmp_path / name, tags))
+
+
+def test_a_photo_of_high_range_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.hdr"), texture().astype(np.float32))
+    with pytest.raises(DataError, match=r"HDR photo[\s\S]*expected: [\s\S]*try: develop it"):
+        read_image(tmp_path / "a.hdr")
 
 
 @pytest.mark.parametrize("kind", ["gif", "tif", "webp", "png"])

@@ -100,8 +100,9 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
 def _refuse_raw(content: bytes, path: PathLike, what: str) -> None:
     """Raise DataError for a raw photo, of which decoders read the thumbnail."""
     found = "its suffix" if Path(path).suffix.lower() in RAW else ""
-    if content[8:10] == b"CR":
-        found = "the mark of Canon"
+    found = "the mark of Canon" if content[8:10] == b"CR" and content[:1] in b"IM" else found
+    # a small file may be large, and Pillow does not read its size
+    found = "the mark of Radiance HDR" if content.startswith(b"#?") else found
     with contextlib.suppress(Exception):  # of other files, or damaged
         directory = TiffImagePlugin.ImageFileDirectory_v2(content[:8])
         stream = io.BytesIO(content)
@@ -113,7 +114,7 @@ def _refuse_raw(content: bytes, path: PathLike, what: str) -> None:
         found = f"TIFF tag {tags[0]}" if tags else found
     if found:
         raise DataError(
-            f"{what} is a raw photo or holds further pictures, and would give its thumbnail",
+            f"{what} is a raw or HDR photo, or holds further pictures behind a thumbnail",
             where=path,
             found=found,
             expected="one developed picture of 8 or 16 bits",
