@@ -1,0 +1,293 @@
+"""The page of a suite: tables by pair, family and half; a picture of sigma; two pages compared."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.scores import METHODS
+from benchmarks.suites import HALF_B
+from benchmarks.table import (
+    geometric,
+    markdown,
+    metric,
+    numbers,
+    page_text,
+    panels,
+    provenance,
+    save,
+    titled,
+)
+from soup_nlp.errors import DataError
+
+BASELINES = ("unorganised", "rigid", "rigid_filled", "constant")
+"""Depth maps that the solution is compared with."""
+ERROR_COLUMNS = {
+    "metrics.solution.mre": "MRE",
+    "metrics.constant.mre": "constant",
+    "metrics.solution.median_relative": "median",
+    "metrics.solution.delta1": "d<1.25",
+    "metrics.solution.skill": "skill",
+    "metrics.solution_rigid.mre": "on rigid",
+    "metrics.rigid.mre": "rigid",
+    "seen.mre": "seen",
+    "seen.rest": "not seen",
+    "seen.share": "share seen",
+    "moving.mre": "moving",
+    "moving.rest": "rest",
+}
+"""Titles of the errors by family, by column of the frame."""
+SIGMA_COLUMNS = {
+    "sigma.nll": "NLL",
+    "sigma.flat": "flat",
+    "sigma.within1": "within 1",
+    "sigma.within2": "within 2",
+    "sigma.sure_wrong": "sure and wrong",
+    "sigma.wrong_sure": "wrong and sure",
+    "sigma.right_guess": "right but guess",
+    "sigma.ause": "AUSE",
+    "guess": "guess",
+}
+"""Titles of the columns on sigma."""
+DETAILS = {
+    "metrics.solution.sq_rel": "SqRel",
+    "metrics.solution.rmse": "RMSE",
+    "metrics.solution.log_rmse": "log-RMSE",
+    "metrics.solution.delta2": "d<1.25^2",
+    "metrics.solution.delta3": "d<1.25^3",
+    "flow_error.mean": "flow EPE px",
+    "scene_flow.mean": "3D EPE",
+    "scene_flow.mean_truth_length": "of length",
+    "bending_share": "bending",
+}
+"""Titles of further columns of the solution's errors."""
+SECONDS = {"cpu_seconds": "s"}
+ABOUT_ERRORS = (
+    "Means over the pairs. On rigid: the solution, only where one rigid motion of the same flow has"
+    " a depth; rigid: that motion. Seen: superpixels with usable flow (mean confidence above 0.5);"
+    " moving: pixels that move by themselves, where a mask or the true motion is known."
+)
+ABOUT_SIGMA = (
+    "NLL: mean of (error / sigma)^2 / 2 + log sigma of log depth after the median scale; flat: the"
+    " same for the best constant sigma. Within k: share of the pixels within k sigma. Sure and"
+    " wrong: of the pixels with a sigma below 10 %, the share that is wrong by more than 20 %;"
+    " wrong and sure: of those wrong by more than 20 %, the share with a sigma below 10 %; right"
+    " but guess: of those right to 10 %, the share that is called a guess. AUSE: area between the"
+    " sparsification curve of sigma and the oracle's, over the MRE; 0 is perfect, 0.8 to 1 is"
+    " chance. Guess: share of the image."
+)
+ABOUT_HALVES = (
+    "Geometric mean over the families of their mean MRE. Half A has the families that rules were"
+    " chosen on, half B the others (`HALF_B` in benchmarks/suites.py)."
+)
+BETTER = {
+    "baseline": ("baseline", ""),
+    "theirs": ("its MRE", ".4f"),
+    "mre": ("the solution's", ".4f"),
+    "pixels": ("its pixels", ".1%"),
+    "difference": ("difference", "+.4f"),
+}
+"""Columns of the table of baselines that are better."""
+
+
+def write_suite(page: Path, frame: pd.DataFrame, note: str = "") -> None:
+    """Write the page of the rows of one suite, and its picture beside it."""
+    picture = plot_sigma(page.with_suffix(".png"), frame)
+    page.write_text(suite_page(page.stem, frame, note, picture), encoding="utf-8")
+
+
+def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = False) -> str:
+    """The page of the rows of one suite, with or without its picture."""
+    good = frame[frame["ok"].eq(True)]
+    scored = good[metric(good).notna()]
+    settings = ", ".join(sorted(frame["settings"].astype(str).unique()))
+    beaten = beating(scored)["title"].nunique()
+    verdict = (
+        f"{len(good)} of {len(frame)} pairs measured, {int(numbers(good, 'good').sum())}"
+        f" converged. The solution beats every baseline on {len(scored) - beaten} of {len(scored)}"
+        " (MRE)."
+    )
+    about = f"{provenance(frame)}; settings {settings} (one a flow source)."
+    blocks = [f"# Accuracy on {name}", note, verdict, about]
+    if len(scored):
+        by_pair = scored.set_axis(pd.Index(scored["title"], name="pair, flow"))
+        blocks += ["## MRE, one median scale per image, no cap", _by_pair(by_pair)]
+        blocks += ["## By half", ABOUT_HALVES, _halves(scored)]
+        blocks += ["## By family", ABOUT_ERRORS, _by_family(scored, ERROR_COLUMNS)]
+        blocks += [*_better_baselines(scored), "## Sigma", ABOUT_SIGMA]
+        blocks += [_by_family(scored, SIGMA_COLUMNS), _columns(by_pair, SIGMA_COLUMNS)]
+        if picture:
+            blocks.append(f"![Sparsification by sigma, and its reliability]({name}.png)")
+        details = _columns(by_pair, DETAILS, "status", *SECONDS)
+        blocks += ["## The solution", details]
+    return page_text(blocks, frame)
+
+
+def beating(frame: pd.DataFrame) -> pd.DataFrame:
+    """Baselines that are not worse than the solution: title, baseline, its MRE, the solution's.
+
+    The baseline `rigid` is compared on the pixels where it has a depth.
+    """
+    parts = []
+    for baseline in BASELINES:
+        own = "solution_rigid" if baseline == "rigid" else "solution"
+        mre, theirs = metric(frame, own).fillna(metric(frame)), metric(frame, baseline)
+        part = frame[["title"]].assign(baseline=baseline, mre=mre, theirs=theirs)
+        part["pixels"] = metric(frame, baseline, "coverage")
+        parts.append(part[theirs <= mre])
+    return pd.concat(parts, ignore_index=True)
+
+
+def _better_baselines(frame: pd.DataFrame) -> list[str]:
+    better = beating(frame)
+    if better.empty:
+        return []
+    better["difference"] = better["theirs"] - better["mre"]
+    text = "The solution's MRE is on the pixels that the baseline has a depth for."
+    shown = better.set_axis(pd.Index(better["title"], name="pair, flow"))
+    return ["## Baselines that are better", text, titled(shown, BETTER)]
+
+
+def _by_pair(frame: pd.DataFrame) -> str:
+    """Table of family and MRE of every method."""
+    columns = {m: metric(frame, m) for m in METHODS}
+    columns |= {k: metric(frame, name=k) for k in ("skill", "coverage")}
+    table = pd.DataFrame(columns).dropna(axis=1, how="all")
+    table.insert(0, "family", frame["family"])
+    return markdown(table)
+
+
+def _columns(frame: pd.DataFrame, titles: dict[str, str], *texts: str) -> str:
+    """Table of columns under their titles, without numbers that no row has, then of `texts`."""
+    out = pd.DataFrame({title: numbers(frame, c) for c, title in titles.items()})
+    out = out.dropna(axis=1, how="all").join(frame[list(texts)].rename(columns=SECONDS))
+    return markdown(out, dict.fromkeys(out.columns, ".4f") | {"s": ".0f"})
+
+
+def _by_family(frame: pd.DataFrame, titles: dict[str, str]) -> str:
+    """Table of means over the pairs of every family and flow."""
+    table = pd.DataFrame({title: numbers(frame, c) for c, title in titles.items()})
+    groups = table.dropna(axis=1, how="all").groupby([frame["family"], frame["flow"]], sort=False)
+    means = groups.mean()
+    means.insert(0, "pairs", groups.size())
+    return markdown(means, {str(c): "" if c == "pairs" else ".4f" for c in means})
+
+
+def _halves(frame: pd.DataFrame) -> str:
+    """Table of geometric means over families by half and flow, and of means of sigma's columns."""
+    shown = {"MRE": "metrics.solution.mre", "constant": "metrics.constant.mre"}
+    table = pd.DataFrame({title: numbers(frame, column) for title, column in shown.items()})
+    for column, title in SIGMA_COLUMNS.items():
+        table[title] = numbers(frame, column)
+    families = table.groupby([frame["family"], frame["flow"]]).mean().reset_index()
+    half = families["family"].isin(HALF_B).map({True: "B", False: "A"}).rename("half")
+    groups = families.groupby([half, "flow"])
+    means = groups[list(table)].mean()
+    for title in shown:
+        means[title] = groups[title].agg(geometric)
+    means.insert(0, "families", groups.size())
+    return markdown(means, {str(c): "" if c == "families" else ".4f" for c in means})
+
+
+def plot_sigma(path: Path, frame: pd.DataFrame) -> bool:
+    """Sparsification curves by family, and the reliability of sigma; False without any sigma.
+
+    Rows with the true flow are left out where there are others.
+    """
+    shown = frame[numbers(frame, "sigma.ause").notna()]
+    computed = shown[~shown["flow"].str.startswith("truth")]
+    families = (computed if len(computed) else shown).groupby("family", sort=False)
+    if not len(families):
+        return False
+    columns = min(6, families.ngroups + 1)
+    out, axes = panels(-(-(families.ngroups + 1) // columns), columns, 2.4, 2.2)
+    reliable, *others = axes.flat[::-1]
+    for ax in others[: len(others) - families.ngroups]:
+        ax.set_axis_off()
+    for ax, (family, group) in zip(axes.flat, families, strict=False):
+        for curve in group["sigma.curve"]:
+            kept, by_sigma, oracle = np.array(curve)
+            ax.plot(100 * (1 - kept), by_sigma / by_sigma[0], color="#4477aa", lw=1)
+            ax.plot(100 * (1 - kept), oracle / by_sigma[0], color="#bbbbbb", lw=1)
+        ax.axhline(1.0, color="#cc6677", lw=0.8, ls="--")
+        ax.set(ylim=(0, 1.3), xlim=(0, 100))
+        ax.set_title(str(family), fontsize=8)
+        mean = np.mean(
+            [k for k in group["sigma.reliability"] if len(k) == 10] or [[[1, 1]]], axis=0
+        )
+        reliable.loglog(mean[:, 0], mean[:, 1], lw=0.8)
+    reliable.plot((0.003, 3), (0.003, 3), color="black", lw=0.8, ls="--")
+    reliable.set_title("reliability: RMS error of log depth by sigma", fontsize=6)
+    out.supxlabel("most uncertain % removed", fontsize=8)
+    out.supylabel("MRE of the rest / MRE", fontsize=8)
+    out.suptitle("Sparsification: sigma (blue), oracle (grey), chance (dashed)", fontsize=9)
+    save(out, path)
+    return True
+
+
+# --- two pages compared -------------------------------------------------------------------------
+
+
+def read_pages(path: Path) -> pd.DataFrame:
+    """The numbers by pair of a page, or of all pages of a folder: `pair, flow` is the index.
+
+    Raises:
+        DataError: there is no table by pair.
+    """
+    pages = sorted(path.glob("*.md")) if path.is_dir() else [path]
+    merged: dict[str, dict[str, str]] = {}
+    for text in (page.read_text(encoding="utf-8") for page in pages if page.is_file()):
+        for table in re.findall(r"(?:^\| pair, flow \|.*\n)(?:^\|.*\n)*", text, re.MULTILINE):
+            head, _, *lines = (_cells(line) for line in table.splitlines())
+            if "baseline" not in head:
+                for cells in lines:
+                    merged.setdefault(cells[0], {}).update(zip(head[1:], cells[1:], strict=True))
+    if not any("solution" in row for row in merged.values()):
+        raise DataError("no table by pair is there", where=path, expected="pages of `accuracy`")
+    return pd.DataFrame.from_dict(merged, orient="index")
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip().strip("|").split("|")]
+
+
+def comparison(before: pd.DataFrame, after: pd.DataFrame) -> str:
+    """Ratios of the MRE by family and half, after over before, on the pairs that both have.
+
+    A family's ratio is the geometric mean of its pairs; a half's is that of its families.
+
+    Raises:
+        DataError: there is no such pair.
+    """
+    both = after.index.intersection(before.index, sort=False)
+    if both.empty:
+        raise DataError("the pages have no pair in common")
+    old, new = before.loc[both], after.loc[both]
+    family = new["family"] if "family" in new else old["family"]
+    flow = pd.Series([title.rpartition(", ")[2] for title in both], both, name="flow")
+    table = pd.DataFrame({"before": _floats(old, "solution"), "after": _floats(new, "solution")})
+    table["ratio"] = table["after"] / table["before"]
+    table["NLL before"], table["NLL after"] = _floats(old, "NLL"), _floats(new, "NLL")
+    groups = table.groupby([family, flow], sort=False)
+    families = groups.mean()
+    families["ratio"] = groups["ratio"].agg(geometric)
+    families.insert(0, "pairs", groups.size())
+    half = families.index.get_level_values(0).isin(HALF_B)
+    lines = []
+    for name, part in (("A", ~half), ("B", half), ("A and B", half | True)):
+        for which, ratios in families[part].groupby(level="flow")["ratio"]:
+            text = (
+                f"worse by 10 %: {int((ratios > 1.1).sum())}, better: {int((ratios < 0.9).sum())}"
+            )
+            lines.append(
+                f"- half {name}, {which}: {geometric(ratios):.4f} over {len(ratios)}; {text}"
+            )
+    shown = families.dropna(axis=1, how="all")
+    forms = {str(c): "" if c == "pairs" else ".4f" for c in shown}
+    return "\n".join([markdown(shown, forms), "", "Geometric mean of the ratios:", *lines])
+
+
+def _floats(frame: pd.DataFrame, column: str) -> pd.Series:
+    """A column of texts as numbers; NaN where there is none."""
+    return pd.to_numeric(frame.get(column, pd.Series("-", frame.index)), errors="coerce")

@@ -1,0 +1,275 @@
+"""The row of a pair: errors of the solution and of baselines, of what is seen and what is not, of
+sigma, of what moves, of flow and scene flow.
+"""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from benchmarks.suites import SUITES
+from benchmarks.table import Cell
+from soup_nlp import Pair, Run, Soup, Truth, run
+from soup_nlp.arrays import Float, Mask
+from soup_nlp.errors import DataError
+from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.evaluate.metrics import (
+    ERRORS,
+    MEDIAN,
+    UNSCALED,
+    DepthMetrics,
+    depth_metrics,
+    scene_flow_epe,
+    skill,
+)
+from soup_nlp.evaluate.scoring import at_truth, coverage, fill_nearest, score_depths, sparsification
+from soup_nlp.geometry.soup import reconstruct
+from soup_nlp.storage.rows import Row
+
+METHODS: Mapping[str, str] = {
+    "solution": "what the product delivers",
+    "nlp": "the NLP alone, before refinement",
+    "start": "the start: shared motions, scales by contact",
+    "unorganised": "independent superpixels: each with a translation of length 1, no assembly",
+    "solution_rigid": "the solution, only where one rigid motion has a depth",
+    "rigid": "one rigid motion, triangulated; only where it has a depth",
+    "rigid_filled": "the same, holes filled from the nearest pixel",
+    "constant": "a constant depth",
+}
+"""Descriptions of the depth maps, in the order of the tables."""
+KEPT_METRICS = (*ERRORS, "scale", "coverage", "n_pixels")
+"""Depth metrics that a row has beside the skill."""
+SEEN = 0.5
+"""Mean confidence of the flow of a superpixel up to which its pixels count as not seen."""
+SURE = 0.10
+"""Sigma below which a depth claims to be sure."""
+RIGHT, WRONG = 0.10, 0.20
+"""Relative errors up to which a depth is right, and above which it is wrong."""
+
+
+def measure_pair(cell: Cell) -> Row:
+    """Solve and score one pair.
+
+    Raises:
+        SoupError: the pair cannot be solved, or has no true depth.
+    """
+    return scores(solved(cell))
+
+
+def solved(cell: Cell) -> Run:
+    """The run of a pair that can be scored.
+
+    Raises:
+        SoupError: the pair cannot be solved, or has no true depth.
+    """
+    item = cell.item
+    problem = item.problem(cell.overrides)
+    pair = problem.load_pair()
+    # do not solve a pair that cannot be scored
+    if not has_depth(pair.truth):
+        suite = SUITES[item.suite]
+        raise DataError(
+            "pair has no true depth",
+            where=item.key,
+            expected=suite.layout or None,
+            hint=f"get it from {suite.source}" if suite.source else None,
+        )
+    return run(problem, pair=pair)
+
+
+def scores(result: Run) -> Row:
+    """Metrics by method, and what a run says of itself.
+
+    Metrics are of every true pixel after one median scale, without a cap.
+    """
+    maps, truth, solution = depth_maps(result), result.pair.truth, result.solution
+    row = {
+        "status": solution.status,
+        "good": result.solved,
+        "stages": dict(result.seconds),
+        "iterations": sum(stage.iterations for stage in solution.stages),
+        "bending_share": float(result.start.bends.mean()),
+        "guess": result.confidence.guessed,
+        "flow_error": flow_error(result.pair),
+    }
+    if truth is None or not has_depth(truth):
+        return {**row, "metrics": {}}
+    metrics = _rows(score_depths(truth, maps))
+    scale = metrics["solution"]["scale"]
+    z, gt = at_truth(truth, result.reconstruction.depth_ref)
+    sigma = result.reconstruction.sigma_ref
+    counts = MEDIAN.mask(gt) & np.isfinite(z) & (z > 0)
+    if counts.any() and sigma is not None:
+        error = np.log(z[counts] * scale / gt[counts])
+        row["sigma"] = sigma_scores(error, at_truth(truth, sigma)[0][counts])
+    return {
+        **row,
+        "metrics": metrics,
+        "seen": split(truth, maps["solution"], seen(result), scale),
+        "moving": moving(result.pair, maps["solution"]),
+        "scene_flow": _scene_flow(result, scale),
+    }
+
+
+def has_depth(truth: Truth | None) -> bool:
+    """Whether there is a depth to compare with."""
+    if truth is None:
+        return False
+    if truth.depth_ref is not None:
+        return MEDIAN.counts(truth.depth_ref)
+    return truth.points is not None and MEDIAN.counts(truth.points[:, 2])
+
+
+def _rows(scored: Mapping[str, DepthMetrics]) -> dict[str, dict[str, float]]:
+    constant = scored["constant"].mre
+    return {
+        method: {**{k: getattr(m, k) for k in KEPT_METRICS}, "skill": skill(m.mre, constant)}
+        for method, m in scored.items()
+    }
+
+
+def sigma_scores(error: Float, sigma: Float) -> Row:
+    """How well sigma (M,) tells the errors of log depth (M,), both at true pixels.
+
+    Returns:
+        "nll": mean negative log likelihood of a normal distribution, without the constant
+            log(2 pi) / 2: mean of (error / sigma)^2 / 2 + log sigma.
+        "flat": the same for the best constant sigma, the root mean square error.
+        "within1", "within2": share of the pixels within one and two sigma.
+        "sure_wrong": of the sure pixels, the share that is wrong.
+        "wrong_sure": of the wrong pixels, the share that is sure.
+        "right_guess": of the right pixels, the share that is called a guess.
+        "ause": area between the sparsification curve and the oracle's, over the MRE.
+        "curve": (kept share, error, error of the oracle) of the sparsification.
+        "reliability": (mean sigma, root mean square error) by tenths of the pixels by sigma.
+    """
+    relative = np.abs(np.expm1(error))
+    measured = sparsification(relative, sigma)
+    curve = np.round([measured.kept, measured.error, measured.oracle], 5)
+    right, wrong, sure = relative <= RIGHT, relative > WRONG, sigma < SURE
+    rms = max(math.sqrt(float(np.mean(error**2))), 1e-12)
+    tenths = np.array_split(np.argsort(sigma, kind="stable"), 10)
+    within = coverage(error, sigma)
+    return {
+        "nll": float(np.mean(0.5 * (error / sigma) ** 2 + np.log(sigma))),
+        "flat": 0.5 + math.log(rms),
+        "within1": within[0],
+        "within2": within[1],
+        "sure_wrong": _share(wrong, sure),
+        "wrong_sure": _share(sure, wrong),
+        "right_guess": _share(sigma > MOST_SIGMA, right),
+        "ause": measured.ause,
+        "curve": curve.tolist(),
+        "reliability": [
+            [float(np.mean(sigma[k])), math.sqrt(float(np.mean(error[k] ** 2)))]
+            for k in tenths
+            if len(k)
+        ],
+    }
+
+
+def _share(what: Mask, among: Mask) -> float | None:
+    """Share of some pixels that are of another kind; None where there are no such pixels."""
+    return float(what[among].mean()) if among.any() else None
+
+
+def seen(result: Run) -> Mask:
+    """(H, W) True where the superpixel of a pixel has usable flow, see `SEEN`."""
+    labels, flow = result.segmentation.labels, result.pair.flow
+    if flow is None:
+        return np.zeros(labels.shape, bool)
+    flat = labels.ravel()
+    mean = np.bincount(flat, flow.confidence.ravel()) / np.maximum(np.bincount(flat), 1)
+    return np.asarray(mean[labels] > SEEN)
+
+
+def split(truth: Truth, depth: Float, part: Mask, scale: float) -> Row:
+    """MRE of a part of the pixels and of the rest, under the scale of all, and its share."""
+    z, gt = at_truth(truth, depth)
+    inside = at_truth(truth, part.astype(float))[0] > 0
+    counts = MEDIAN.mask(gt) & np.isfinite(z)
+    out: Row = {"share": _share(inside, counts)}
+    for name, mask in (("mre", counts & inside), ("rest", counts & ~inside)):
+        masked = np.where(mask, gt, np.nan)
+        out[name] = depth_metrics(z * scale, masked, UNSCALED).mre if mask.any() else None
+    return out
+
+
+def moving(pair: Pair, depth: Float) -> Row | None:
+    """Errors of independently moving pixels and of all other pixels, under one median scale.
+
+    Components move independently if their true motion is not that of the static scene; without
+    known motions, all do.
+
+    Args:
+        pair: Its truth must have components (0 is the static scene) and dense depth.
+        depth: (H, W) z.
+
+    Returns:
+        "mre" and "rest", the MRE of moving and of other pixels, and the "share" of the former. None
+        without such a truth or without moving pixels.
+    """
+    truth = pair.truth
+    if truth is None or truth.components is None or truth.depth_ref is None:
+        return None
+    label = truth.components
+    part = label > 0
+    if truth.motions is not None:
+        near = np.isclose(truth.motions, truth.motions[0], rtol=0, atol=1e-9).all(axis=(1, 2))
+        part &= ~np.isin(label, np.flatnonzero(near))
+    known = Truth(depth_ref=np.where(label >= 0, truth.depth_ref, np.nan))
+    scale = depth_metrics(depth, truth.depth_ref).scale
+    errors = split(known, depth, part, scale) if has_depth(known) else {"mre": None, "rest": None}
+    return None if errors["mre"] is None or errors["rest"] is None else errors
+
+
+def _scene_flow(result: Run, scale: float) -> dict[str, float | int] | None:
+    """3D end-point error with the depth's own scale; None without truth."""
+    truth = result.pair.truth
+    if truth is None or truth.scene_flow is None or not math.isfinite(scale):
+        return None
+    rec = result.reconstruction
+    return scene_flow_epe(rec.points_next - rec.points_ref, truth.scene_flow, scale=scale)
+
+
+def flow_error(pair: Pair) -> dict[str, float] | None:
+    """Mean and median end-point error of the flow, pixels; None without a true flow."""
+    if pair.flow is None or pair.truth is None or pair.truth.flow is None:
+        return None
+    used = np.isfinite(pair.truth.flow).all(axis=2) & (pair.flow.confidence > 0)
+    if not used.any():
+        return None
+    gap = np.linalg.norm(pair.flow.uv[used] - pair.truth.flow[used], axis=1)
+    return {"mean": float(gap.mean()), "median": float(np.median(gap))}
+
+
+def unorganised(soup: Soup) -> Soup:
+    """The soup before assembly: the scale of every superpixel makes its translation have length 1.
+
+    Two views determine each plane and motion up to a scale, so this is the result of independent
+    superpixels. Superpixels at rest keep their scale.
+    """
+    length = np.linalg.norm(soup.translation, axis=1)
+    tiny = 1e-9 * max(float(length.max(initial=0.0)), 1e-300)
+    unit = np.where(length > tiny, length, 1.0)
+    return Soup(soup.lam / unit, soup.n, soup.d, soup.R, soup.t)
+
+
+def depth_maps(result: Run) -> dict[str, Float]:
+    """(H, W) depths of the reference frame by method.
+
+    "nlp" is present if the NLP was refined, and the rigid depths if a motion fits.
+    """
+    pair, labels = result.pair, result.segmentation.labels
+    known = result.depth_maps
+    out = {k: known[k] for k in ("solution", "nlp", "start") if k in known}
+    alone = reconstruct(unorganised(result.start.soup), labels, pair.K_ref, pair.K_next)
+    out["unorganised"] = alone.depth_ref
+    rigid = known.get("rigid")
+    if rigid is not None:
+        valid = np.isfinite(rigid)
+        out["solution_rigid"] = np.where(valid, result.reconstruction.depth_ref, np.nan)
+        out["rigid"] = rigid
+        if valid.any():
+            out["rigid_filled"] = fill_nearest(rigid)
+    return out

@@ -1,0 +1,215 @@
+"""Accuracy of pairs: contents of rows, scores of sigma, the page, comparison of two pages."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.__main__ import main
+from benchmarks.accuracy import BASELINES, comparison, read_pages, suite_page, write_suite
+from benchmarks.scores import METHODS, measure_pair, moving, sigma_scores, split
+from benchmarks.suites import SUITES
+from benchmarks.table import Cell, Item, frame_of
+from soup_nlp import Pair, Truth
+from soup_nlp.errors import ConfigError
+from soup_nlp.storage.rows import Row, attempt
+
+QUICK = (
+    "segmentation.superpixels=20",
+    "segmentation.neighbours=4",
+    "solver.presolve=false",
+    "solver.max_iter=5",
+    "refine.rounds=1",
+    "refine.particles=6",
+)
+K = np.array([[100.0, 0, 32], [0, 100.0, 24], [0, 0, 1]])
+
+
+def item(scene: str = "orbit", flow: str = "truth", seed: int = 0) -> Item:
+    raw = {"kind": "scene", "scene": scene, "seed": seed, "width": 128, "height": 64}
+    return Item("rendered", scene, f"{scene}-{seed}", flow, raw)
+
+
+def row_of(item: Item, overrides: tuple[str, ...] = QUICK) -> Row:
+    cell = Cell(item, overrides)
+    return {**cell.identity(), **attempt(lambda: measure_pair(cell)), "code": "c"}
+
+
+def text_of(*rows: Row) -> str:
+    return suite_page("T", frame_of(rows))
+
+
+@pytest.mark.slow
+def test_a_row_has_every_number():
+    row = row_of(item())
+    assert row["ok"], row["error"]
+    json.dumps(row, allow_nan=False)
+    table = row["metrics"]
+    assert set(table) == set(METHODS)
+    assert table["constant"]["skill"] == 0.0
+    # one rigid motion with the true flow is exact on a scene of one component
+    assert table["rigid"]["mre"] < 1e-3
+    assert row["flow_error"]["mean"] < 1e-5
+    assert row["scene_flow"]["coverage"] == 1.0
+    # the true flow has confidence everywhere
+    assert row["seen"] == {"share": 1.0, "mre": table["solution"]["mre"], "rest": None}
+    assert 0 <= row["sigma"]["within1"] <= row["sigma"]["within2"] <= 1
+    assert row["sigma"]["curve"][0][0] == 1.0
+
+
+def test_a_pair_that_cannot_be_measured_has_a_reason(tmp_path):
+    with pytest.raises(ConfigError, match="superpixel"):
+        Cell(item(), ("segmentation.superpixel=3",)).identity()
+    # a pair without a truth is not solved
+    for k in (0, 1):
+        cv2.imwrite(str(tmp_path / f"frame_{k}.png"), np.zeros((48, 64, 3), np.uint8))
+    np.savetxt(tmp_path / "K.txt", K)
+    raw = {"kind": "folder", "path": str(tmp_path)}
+    row = row_of(Item("kinect_paper", "s", "p", "dis", raw))
+    assert not row["ok"]
+    suite = SUITES["kinect_paper"]
+    for words in ("pair has no true depth", suite.layout, suite.source):
+        assert words in row["error"]
+    text = text_of(row)
+    assert "0 of 1 pairs measured" in text
+    assert "## Failed" in text
+
+
+def test_a_row_is_identified_by_settings_and_input():
+    def identity(root: str, *overrides: str) -> Row:
+        raw = {"kind": "sintel", "root": root, "scene": "alley_1", "frame": 2}
+        return Cell(Item("sintel", "alley_1", "alley_1-0002", "dis", raw), overrides).identity()
+
+    here, final = identity("/a"), identity("/a", "input.render=final")
+    assert here == identity("/b")
+    assert here["settings"] == final["settings"]
+    assert here["input"] != final["input"]
+    assert here["settings"] == Cell(item(), ("flow.source=dis",)).identity()["settings"]
+    assert here["settings"] != Cell(item()).identity()["settings"]
+    assert here["settings"] != identity("/a", "energy.weights.cont=9.0")["settings"]
+
+
+def test_sigma_is_scored_by_what_it_says():
+    # half of the pixels are exact and sure, half are off by a factor of 2
+    error = np.repeat([0.0, np.log(2.0)], 50)
+    honest = sigma_scores(error, np.where(error > 0, 1.0, 0.05))
+    assert honest["sure_wrong"] == honest["wrong_sure"] == honest["right_guess"] == 0.0
+    assert honest["nll"] == pytest.approx(0.25 * np.log(2) ** 2 + 0.5 * np.log(0.05))
+    assert honest["nll"] < honest["flat"] == pytest.approx(0.5 + 0.5 * np.log(np.log(2) ** 2 / 2))
+    assert honest["ause"] == pytest.approx(0.0, abs=1e-9)
+    assert [len(honest["reliability"]), honest["reliability"][-1][0]] == [10, 1.0]
+    false = sigma_scores(error, np.where(error > 0, 0.05, 1.0))
+    assert (false["sure_wrong"], false["wrong_sure"], false["right_guess"]) == (1.0, 1.0, 1.0)
+    assert false["nll"] > honest["flat"]
+    flat = sigma_scores(error, np.full(100, np.sqrt(np.mean(error**2))))
+    assert flat["nll"] == pytest.approx(flat["flat"])
+    assert sigma_scores(np.zeros(20), np.ones(20))["wrong_sure"] is None
+
+
+def test_what_is_seen_is_scored_under_the_scale_of_all():
+    gt = np.full((10, 10), 4.0)
+    gt[0] = np.nan
+    depth, part = np.where(np.arange(10) < 6, 2.0, 3.0) * np.ones((10, 1)), np.zeros((10, 10), bool)
+    part[:, :6] = True
+    assert split(Truth(depth_ref=gt), depth, part, 2.0) == {"share": 0.6, "mre": 0.0, "rest": 0.5}
+
+
+def test_moving_pixels_are_told_apart_under_one_scale():
+    label = np.zeros((40, 60), np.int32)
+    label[5:15, 5:25], label[30:, 50:] = 1, 2
+    label[:, 0] = -1
+    depth = np.full((40, 60), 4.0)
+    # the first component comes out at half of its depth, the second is exact
+    estimate = np.where(label == 1, 2.0, 4.0) / 7
+    pair = Pair(
+        *(np.zeros((40, 60, 3), np.uint8) for _ in range(2)),
+        *(np.array([[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]]) for _ in range(2)),
+        truth=Truth(depth_ref=depth, components=label),
+    )
+    errors = moving(pair, estimate)
+    assert (errors["mre"], errors["rest"]) == pytest.approx((0.5 * 200 / 300, 0.0), abs=1e-12)
+    still = replace(pair, truth=Truth(depth_ref=depth, components=0 * label))
+    assert moving(still, estimate) is None
+
+
+def solved(suite: str, pair: str = "p", family: str = "s", mre: float = 0.03) -> Row:
+    """A row without a solve."""
+    metrics = {
+        "solution": {"mre": mre, "skill": 0.25, "coverage": 1.0},
+        "constant": {"mre": 0.04, "coverage": 1.0},
+    }
+    return {
+        **{"key": pair, "ok": True, "good": True, "suite": suite, "pair": pair, "error": None},
+        **{"family": family, "flow": "dis", "status": "x", "code": "c", "overrides": []},
+        **{"metrics": metrics, "cpu_seconds": 1.0, "settings": "0"},
+    }
+
+
+def test_pairs_of_one_name_are_told_apart_by_their_suite():
+    text = text_of(solved("kitti2012"), solved("kitti2015"))
+    assert all(f"| kitti{year} p, dis |" in text for year in (2012, 2015))
+
+
+def test_one_rigid_motion_is_compared_on_its_own_pixels():
+    row = solved("shared")
+    metrics = row["metrics"]
+    metrics |= {"rigid": {"mre": 0.025, "coverage": 0.6}, "solution_rigid": {"mre": 0.02}}
+    assert "beats every baseline on 1 of 1" in text_of(row)
+    metrics["solution_rigid"]["mre"] = 0.026
+    text = text_of(row)
+    assert "beats every baseline on 0 of 1" in text
+    assert "| p, dis | rigid | 0.0250 | 0.0260 | 60.0% | -0.0010 |" in text
+    assert set(BASELINES) <= set(METHODS)
+
+
+def test_sigma_has_columns_and_a_picture_of_its_curves(tmp_path):
+    rows = [solved("shared", p) | {"family": p, "guess": 0.1} for p in ("a", "b")]
+    write_suite(tmp_path / "without.md", frame_of(rows))
+    assert not (tmp_path / "without.png").exists()
+    error = np.linspace(0, 0.3, 40)
+    for row in rows:
+        row["sigma"] = sigma_scores(error, error + 0.01)
+    write_suite(tmp_path / "shared.md", frame_of(rows))
+    text = (tmp_path / "shared.md").read_text()
+    assert "| pair, flow | NLL | flat | within 1 | within 2 | sure and wrong | wrong" in text
+    assert "](shared.png)" in text
+    assert (tmp_path / "shared.png").stat().st_size > 5000
+
+
+def test_two_pages_are_compared_by_family_and_half(tmp_path):
+    before = [solved("shared", p, f) for p, f in (("a", "street"), ("b", "street"), ("c", "room"))]
+    before.append(solved("shared", "d", "flying3d"))
+    after = [row | solved("shared", row["pair"], row["family"], 0.06) for row in before]
+    after[1]["metrics"]["solution"]["mre"] = after[2]["metrics"]["solution"]["mre"] = 0.03
+    after.append(solved("shared", "new", "sheet"))
+    for name, rows in (("before", before), ("after", after)):
+        (tmp_path / name).mkdir()
+        write_suite(tmp_path / name / "shared.md", frame_of(rows))
+    text = comparison(read_pages(tmp_path / "before"), read_pages(tmp_path / "after"))
+    assert "| street | dis | 2 | 0.0300 | 0.0450 | 1.4142 |" in text
+    assert "half A, dis: 1.1892 over 2; worse by 10 %: 1, better: 0" in text
+    assert "half B, dis: 2.0000 over 1; worse by 10 %: 1, better: 0" in text
+    assert main(["compare", str(tmp_path / "before"), str(tmp_path / "before/shared.md")]) == 0
+    assert main(["compare", str(tmp_path), str(tmp_path)]) == 2
+
+
+def test_command_line(tmp_path, capsys):
+    words = ["accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
+    words += ["--width", "128", "--out", str(tmp_path)]
+    words += [w for o in QUICK for w in ("--set", o)]
+    assert main(words) == 0
+    out = capsys.readouterr()
+    listed, measured = out.err.splitlines()
+    assert listed == "suite rendered: 1 of 1 pairs found"
+    assert measured.startswith("1/1  rendered/orbit-s0-128x54/truth  MRE 0.")
+    assert (tmp_path / "rendered.md").read_text() in out.out
+    # nothing is measured twice
+    before = (tmp_path / "rendered.jsonl").read_text()
+    assert main(words) == 0
+    assert (tmp_path / "rendered.jsonl").read_text() == before
+    assert main([*words, "--set", "segmentation.neighbours=99"]) == 1
+    assert "K-NN" in capsys.readouterr().out
+    assert main(["accuracy", "--suite", "imagenet"]) == 2
+    assert "kinect_tshirt" in capsys.readouterr().err

@@ -1,0 +1,82 @@
+"""Suites: lists of pairs, available pairs, and messages on the source of missing ones."""
+
+import pytest
+
+from benchmarks.__main__ import main
+from benchmarks.suites import HALF_B, SINGLE, SUITES, Options, list_suite, spread
+
+
+def test_suites_list_the_papers_pairs(tmp_path):
+    assert set(SUITES) == {
+        *("rendered", "everyday", "shared", "sintel", "kitti2012", "kitti2015", "vkitti"),
+        *("kinect_paper", "kinect_tshirt"),
+    }
+    for name, size in (("rendered", (320, 136)), ("everyday", (200, 150))):
+        items = list_suite(name, None, Options(width=320, seeds=(0, 3), flows=("dis",)))
+        assert len({i.key for i in items}) == len(items) == (12 if name == "rendered" else 14)
+        problem = items[0].problem(["segmentation.superpixels=60"])
+        assert (problem.input.width, problem.input.height) == size
+    for name, count in (("sintel", 120), ("vkitti", 120), ("kitti2012", 194), ("kitti2015", 200)):
+        items = list(SUITES[name].items(tmp_path, Options()))
+        assert len({i.key for i in items}) == count
+        for i in items[:: count // 5]:
+            i.problem()  # is a problem that the program accepts
+    assert spread(10, 3) == [1, 5, 8]
+    assert spread(4, 9) == [0, 1, 2, 3]
+
+
+def test_a_suite_lists_the_pairs_whose_files_exist(tmp_path):
+    base = tmp_path / "data" / "sintel" / "training" / "clean" / "alley_1"
+    base.mkdir(parents=True)
+    suite = SUITES["sintel"]
+    frames = [i.input["frame"] for i in suite.items(tmp_path, Options())][:2]
+    for frame in frames:
+        (base / f"frame_{frame:04d}.png").touch()
+    (base / f"frame_{frames[0] + 1:04d}.png").touch()
+    told = []
+    listed = list_suite("sintel", tmp_path / "data", say=told.append)
+    assert told == ["suite sintel: 1 of 120 pairs found"]
+    assert [i.input["frame"] for i in listed] == frames[:1]
+
+
+def test_a_pair_is_listed_with_every_flow_that_it_has(tmp_path):
+    flows = [i.flow for i in list_suite("rendered", None, Options(only=("street",)))]
+    assert flows == ["truth", "dis"]
+    (tmp_path / "tum_fr1").mkdir()
+    (tmp_path / "tum_fr1" / "frame_0.png").touch()
+    listed = list_suite("shared", tmp_path)
+    assert {(i.name, i.flow) for i in listed} == {
+        ("motorcycle", "truth"), ("motorcycle", "dis"), ("tum_fr1", "dis"),
+    }  # fmt: skip
+
+
+def test_sintel_needs_cameras_except_for_the_known_scene(tmp_path):
+    suite = SUITES["sintel"]
+    for i in suite.items(tmp_path, Options()):
+        if i.family in ("alley_1", "temple_2"):
+            for path in i.needs:
+                if path.suffix == ".png":
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    path.touch()
+    assert {i.family for i in list_suite("sintel", tmp_path)} == {"alley_1"}
+    camera = tmp_path / "camdata_left" / "temple_2"
+    camera.mkdir(parents=True)
+    for frame in range(1, 51):
+        (camera / f"frame_{frame:04d}.cam").touch()
+    assert len(list_suite("sintel", tmp_path)) == 48
+
+
+@pytest.mark.parametrize("name", [n for n, s in SUITES.items() if s.layout])
+def test_a_missing_dataset_says_where_to_get_it(name, tmp_path, capsys):
+    assert main(["accuracy", "--suite", name, "--data", str(tmp_path)]) == 2
+    text = capsys.readouterr().err
+    assert "get it from" in text
+    assert "expected:" in text
+
+
+def test_the_shared_pairs_are_split_in_two_halves_by_family(tmp_path):
+    items = list(SUITES["shared"].items(tmp_path, Options(flows=("dis",))))
+    families = {i.family for i in items}
+    assert len({i.key for i in items}) == len(items)
+    assert {*SINGLE, *HALF_B} <= families
+    assert {i.name for i in items if i.family == "kitti2012_074"} == {"kitti2012 000074"}
