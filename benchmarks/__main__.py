@@ -3,15 +3,26 @@
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import pandas as pd
 import typer
 
+from benchmarks import chain as chains
+from benchmarks import paper as papers
+from benchmarks import speed as speeds
 from benchmarks.accuracy import comparison, read_pages, write_suite
+from benchmarks.family.instances import SCENES, SIZES, STARTS, VERSION, select
+from benchmarks.family.write import check_sol, family_tasks, write_family
 from benchmarks.scores import measure_pair
+from benchmarks.solvers import write_results
 from benchmarks.suites import SUITES, Options, list_suite
 from benchmarks.table import Cell, measure
 from soup_nlp import SoupError
+from soup_nlp.export.compare import compare as run_solvers
+from soup_nlp.export.compare import page as solver_page
+from soup_nlp.export.verify import Limits
+from soup_nlp.storage.files import write_text
 
 app = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, help="Accuracy and speed, measured."
@@ -33,6 +44,19 @@ def numbers(text: str) -> list[int]:
         raise typer.BadParameter(f"{text!r} is no comma-separated list of whole numbers") from None
 
 
+def listed(text: str) -> list[str]:
+    """Different words of a comma-separated list."""
+    return [*dict.fromkeys(word.strip() for word in text.split(",") if word.strip())]
+
+
+def finish(page: Path, frame: pd.DataFrame, text: str | None = None) -> int:
+    """Write a page, if its text is given, and print it; 1 if a row failed."""
+    if text is not None:
+        write_text(page, text)
+    print(page.read_text(encoding="utf-8"))
+    return int(not frame["ok"].eq(True).all())
+
+
 @app.command()
 def accuracy(
     suite: Annotated[list[str], typer.Option(help=f"{', '.join(SUITES)}; may be repeated.")],
@@ -44,21 +68,22 @@ def accuracy(
     width: Annotated[int, typer.Option(min=64, help="Columns of rendered scenes.")] = 1024,
     seeds: Annotated[str, typer.Option(help="Seeds of rendered scenes.")] = "0",
     workers: Workers = 1,
+    cluster: Annotated[str | None, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = None,
     name: Annotated[str, typer.Option(help="Name of the page of one suite.")] = "",
 ) -> int:
     """Depth against truth on suites of pairs; a run that was stopped goes on."""
     wanted = Options(tuple(flow or ()), width, tuple(numbers(seeds)), tuple(only or ()))
     say = partial(print, file=sys.stderr)
     suites = {each: list_suite(each, data, wanted, say) for each in suite}
-    good = True
+    codes = []
     for each, items in suites.items():
         page = out / f"{name or each}.md"
         cells = [Cell(item, tuple(overrides or ())) for item in items]
-        frame = measure(cells, measure_pair, page.with_suffix(".jsonl"), workers)
+        rows = page.with_suffix(".jsonl")
+        frame = measure(cells, measure_pair, rows, workers, cluster=cluster)
         write_suite(page, frame, f"Suite `{each}`: {SUITES[each].text}.")
-        print(page.read_text(encoding="utf-8"))
-        good &= bool(frame["ok"].eq(True).all())
-    return int(not good)
+        codes.append(finish(page, frame))
+    return max(codes)
 
 
 @app.command()
@@ -68,13 +93,127 @@ def compare(before: Path, after: Path) -> int:
     return 0
 
 
+@app.command()
+def paper(
+    data: Data = None,
+    out: Out = Path("results/paper"),
+    superpixels: Annotated[int, typer.Option(help="N of the comparison.")] = 1000,
+    analysis: Annotated[int, typer.Option(help="N of the other sections.")] = 500,
+    limit: Annotated[int | None, typer.Option(min=1, help="Most pairs a dataset.")] = None,
+    overrides: Set = None,
+    workers: Workers = 1,
+) -> int:
+    """The paper's tables by `preset: paper` and the defaults; a run that was stopped goes on."""
+    plan = papers.make_plan(data, superpixels, analysis, limit, tuple(overrides or ()))
+    print("\n".join(papers.pairs_found(plan)), file=sys.stderr)
+    page, cells = out / "README.md", list(plan.drop_duplicates("key")["cell"])
+    frame = measure(cells, measure_pair, page.with_suffix(".jsonl"), workers)
+    note = f"Superpixels wanted: {superpixels} in the comparison, {analysis} elsewhere."
+    papers.write_paper(page, frame, plan, note)
+    return finish(page, frame)
+
+
+@app.command()
+def speed(
+    scenes: Annotated[str, typer.Option(help="Rendered ones, motorcycle.")] = "street,motorcycle",
+    superpixels: Annotated[str, typer.Option(help="N.")] = "250,500,1000,2000",
+    neighbours: Annotated[str, typer.Option(help="K of the K-NN graph.")] = "15",
+    seeds: str = "0",
+    pairs: Annotated[str, typer.Option(help="Words of names of pairs of suite shared.")] = "",
+    data: Data = None,
+    widths: Annotated[str, typer.Option(help="Columns of rendered scenes.")] = "1024",
+    overrides: Set = None,
+    out: Out = Path("out/bench/speed"),
+    name: Annotated[str, typer.Option(help="Name of the page.")] = "table",
+) -> int:
+    """Time solves over N, K and image size, each in a process of its own.
+
+    The refinement is left out; --set refine.enabled=true measures whole solves.
+    """
+    chosen = listed(scenes), numbers(seeds), numbers(widths), listed(pairs), data
+    items = speeds.timed_pairs(*chosen)
+    n, k = numbers(superpixels), numbers(neighbours)
+    cells, page = speeds.speed_cells(items, n, k, overrides or []), out / f"{name}.md"
+    frame = measure(cells, speeds.measure_speed, page.with_suffix(".jsonl"), fresh=True)
+    return finish(page, frame, speeds.speed_page(frame))
+
+
+@app.command()
+def chain(
+    data: Data = None,
+    only: Only = None,
+    overrides: Set = None,
+    out: Out = Path("out/bench/accuracy"),
+) -> int:
+    """What one scale costs on rendered sequences, and on kitti_tracking in the --data folder."""
+    chosen = [i for i in chains.sequences(data) if not only or any(w in i.name for w in only)]
+    cells, page = [Cell(item, tuple(overrides or ())) for item in chosen], out / "chain.md"
+    frame = measure(cells, chains.measure_chain, page.with_suffix(".jsonl"))
+    return finish(page, frame, chains.chain_page(frame))
+
+
+# --- problems for solvers -------------------------------------------------------------------------
+
+
+def _joined(values: tuple[Any, ...]) -> str:
+    return ",".join(map(str, values))
+
+
+@app.command()
+def family(
+    out: Annotated[Path, typer.Argument(help="Folder of the set, new or of an earlier one.")],
+    sizes: Annotated[str, typer.Option(help=f"Superpixels, of {_joined(SIZES)}.")] = "100,250",
+    scenes: str = _joined(SCENES),
+    formulation: Annotated[Words, typer.Option(help="gauge/norm or tangent/norm.")] = None,
+    starts: Annotated[
+        str, typer.Option(help="easy (presolved), hard (initialisation), cold (constant depth).")
+    ] = _joined(STARTS),
+) -> int:
+    """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
+    chosen = select(numbers(sizes), listed(scenes), formulation or [""], listed(starts))
+    entries = write_family(out, chosen)
+    differing = sum(e["published"] is False for e in entries)
+    print(f"{len(entries)} instances in {out}/; {differing} are not the published bytes")
+    return int(differing > 0)
+
+
+@app.command()
+def check(sol: Annotated[Path, typer.Argument(help="NAME.sol of an instance of the set.")]) -> int:
+    """Recompute objective and residuals of a solver's answer to an instance of the set."""
+    text, good = check_sol(sol)
+    print(text)
+    return int(not good)
+
+
+@app.command()
+def solvers(
+    folders: Annotated[list[Path], typer.Argument(help="Folders of `family`.")],
+    names: Annotated[str, typer.Option("--solvers", help="As of `soup-nlp compare`.")] = "soup-nlp",
+    seconds: Annotated[float, typer.Option(help="CPU time limit of a run.")] = 60.0,
+    iterations: Annotated[int, typer.Option(help="Iteration limit of a run.")] = 300,
+    out: Out = Path("out/bench/solvers"),
+) -> int:
+    """Run solvers on the set, verify their claims, draw profiles, write results.json."""
+    limits = Limits(seconds, iterations)
+    tasks = [task for folder in folders for task in family_tasks(folder)]
+    rows = run_solvers(tasks, listed(names), limits, out / "runs.jsonl")
+    table = write_results(out, rows, {"set": "SOUP", "version": VERSION})
+    write_text(out / "README.md", solver_page(rows, limits) + "\n" + table)
+    return int(not any(row.get("verified") for row in rows))
+
+
 def main(words: list[str] | None = None) -> int:
     """Run a command; returns its exit code."""
     try:
         return int(app(words, standalone_mode=False) or 0)
     except SoupError as error:
         print(error, file=sys.stderr)
-        return 2
+    except typer.BadParameter as error:
+        print(error.format_message(), file=sys.stderr)
+    except KeyboardInterrupt:
+        print("interrupted: the rows that were measured are kept", file=sys.stderr)
+        return 130
+    return 2
 
 
 if __name__ == "__main__":

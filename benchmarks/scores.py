@@ -24,7 +24,7 @@ from soup_nlp.evaluate.metrics import (
 )
 from soup_nlp.evaluate.scoring import at_truth, coverage, fill_nearest, score_depths, sparsification
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.storage.rows import Row
+from soup_nlp.storage.each import Row
 
 METHODS: Mapping[str, str] = {
     "solution": "what the product delivers",

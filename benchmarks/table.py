@@ -23,7 +23,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from soup_nlp import Problem, make_problem
-from soup_nlp.storage.rows import Job, Row, attempt, measure_all, reason
+from soup_nlp.storage.each import Row
+from soup_nlp.storage.rows import Job, measure_all, reason
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -104,14 +105,17 @@ def _hash(section: Any, exclude: set[str]) -> str:
 
 
 def measure(
-    cells: Iterable[Cell], work: Callable[[Cell], Row], rows: Path, workers: int = 1
+    cells: Iterable[Cell], work: Callable[[Cell], Row], rows: Path, workers: int = 1, **options: Any
 ) -> pd.DataFrame:
-    """The frame of the rows of cells, which a JSON-lines file holds or which are measured."""
-    jobs = [Job(cell.identity(), partial(attempt, partial(work, cell))) for cell in cells]
-    return frame_of(measure_all(jobs, rows, workers, say=_say))
+    """The frame of the rows of cells, which a JSON-lines file holds or which are measured.
+
+    `workers` and `options` are those of `soup_nlp.storage.each.each`.
+    """
+    jobs = [Job(cell.identity(), partial(work, cell)) for cell in cells]
+    return frame_of(measure_all(jobs, rows, workers, say=say_row, **options))
 
 
-def _say(done: int, total: int, row: Row) -> None:
+def say_row(done: int, total: int, row: Row) -> None:
     """Print a new row."""
     mre = row.get("metrics", {}).get("solution", {}).get("mre")
     result = f"MRE {show(mre)}" if row["ok"] else f"failed: {reason(row)}"

@@ -1,6 +1,8 @@
 """Errors that a user can act on: what, where, found, expected, what to try."""
 
 import reprlib
+from importlib import import_module
+from typing import Any
 
 LONGEST = 1000
 """Characters of a text from outside that a message repeats."""
@@ -128,3 +130,24 @@ def repr_of(value: object) -> str:
         return reprlib.repr(value)
     except Exception as error:  # of a class of the user's own
         return f"({type(error).__name__})"
+
+
+def optional(package: str, extra: str) -> Any:
+    """An optional package.
+
+    Args:
+        package: Its name for `import`.
+        extra: The extra of soup-nlp that installs it.
+
+    Raises:
+        ConfigError: it is not installed; the message names the extra.
+    """
+    try:
+        return import_module(package)
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            "an optional package is missing",
+            where=package,
+            found=error,
+            hint=f"pip install 'soup-nlp[{extra}]'",
+        ) from error

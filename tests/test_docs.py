@@ -87,10 +87,9 @@ def keys(model: type[BaseModel], prefix: str = "") -> set[str]:
 
 @cache
 def commands() -> set[str]:
-    """Every command and subcommand of the command line."""
+    """Every command of the command line."""
     group = typer.main.get_command(app)
-    out = set(group.commands)
-    return out | {f"bench {name}" for name in group.commands["bench"].commands}
+    return set(group.commands)
 
 
 SECTIONS = "segmentation|flow|start|energy|formulation|solver|refine|expected|output"
@@ -108,8 +107,8 @@ def test_files_keys_and_commands_that_are_named_exist(page):
         # a picture flow.png is none
         assert key in known or key.endswith((".png", ".flo")), key
     known = commands()
-    assert {"solve", "bench speed"} <= known
-    for command in re.findall(r"soup-nlp (bench [a-z][a-z-]+|[a-z]+)\b", text):
+    assert {"solve", "batch"} <= known
+    for command in re.findall(r"soup-nlp ([a-z]+)\b", text):
         assert command in known, command
 
 

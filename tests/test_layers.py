@@ -27,17 +27,16 @@ DOORS = {
     ("start", "model"): {"model.energy_data"},
     ("solve", "data"): {"data.pair"},
     ("refine", "data"): {"data.pair", "data.census"},
-    ("family", "data"): {"data.pair"},
 }
 """Where one room may enter another only through some of its modules."""
 
 LIBRARIES = {
-    "casadi": {"model", "solve", "export", "family", "bench"},
-    "matplotlib": {"bench"},
+    "casadi": {"model", "solve", "export"},
+    "joblib": {"storage"},
     "h5py": {"storage", "data"},
     "typer": {"cli"},
     "rich": {"cli", "report"},
-    "yaml": {"storage", "config", "data", "report", "family", "cli"},
+    "yaml": {"storage", "config", "data", "report", "cli"},
     "cv2": {"data", "start", "report", "sequence"},
     "skimage": {"data", "geometry"},
     "trimesh": {"report"},

@@ -1,16 +1,13 @@
-"""Commands export and family: problems as files for other solvers."""
+"""Command export: problems as files for other solvers."""
 
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from soup_nlp.cli import options
 from soup_nlp.cli.options import Words, option
 from soup_nlp.config.problem import load_problem
-from soup_nlp.errors import DataError
 from soup_nlp.export.artefact import (
     EXPORT_FILES,
     FORMATS,
@@ -18,10 +15,8 @@ from soup_nlp.export.artefact import (
     form_label,
     parse_formulation,
 )
-from soup_nlp.family.instances import SCENES, SIZES, STARTS, select
-from soup_nlp.family.write import write_family
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.storage.folders import claim, default_folder, staged
+from soup_nlp.storage.folders import claim, default_folder
 
 
 def export(
@@ -74,42 +69,3 @@ def export(
                 f" {s['jacobian_nonzeros']} Jacobian nonzeros,"
                 f" {manifest['nl']['bytes'] / 1e6:.1f} MB"
             )
-
-
-QUICK = "100,250"
-"""Default sizes, which take about a minute."""
-
-TABLES = ("index.json", "instancedata.csv", "README.md", "LICENSE.txt")
-"""Files of a set beside its instances."""
-
-
-def _list(values: tuple[object, ...]) -> str:
-    return ",".join(map(str, values))
-
-
-def family(
-    out: Annotated[Path, typer.Argument(help="Folder of the set, new or of an earlier one.")],
-    sizes: Annotated[str, option(f"Superpixels, of {_list(SIZES)}.")] = QUICK,
-    scenes: Annotated[str, option("Rendered scenes.")] = _list(SCENES),
-    formulation: options.Formulations = None,
-    coordinates: options.Coordinates = "matrix",
-    starts: Annotated[
-        str, option("easy (presolved), hard (initialisation), cold (constant depth).")
-    ] = _list(STARTS),
-    overwrite: options.Overwrite = False,
-) -> int:
-    """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
-    wanted, named = options.numbers(sizes, "--sizes"), options.listed(scenes)
-    chosen = select(wanted, named, formulation or [""], options.listed(starts), coordinates)
-    if out.is_dir() and any(out.iterdir()) and not (out / "index.json").is_file():
-        raise DataError(
-            "folder holds other files", where=out, expected="a new or empty folder, or a set"
-        )
-    claim(out, TABLES, overwrite)
-    with staged(out, whole=True, overwrite=overwrite) as new:
-        entries = write_family(new, chosen)
-    print(f"{len(entries)} instances; {', '.join(TABLES)} in {out}/")
-    differing = [e["name"] for e in entries if e["published"] is False]
-    if differing:
-        print(f"{len(differing)} are not the published bytes: please report processor and versions")
-    return 1 if differing else 0

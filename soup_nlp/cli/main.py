@@ -89,14 +89,9 @@ COMMANDS: Mapping[str, str] = {
     "list": "problems:list_",
     "export": "exports:export",
     "import": "results:import_",
-    "family": "exports:family",
     "compare": "compare:compare",
 }
 """Module and function under `soup_nlp.cli`, by command; in this order the help lists them."""
-BENCH: Mapping[str, str] = {
-    name: f"bench:{name}" for name in ("accuracy", "speed", "search", "paper", "chain")
-}
-"""Module and function of the commands of `soup-nlp bench`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -171,9 +166,8 @@ class LazyGroup(_Flags, TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Name, imported command and remaining arguments."""
         name, command, remaining = super().resolve_command(ctx, args)
-        homes = BENCH if self.name == "bench" else COMMANDS
-        if name is not None and name in homes:
-            command = _load(name, homes[name])
+        if name is not None and name in COMMANDS:
+            command = _load(name, COMMANDS[name])
         return name, command, remaining
 
 
@@ -201,33 +195,21 @@ def first_line(home: str) -> str:
     return _functions(module)[function]
 
 
-def _group(text: str, commands: Mapping[str, str]) -> typer.Typer:
-    """A group of commands that are imported later."""
-    group = typer.Typer(
-        cls=LazyGroup,
-        no_args_is_help=True,
-        pretty_exceptions_enable=False,
-        help=text,
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )
-    for name, home in commands.items():
-        # the command itself is imported when it is called
-        group.command(name=name, help=first_line(home))(lambda: None)
-    return group
-
-
 def _version(asked: bool) -> None:
     if asked:
         print(f"soup-nlp {__version__}")
         raise typer.Exit()
 
 
-app = _group(
-    "Dense 3D of a dynamic scene from two frames: Superpixel Soup as a nonlinear program.", COMMANDS
+app = typer.Typer(
+    cls=LazyGroup,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.add_typer(
-    _group("Measure accuracy and speed over many runs: tables, plots.", BENCH), name="bench"
-)
+for _name, _home in COMMANDS.items():
+    # the command itself is imported when it is called
+    app.command(name=_name, help=first_line(_home))(lambda: None)
 
 
 @app.callback()

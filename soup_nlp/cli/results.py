@@ -17,7 +17,6 @@ from soup_nlp.errors import ConfigError, DataError, ExportError
 from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
-from soup_nlp.family.describe import check_sol
 from soup_nlp.geometry.constraints import table
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.formats import FORMATS
@@ -49,13 +48,9 @@ def check(
         return options.finish(
             report.ok, "every claim holds" if report.ok else "a claim does not hold"
         )
-    if folder.stem.startswith("SOUP-") and export_ is None:
-        verdict = check_sol(folder)
-        rows, r, text = verdict.kinds, verdict.residuals, str(verdict)
-    else:
-        imported = import_sol(export_ or folder.parent, folder)
-        rows, r, text = sol_table(imported), imported.residuals, foreign_verdict(imported)
-    print(f"{table(rows)}\n{text}")
+    imported = import_sol(export_ or folder.parent, folder)
+    rows, r = sol_table(imported), imported.residuals
+    print(f"{table(rows)}\n{foreign_verdict(imported)}")
     if not all(row.ok for row in rows):
         return options.finish(False, "a constraint does not hold")
     conclusion = f"every constraint holds, and the point is {'' if r.optimal else 'not '}stationary"

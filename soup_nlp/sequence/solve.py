@@ -33,9 +33,10 @@ from soup_nlp.sequence.frames import (
     video_frames,
 )
 from soup_nlp.sequence.links import SolvedPair, make_chain, read_pair
+from soup_nlp.storage.each import Row
 from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.rows import Job, Row, Say, attempt, failed, measure_all, read_rows
+from soup_nlp.storage.rows import Job, Say, failed, measure_all, read_rows
 from soup_nlp.storage.versions import code_version
 
 SCENE = "scene:"
@@ -83,7 +84,7 @@ def solve_chain(
         two_frame: Solve frames k and k + 2 too, for more links.
         depth_scale: Values per unit of length of true depth_*.png beside frame_*.
         overrides: Keys of a problem file, such as `["segmentation.superpixels=500"]`.
-        workers: Processes; with more than one, a script needs `if __name__ == "__main__":`.
+        workers: Processes.
         overwrite: Replace the result of another sequence.
         begin: Called with the frames and the number of pairs before the first is solved.
         say: Called with (done, total, row) after every pair.
@@ -164,7 +165,7 @@ def solve_pairs(
     paths = [folder.resolve() / PAIRS / key for key in named_pairs]
     for path, name in zip(paths, named_pairs.values(), strict=True):
         raw = {"name": path.name, "input": name["input"], "base": str(Path.cwd())}
-        work = partial(attempt, partial(_solve, raw, tuple(name["overrides"]), path))
+        work = partial(_solve, raw, tuple(name["overrides"]), path)
         jobs.append(Job(name, work, stale=path.name not in kept))
 
     def report(done: int, total: int, row: Row) -> None:

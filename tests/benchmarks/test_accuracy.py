@@ -14,7 +14,7 @@ from benchmarks.suites import SUITES
 from benchmarks.table import Cell, Item, frame_of
 from soup_nlp import Pair, Truth
 from soup_nlp.errors import ConfigError
-from soup_nlp.storage.rows import Row, attempt
+from soup_nlp.storage.each import Row, attempt
 
 QUICK = (
     "segmentation.superpixels=20",

@@ -176,7 +176,7 @@ def text(name):
 
 
 HELP = """from soup_nlp.cli.main import main
-for words in (['--help'], ['--version'], ['bench', '--help']): main(words)"""
+for words in (['--help'], ['--version']): main(words)"""
 ON_USE = ("matplotlib", "trimesh", "pandas", "skimage.segmentation", "scipy.stats")
 
 

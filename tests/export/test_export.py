@@ -14,7 +14,6 @@ from helpers_files import sets
 from helpers_nl import ReadBack, close
 from scipy import sparse
 
-from soup_nlp.bench.solvers.plugins import find_program
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError, ExportError
@@ -23,6 +22,7 @@ from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol, sol_table
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import write_sol
+from soup_nlp.export.solvers import find_program
 from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.geometry.constraints import kind, table
 from soup_nlp.model import oracle

@@ -1,7 +1,6 @@
 """The folder, page and commands of a sequence."""
 
 import json
-from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,8 +12,6 @@ from helpers_files import sets
 from helpers_result import CAMERA, CERTAINTY, toy_pairs
 
 import soup_nlp
-from soup_nlp.bench import chain as chain_study
-from soup_nlp.bench.study import Cell, frame_of
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -221,17 +218,6 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     rows = (tmp_path / "out" / "pairs.jsonl").read_text()
     assert main(call) == 0
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
-    # the table of chains has the same numbers
-    monkeypatch.setattr(chain_study, "scratch", lambda: nullcontext(tmp_path / "out"))
-    cell = Cell(chain_study.sequences(None)[0], tuple(SMALL))
-    row = chain_study.measure_chain(cell, frames=3)
-    assert row["cost"] == told["score"]["cost"]
-    assert row["path"] == told["score"]["path"]["share"]
-    assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
-    row = {**cell.identity(), "ok": True, "cpu_seconds": 1.0, "code": "c", **row}
-    text = chain_study.chain_page(frame_of([row]))
-    assert "| street | 3 |" in text
-    assert f"code c; overrides of every row: `{SMALL[0]}`" in text
     # a file of the user is overwritten on request only
     (tmp_path / "out" / "chain.json").write_text("mine")
     assert main(call) == 2

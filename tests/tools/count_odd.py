@@ -17,17 +17,20 @@ from helpers_odd_run import Case, fault
 from helpers_odd_world import World
 from test_odd_inputs import CASES
 
-from soup_nlp.bench.processes import isolated
+from soup_nlp.storage.each import each
 
 SECONDS = 120
-MEMORY = 6 << 30
 
 
 def found_in(case: Case, world: World, folder: Path) -> str | None:
-    """The fault of a case, found in a child process with limited memory."""
-    beside = folder.parent
-    ended = isolated(partial(fault, case, world, folder, SECONDS), beside, SECONDS, MEMORY)
-    return ended.value if ended.how == "returned" else ended.how
+    """The fault of a case, found in a child process."""
+    work = partial(_fault, case, world, folder)
+    ((_, row),) = each({case.name: work}, fresh=True, seconds=SECONDS)
+    return row.get("fault", row["error"])
+
+
+def _fault(case: Case, world: World, folder: Path) -> dict[str, str | None]:
+    return {"fault": fault(case, world, folder, SECONDS)}
 
 
 def main() -> None:

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.family.frozen import STORED, Frozen
+from benchmarks.family.instances import case_of, rounded
 from soup_nlp.arrays import Float
 from soup_nlp.config.problem import Problem, dump_problem, make_problem
-from soup_nlp.family.frozen import STORED, Frozen
-from soup_nlp.family.instances import case_of, rounded
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.pipeline.case import prepare

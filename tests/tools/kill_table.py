@@ -40,7 +40,7 @@ TINY = [
     "input.width=64", "input.height=48", "flow.source=truth", "segmentation.superpixels=12",
     "segmentation.neighbours=4", "refine.rounds=1", "refine.particles=6", "output.page=false",
 ]  # fmt: skip
-NAMES = ("solve", "export", "import", "compare", "bench", "chain", "family")
+NAMES = ("solve", "export", "import", "compare", "chain")
 SIGNALS: Mapping[str, Sequence[int]] = {
     "SIGKILL": [signal.SIGKILL],
     "SIGTERM": [signal.SIGTERM],
@@ -69,11 +69,7 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         "import": ["import", str(root / "exported"), str(root / "a.sol"), "-o", str(out["import"])],
         "compare": f"compare orbit --solvers ipopt --seconds 20 -o {out['compare']}".split()
         + overrides,
-        "bench": "bench accuracy --suite rendered --only orbit --only room --flow truth --width 64"
-        f" --workers 2 -q -o {out['bench']}".split()
-        + overrides[4:],
         "chain": f"chain {clip(root)} --fov=50 -q -o {out['chain']}".split() + overrides[6:],
-        "family": f"family {out['family']} --sizes 100 --scenes orbit --starts cold".split(),
     }
     if "import" in names:
         run([*export, "--out", str(root / "exported")])

@@ -1,7 +1,7 @@
 """Instances of the family: their names and their NLPs, which are equal on every processor.
 
 Superpixels, start and presolve involve search or iteration. They were computed once, and their
-results are records in the package (`frozen`). The rest is rendering and arithmetic, whose last bits
+results are records (`frozen`). The rest is rendering and arithmetic, whose last bits
 depend on the processor. Every number of the NLP is therefore rounded to 20 significant bits.
 """
 
@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.family.frozen import Frozen
 from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import CHOICES, form_label, parse_formulation
-from soup_nlp.family.frozen import Frozen
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData

@@ -3,11 +3,11 @@
 import pytest
 from freeze_family import record_of
 
-from soup_nlp.config.problem import make_problem
-from soup_nlp.family import describe, write
-from soup_nlp.family.frozen import Frozen
-from soup_nlp.family.instances import STANDARD, select
-from soup_nlp.family.write import write_family
+from benchmarks.family import write
+from benchmarks.family.frozen import Frozen
+from benchmarks.family.instances import STANDARD, select
+from benchmarks.family.write import write_family
+from soup_nlp import make_problem
 from soup_nlp.pipeline.case import prepare
 
 EPIGRAPH = "unit-translation/epigraph"
@@ -26,8 +26,7 @@ def folder(record, tmp_path_factory):
     """The set of that record, under the names of a published size."""
     out = tmp_path_factory.mktemp("set")
     patch = pytest.MonkeyPatch()
-    for module in (write, describe):
-        patch.setattr(module, "load_frozen", lambda scene, size: record)
+    patch.setattr(write, "load_frozen", lambda scene, size: record)
     chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [EPIGRAPH], ["hard"])
     lines: list[str] = []
     write_family(out, chosen, lines.append)

@@ -1,12 +1,13 @@
-"""Task and answer of a solver; CasADi's plug-ins and programs that read .nl as solvers."""
+"""Solvers by name: CasADi's plug-ins, programs that read .nl, and this package."""
 
-import os
+import shlex
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,6 @@ import casadi as ca
 import numpy as np
 
 from soup_nlp.arrays import Float
-from soup_nlp.bench.processes import without_answer
 from soup_nlp.errors import SolverError
 from soup_nlp.export.nl import write_nl
 from soup_nlp.export.sol import read_sol
@@ -30,6 +30,8 @@ from soup_nlp.model.symbolic import Graph
 from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.ipopt import DEFAULTS
+from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.system import end_with_parent
 
 
@@ -85,14 +87,6 @@ class Answer:
     status: str
     claimed: bool
     iterations: int = -1
-
-
-def clock() -> float:
-    """CPU seconds of this process and of its children that have ended.
-
-    Limits and comparisons use CPU time, since wall time depends on other work of the machine.
-    """
-    return sum(os.times()[:4])
 
 
 WALL_PER_CPU = 8.0
@@ -258,7 +252,7 @@ def _derivatives(
 
 def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
     """Solve with a program of the AMPL convention, `solver stub -AMPL key=value ...`."""
-    begin, path = clock(), Path("soup.sol")
+    path = Path("soup.sol")
     file = write_nl(path.with_suffix(".nl"), task.nlp)
     # remove an answer to an earlier problem
     path.unlink(missing_ok=True)
@@ -268,16 +262,15 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
                 [command, "soup", "-AMPL", *options],
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                timeout=WALL_PER_CPU * max(1.0, task.limits.seconds - (clock() - begin)),
+                timeout=WALL_PER_CPU * max(1.0, task.limits.seconds),
                 check=False,
                 preexec_fn=end_with_parent,
             ).returncode
         except subprocess.TimeoutExpired:
             return Answer(None, None, "Time_Limit", False)
     if not path.is_file():
-        _, killed_by = without_answer(code, clock() - begin, task.limits.seconds)
-        if killed_by:
-            return Answer(None, None, killed_by, False)
+        if code < 0:
+            return Answer(None, None, f"killed by {signal.Signals(-code).name}", False)
         raise SolverError("solver wrote no .sol", where=Path(command).name, found=f"exit {code}")
     sol = read_sol(path, file.variables, file.rows)
     status = sol.message.splitlines()[-1] if sol.message else sol.status
@@ -298,3 +291,59 @@ def pounce(command: str, task: Task, near: bool = False) -> Answer:
     options |= {"acceptable_iter": 0, "max_cpu_time": 0.9 * m.seconds, "print_level": 0}
     options |= NEAR_START if near else {}
     return executable(command, task, [f"{k}={v}" for k, v in options.items()])
+
+
+# --- by name --------------------------------------------------------------------------------------
+
+
+def package(task: Task) -> Answer:
+    """Solve as this package does: Ipopt's stages, then the constrained NLP."""
+    m = task.limits
+    options = SolverOptions(
+        eps=task.form.eps,
+        tol=m.tol,
+        max_iter=m.iterations,
+        max_seconds=0.9 * WALL_PER_CPU * m.seconds,
+    )
+    answer = solve_soup(task.soup, task.data, task.weights, task.form, options)
+    stage, iterations = answer.stages[-1], sum(s.iterations for s in answer.stages)
+    # the package solves the program in matrices, whose multipliers differ from those in tangents
+    matrices = task.form.coordinates == "matrix"
+    x, lam_g = (stage.x, stage.lam_g) if matrices else (answer.soup, None)
+    return Answer(x, lam_g, stage.status, stage.converged, iterations)
+
+
+def available() -> dict[str, Solver]:
+    """Installed solvers by name."""
+    names = [name for name, row in PLUGINS.items() if ca.has_nlpsol(row.library)]
+    out: dict[str, Solver] = {name: partial(plugin, name) for name in names}
+    command = find_program("pounce")
+    if command:
+        out["pounce"] = partial(pounce, command)
+        out["pounce-tuned"] = partial(pounce, command, near=True)
+    out["soup-nlp"] = package
+    return out
+
+
+def find_solver(name: str) -> Solver:
+    """The solver of a name, or the executable of that name (AMPL convention).
+
+    Raises:
+        SolverError: there is neither a solver nor an executable.
+    """
+    installed = available()
+    if name in installed:
+        return installed[name]
+    # options may follow the name of the program, whose path may have spaces
+    command, options = find_program(name), list[str]()
+    if command is None:
+        program, *options = shlex.split(name) or [""]
+        command = find_program(program)
+    if command is None or name in PLUGINS:
+        raise SolverError(
+            "solver is not here",
+            where="--solvers",
+            found=name,
+            expected=", ".join(installed) + ", or a program that reads .nl",
+        )
+    return partial(executable, command, options=options)

@@ -1,10 +1,9 @@
-"""Records of the family in the package: superpixels, start and best known point by problem."""
+"""Records of the family: superpixels, start and best known point by problem."""
 
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from soup_nlp import Problem, Soup, make_problem
 from soup_nlp.arrays import Float, Int
-from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.errors import DataError
-from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_options import Weights
 
 
@@ -123,13 +121,16 @@ STORED = {
 labels as differences along rows, which are mostly 0."""
 
 
+RECORDS = Path(__file__).with_name("records")
+
+
 def load_frozen(scene: str, size: int) -> Frozen:
-    """The package's record of a scene and size.
+    """The record of a scene and size.
 
     Raises:
         DataError: there is no such record.
     """
-    return read_frozen(Path(str(files("soup_nlp.family") / "records" / f"{scene}-{size}.npz")))
+    return read_frozen(RECORDS / f"{scene}-{size}.npz")
 
 
 def read_frozen(path: Path) -> Frozen:

@@ -1,17 +1,16 @@
-"""`bench chain`: the error that one scale for a whole sequence causes."""
+"""The error that one scale for a whole sequence causes."""
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
 
-from soup_nlp.bench.study import Cell, Item, page_text, provenance, titled
+from benchmarks.table import Cell, Item, numbers, page_text, provenance, titled
+from soup_nlp import chain
 from soup_nlp.errors import DataError
-from soup_nlp.sequence.folder import ROWS
 from soup_nlp.sequence.score import score
-from soup_nlp.sequence.solve import SCENE, solve_chain
-from soup_nlp.storage.rows import Row, read_rows
-from soup_nlp.storage.system import scratch
+from soup_nlp.storage.each import Row
 
 NOTE = (
     "MRE (no cap) of sequences whose pairs are put on one scale (`soup-nlp chain`), mean over the"
@@ -20,8 +19,6 @@ NOTE = (
     " RMSE of its positions after the best similarity, over the path's length (no true path of"
     " kitti_tracking is known). DIS flow."
 )
-KITTI_DEPTH = 256.0
-"""Values per metre of a depth of kitti_tracking."""
 COLUMNS = {
     "frames": ("frames", ".0f"),
     "mre_own_scale": ("a scale for every frame", ".4f"),
@@ -30,17 +27,15 @@ COLUMNS = {
     "worst_link": ("worst link off by", ".2%"),
     "path": ("error of the path", ".2%"),
     "flagged": ("links without parallax", ".0f"),
-    "pair_seconds": ("CPU s a pair", ".0f"),
+    "cpu_seconds": ("CPU s", ".0f"),
 }
 """Title and format of every column of the table."""
 
 
 def sequences(data: Path | None) -> list[Item]:
     """Rendered sequences, and kitti_tracking where its folder is there."""
-    out = [
-        Item("rendered", scene, scene, "dis", {"kind": "scene", "scene": scene})
-        for scene in ("street", "room", "orbit")
-    ]
+    scenes = ("street", "room", "orbit")
+    out = [Item("rendered", s, s, "dis", {"kind": "scene", "scene": s}) for s in scenes]
     folder = (data or Path()).resolve() / "kitti_tracking"
     if data is not None and folder.is_dir():
         source = {"kind": "folder", "path": str(folder)}
@@ -55,23 +50,26 @@ def measure_chain(cell: Cell, frames: int = 10) -> Row:
         DataError: the sequence has no truth.
     """
     item = cell.item
-    source = item.input.get("path", f"{SCENE}{item.sequence}")
-    with scratch() as folder:
-        chain = solve_chain(
-            source, folder, most=frames, depth_scale=KITTI_DEPTH, overrides=cell.overrides
+    source = item.input.get("path", f"scene:{item.family}")
+    with TemporaryDirectory() as folder:
+        # KITTI: 256 values per metre
+        solved = chain(
+            source,
+            Path(folder) / "chain",
+            most=frames,
+            depth_scale=256.0,
+            overrides=cell.overrides,
         )
-        seconds = {row["key"]: row["cpu_seconds"] for row in read_rows(folder / ROWS)}
-    scores = score(chain)
+        scores = score(solved)
     if scores is None:
         raise DataError("sequence has no truth", where=item.name)
     errors = [abs(np.log(k["estimated"] / k["true"])) for k in scores["links"]]
     return {
-        "frames": len(chain),
+        "frames": len(solved),
         **{key: scores[key] for key in ("mre_own_scale", "mre_one_scale", "cost")},
         "worst_link": float(np.expm1(max(errors))),
         "path": None if scores["path"] is None else scores["path"]["share"],
-        "flagged": sum(k.flagged for k in chain.links),
-        "pair_seconds": sum(seconds.values()) / len(seconds),
+        "flagged": sum(k.flagged for k in solved.links),
     }
 
 
@@ -79,7 +77,7 @@ def chain_page(frame: pd.DataFrame) -> str:
     """The page of all rows."""
     blocks, good = [NOTE, f"{provenance(frame)}."], frame[frame["ok"].eq(True)]
     if len(good):
-        mean = good["cost"].astype(float).mean()
         blocks.append(titled(good.set_axis(pd.Index(good["pair"], name="sequence")), COLUMNS))
+        mean = numbers(good, "cost").mean()
         blocks.append(f"Mean cost of one scale: {mean:+.2%} of the MRE.")
     return page_text(blocks, frame)

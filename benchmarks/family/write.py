@@ -1,0 +1,222 @@
+"""Writing of the family: .nl files, best known points, index, README; answers of solvers."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.family.frozen import RECORDS, Frozen, load_frozen
+from benchmarks.family.instances import (
+    VERSION,
+    Instance,
+    build_instance,
+    case_of,
+    parse_name,
+    problems,
+)
+from soup_nlp import Pair, __version__
+from soup_nlp.errors import DataError
+from soup_nlp.export.compare import Labelled, make_task
+from soup_nlp.export.nl import NLFile, write_nl
+from soup_nlp.export.program import file_orders
+from soup_nlp.export.sol import read_sol, write_sol
+from soup_nlp.export.solvers import Task
+from soup_nlp.export.verify import Limits, examine
+from soup_nlp.model.nlp import NLP
+from soup_nlp.storage.files import read_json, write_json, write_text
+
+Entry = dict[str, Any]
+
+REACHED = 1e-4
+"""Relative distance up to which an objective has reached the best known one."""
+INDEX = "index.json"
+
+
+def published() -> dict[str, Any]:
+    """Published data of this version: checksums, and solvers that reached the best known points."""
+    return dict(json.loads((RECORDS / "published.json").read_text(encoding="utf-8")))
+
+
+def write_family(
+    folder: Path, chosen: Sequence[Instance], say: Callable[[str], object] = print
+) -> list[Entry]:
+    """Write instances with their index into a new folder or into that of an earlier set.
+
+    Returns:
+        Entries of the index. "published" says whether the bytes are those of the published
+        version; None if that version has no such instance.
+
+    Raises:
+        DataError: there is no record of a size, or the folder holds other files or cannot be
+            written.
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / INDEX).is_file():
+        raise DataError(
+            "folder holds other files", where=folder, expected="a new or empty folder, or a set"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    known, entries = published(), []
+
+    @cache
+    def rendered(scene: str) -> Pair:
+        return load_frozen(scene, chosen[0].size).problem.load_pair()
+
+    for scene, size, members in problems(chosen):
+        record = load_frozen(scene, size)
+        case = case_of(record, rendered(scene))
+        for instance in members:
+            nlp = build_instance(case, record, instance.formulation, instance.start)[0]
+            file = write_nl(folder / f"{instance.name}.nl", nlp)
+            best = build_instance(case, record, instance.formulation, "best")[0]
+            order = file.variables, file.rows
+            message = f"SOUP {VERSION}: best known point of {instance.problem}"
+            write_sol(folder / f"{instance.problem}.sol", best.x0, None, *order, message)
+            entries.append(_entry(instance, len(case), nlp, best, file, known))
+            changed = "  NOT the published bytes" * (entries[-1]["published"] is False)
+            say(f"{file.path.name:<52} n {nlp.nx:>6}  m {nlp.ng:>6}{changed}")
+    index = {"set": "SOUP", "version": VERSION, "generator": f"soup_nlp {__version__}"}
+    write_json(folder / INDEX, {**index, "instances": entries})
+    write_text(folder / "README.md", readme(entries))
+    licence = (RECORDS / "LICENSE.txt").read_text(encoding="utf-8")
+    write_text(folder / "LICENSE.txt", licence)
+    return entries
+
+
+def _entry(
+    instance: Instance,
+    superpixels: int,
+    nlp: NLP,
+    best: NLP,
+    file: NLFile,
+    known: Mapping[str, Any],
+) -> Entry:
+    """Entry of an instance in the index."""
+    sha = known["sha256"].get(instance.name)
+    solved = dict(known["solved"].get(instance.problem, {}))
+    runs = solved.pop("runs", {}).get(instance.start, {})
+    r = examine(best, best.x0, None)
+    return {
+        **{"name": instance.name, "file": file.path.name, "scene": instance.scene},
+        **{"formulation": instance.formulation, "size": instance.size, "start": instance.start},
+        "superpixels": superpixels,
+        **nlp.sizes(),
+        "bounded_variables": int((np.isfinite(nlp.lbx) | np.isfinite(nlp.ubx)).sum()),
+        **file.counts,
+        "best_known": {
+            "objective": _short(best.value(best.x0)),
+            "sol": f"{instance.problem}.sol",
+            **{k: _short(getattr(r, k), 2) for k in ("primal", "dual", "complementarity")},
+            **solved,
+        },
+        "runs": runs,
+        "objective_at_start": _short(nlp.value(nlp.x0)),
+        "bytes": file.size,
+        "sha256": file.sha256,
+        "published": None if sha is None else sha == file.sha256,
+    }
+
+
+def _short(value: Any, digits: int = 9) -> float:
+    """A number rounded to significant digits; further ones depend on the processor."""
+    return float(f"{float(value):.{digits}g}")
+
+
+def readme(entries: Sequence[Entry]) -> str:
+    """README of the folder, for the entries of its index."""
+    scenes = ", ".join(dict.fromkeys(e["scene"] for e in entries))
+    sizes = ", ".join(str(n) for n in sorted({e["size"] for e in entries}))
+    head = (
+        (RECORDS / "README.md")
+        .read_text(encoding="utf-8")
+        .format(scenes=scenes, sizes=sizes, package=__version__, version=VERSION)
+    )
+    columns = (
+        "file",
+        "n",
+        "m",
+        "Jacobian",
+        "Hessian",
+        "start",
+        "best known",
+        "reached by",
+        "SHA-256",
+    )
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+    for e in entries:
+        best = e["best_known"]
+        sizes_of = "variables", "constraints", "jacobian_nonzeros", "hessian_nonzeros"
+        cells = [e["file"], *(str(e[k]) for k in sizes_of)]
+        cells += [f"{e['objective_at_start']:.6g}", f"{best['objective']:.8g}"]
+        cells += [f"{len(best.get('reached_by', []))} of {len(best.get('tried_by', []))} solvers"]
+        lines.append("| " + " | ".join([*cells, f"{e['sha256'][:16]}..."]) + " |")
+    note = "Nonzeros of the Hessian are of its upper triangle."
+    return "\n".join([head, *lines, "", note]) + "\n"
+
+
+# --- answers of solvers --------------------------------------------------------------------------
+
+
+def check_sol(path: Path) -> tuple[str, bool]:
+    """Read `<name>.sol`, the answer to the instance of that name, and recompute its values.
+
+    The instance is built again; neither the .nl file nor a value of the solver is used.
+
+    Returns:
+        What was found, and whether the point is verified.
+
+    Raises:
+        ConfigError: the name is not one of the family.
+        ExportError: the file cannot be read.
+    """
+    instance = parse_name(path.stem)
+    record = load_frozen(instance.scene, instance.size)
+    case = case_of(record)
+    nlp = build_instance(case, record, instance.formulation, instance.start)[0]
+    best = nlp.value(build_instance(case, record, instance.formulation, "best")[0].x0)
+    sol = read_sol(path, *file_orders(nlp))
+    with np.errstate(all="ignore"):
+        objective, r = nlp.value(sol.x), examine(nlp, sol.x, sol.lam_g)
+    gap = (objective - best) / best
+    text = (
+        f"{sol}: {'verified' if r.optimal else 'not verified'}\n"
+        f"objective   {objective:.9g}, best known {best:.9g}, gap {gap:+.2e}\n"
+        f"residuals   primal {r.primal:.1e}  dual {r.dual:.1e}  complementarity"
+        f" {r.complementarity:.1e}  (unscaled; multipliers: {r.multipliers})"
+    )
+    return text, r.optimal
+
+
+def family_tasks(folder: Path) -> Iterator[Labelled]:
+    """The tasks of all instances in a folder, for `export.compare.compare`.
+
+    Raises:
+        DataError: the index cannot be read.
+    """
+    try:
+        entries = read_json(folder / INDEX, "index of the family")["instances"]
+        best = {e["name"]: float(e["best_known"]["objective"]) for e in entries}
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError("index of the family cannot be read", where=folder, found=error) from error
+    for name, objective in best.items():
+        instance = parse_name(name)
+        label = {
+            "problem": f"{instance.scene} {instance.start}",
+            "problem_hash": VERSION,
+            "superpixels": instance.size,
+            "formulation": instance.formulation,
+            "start": instance.start,
+            "name": name,
+            "best_known": objective,
+            "energy_limit": 1e300,
+        }
+        yield label, partial(_task, instance)
+
+
+def _task(instance: Instance, limits: Limits) -> Task:
+    record = load_frozen(instance.scene, instance.size)
+    case = case_of(record)
+    parts: tuple[Frozen, str, str] = record, instance.formulation, instance.start
+    return make_task(case, lambda: build_instance(case, *parts), limits)

@@ -1,0 +1,152 @@
+"""Seconds, energy and memory of solves by stage, over N, K and the image size."""
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pandas as pd
+import psutil
+
+from benchmarks.scores import scores
+from benchmarks.suites import MOTORCYCLE, Options, list_suite
+from benchmarks.table import Cell, Item, page_text, provenance, titled
+from soup_nlp import run
+from soup_nlp.storage.each import Row, peak_bytes
+from soup_nlp.storage.versions import versions
+
+OUTSIDE = ("flow", "segmentation", "start", "evaluation", "output")
+"""All stages but the NLP and the loading or rendering of the frames."""
+RUN = {"pair": "pair", "n": "N", "k": "K"}
+COLUMNS = {
+    "cpu.nlp": ("CPU s", ".1f"),
+    "stages.nlp": ("wall s", ".1f"),
+    "iterations": ("its", ".0f"),
+    "each": ("its by stage", ""),
+    "energy_start.total": ("E start", ".2f"),
+    "energy.total": ("E", ".3f"),
+    "metrics.start.mre": ("MRE start", ".4f"),
+    "metrics.solution.mre": ("MRE", ".4f"),
+    "residuals.dual_infeasibility": ("dual inf.", ".1e"),
+    "residuals.nlp_infeasibility": ("constraints", ".1e"),
+    "sizes.hessian_nonzeros": ("nnz H", ".0f"),
+    "GB": ("GB", ".2f"),
+    "outside": ("outside, CPU s", ".1f"),
+    "whole": ("whole, CPU s", ".0f"),
+    "status": ("status", ""),
+}
+"""Title and format of every column of the main table, by column of the frame."""
+NOTE = (
+    "CPU s and wall s: the whole NLP. E: exact energy. MRE after median scale, no cap. dual inf.,"
+    " constraints: recomputed at Ipopt's answer. GB: peak of the process. Outside: flow,"
+    " segmentation, start, evaluation, output with every picture, point cloud and HDF5. Whole: from"
+    " the images to the files, refinement included where it is on. Wall times of a shared machine"
+    " vary with its load; CPU times less so. One thread."
+)
+
+
+def timed_pairs(
+    scenes: Sequence[str],
+    seeds: Sequence[int],
+    widths: Sequence[int] = (1024,),
+    pairs: Sequence[str] = (),
+    data: Path | None = None,
+) -> list[Item]:
+    """Rendered scenes and the motorcycle, then named pairs of the suite shared, with DIS flow."""
+    sizes = [Options(("dis",), width, tuple(seeds)) for width in widths]
+    rendered = [i for size in sizes for i in list_suite("rendered", None, size)]
+    items = [i for i in rendered if i.family in scenes]
+    items += [MOTORCYCLE] * (MOTORCYCLE.name in scenes)
+    named = list_suite("shared", data, Options(("dis",), only=tuple(pairs))) if pairs else []
+    return items + named
+
+
+def speed_cells(
+    items: Sequence[Item],
+    sizes: Sequence[int],
+    neighbours: Sequence[int],
+    overrides: Sequence[str] = (),
+) -> list[Cell]:
+    """Timed runs of pairs over N and K, small N first: the NLP without refinement.
+
+    A rendered scene has its seed in the solve as well.
+    """
+    cells = []
+    for n, k, item in product(sorted(sizes), sorted(neighbours), items):
+        sections = f"segmentation.superpixels={n}", f"segmentation.neighbours={k}"
+        seed = f"seed={item.input.get('seed', 0)}"
+        changes = (*sections, seed, "refine.enabled=false", *overrides)
+        cells.append(Cell(item, changes, f"N {n}, K {k}"))
+    return cells
+
+
+def measure_speed(cell: Cell) -> Row:
+    """The scores of a run, and the cost of every stage.
+
+    Returns:
+        Entries of `scores.scores`; "cpu" has seconds by stage, "stages" the wall seconds; further
+        numbers by the names of the solution.
+
+    Raises:
+        SoupError: the input cannot be used.
+    """
+    cpu = {"": time.process_time()}
+
+    def lap(stage: str) -> None:
+        cpu[stage] = time.process_time() - sum(cpu.values())
+
+    problem = cell.item.problem(cell.overrides)
+    result = run(problem, on_stage=lap)
+    solution = result.solution
+    with TemporaryDirectory() as folder:
+        result.save(Path(folder) / "result")
+    lap("output")
+    del cpu[""]
+    return {
+        "peak_bytes": peak_bytes(),
+        **scores(result),
+        "n": len(result),
+        "k": problem.segmentation.neighbours,
+        "sizes": solution.nlp,
+        "cpu": cpu | {"nlp": sum(solution.cpu_seconds.values())},
+        "each": " + ".join(str(s.iterations) for s in solution.stages),
+        "energy": dict(solution.energy),
+        "energy_start": dict(solution.energy_start),
+        "residuals": dict(solution.residuals),
+    }
+
+
+def speed_page(frame: pd.DataFrame) -> str:
+    """Markdown page of the rows: runs, seconds by stage, machine."""
+    good = frame[frame["ok"].eq(True)]
+    blocks = ["# Speed", f"{provenance(frame)}."]
+    if len(good):
+        cpu = good.filter(regex="^cpu[.]").astype(float)
+        runs = good.assign(
+            outside=cpu.reindex(columns=[f"cpu.{s}" for s in OUTSIDE]).sum(axis=1),
+            whole=cpu.drop(columns="cpu.load").sum(axis=1),
+            GB=good["peak_bytes"].astype(float) / 2**30,
+        )
+        runs.index = pd.MultiIndex.from_frame(good[list(RUN)].rename(columns=RUN))
+        stages = {column: (column.removeprefix("cpu."), ".2f") for column in cpu}
+        blocks += [titled(runs, COLUMNS), NOTE, "## CPU seconds by stage", titled(runs, stages)]
+    return page_text([*blocks, "## Machine", machine()], frame)
+
+
+def machine() -> str:
+    """Processor, memory, system and versions, as a list."""
+    lines = [f"- {os.cpu_count()} cores of {processor()}"]
+    lines.append(f"- {psutil.virtual_memory().total / 2**30:.0f} GB, {platform.platform()}")
+    return "\n".join([*lines, "- " + ", ".join(f"{k} {v}" for k, v in versions().items())])
+
+
+def processor() -> str:
+    """Name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(x.partition(":")[2].strip() for x in lines if x.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

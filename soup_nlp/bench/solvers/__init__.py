@@ -1,1 +1,0 @@
-"""Comparison of solvers on the same NLP, each in a process of its own with verified claims."""

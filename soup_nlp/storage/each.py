@@ -1,0 +1,189 @@
+"""Many jobs: here, in worker processes of this machine (loky), or on a cluster (Dask)."""
+
+import os
+import re
+import resource
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from joblib.externals.loky import ProcessPoolExecutor
+
+from soup_nlp.errors import optional
+from soup_nlp.storage.files import plain
+from soup_nlp.storage.system import end_with_parent
+
+Row = dict[str, Any]
+Work = Callable[[], Row]
+
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
+     "OPENCV_FOR_THREADS_NUM"), "1",
+)  # fmt: skip
+"""Environment of a worker process; libraries read it when they are loaded."""
+
+
+def each(
+    jobs: Mapping[str, Work],
+    workers: int = 1,
+    *,
+    cluster: str | None = None,
+    fresh: bool = False,
+    seconds: float | None = None,
+    begin: Callable[[], object] | None = None,
+) -> Iterator[tuple[str, Row]]:
+    """Names and rows of jobs, in the order in which they end.
+
+    A job that raises, or whose process dies, is a row with `ok` false and the reason; the others go
+    on. Functions travel by cloudpickle and workers do not import `__main__`, so that this works
+    from a script without a guard, from stdin and in a notebook. When the iteration ends early, as
+    by Ctrl-C, the workers are killed.
+
+    Args:
+        jobs: Functions by name.
+        workers: Processes of this machine, one thread each; 1 calls the jobs in this process.
+        cluster: Address of the scheduler of a Dask cluster, tcp://HOST:PORT, instead.
+        fresh: A new process for every job, also with one worker.
+        seconds: Wall time after which the process of a job is killed.
+        begin: Called in every new process before its first job.
+
+    Raises:
+        ConfigError: Dask is not installed.
+    """
+    if cluster is not None:
+        yield from _on_cluster(jobs, cluster)
+    elif fresh or workers > 1:
+        yield from _in_processes(jobs, min(workers, len(jobs)), fresh, seconds, begin)
+    else:
+        yield from ((name, attempt(work)) for name, work in jobs.items())
+
+
+def attempt(work: Work) -> Row:
+    """Result of `work`, with "ok", "error", "seconds" and "cpu_seconds", as plain JSON values.
+
+    "peak_bytes", unless the result has it, is the largest resident size meanwhile (Linux; elsewhere
+    of the process so far). An exception becomes a row with `ok` false and the reason.
+    """
+    with suppress(OSError):
+        # resets the largest resident size of this process
+        Path("/proc/self/clear_refs").write_text("5")
+    begin, cpu = time.perf_counter(), _cpu_seconds()
+    try:
+        row = {"ok": True, "error": None, **work()}
+        row.setdefault("peak_bytes", peak_bytes())
+    except Exception as error:
+        row = failure(f"{type(error).__name__}: {error}")
+    row["seconds"] = time.perf_counter() - begin
+    row["cpu_seconds"] = _cpu_seconds() - cpu
+    return dict(plain(row))
+
+
+def _cpu_seconds() -> float:
+    """CPU seconds of this process and of its children that have ended."""
+    return sum(os.times()[:4])
+
+
+def failure(reason: str) -> Row:
+    """The row of work that failed, with the reason."""
+    return {"ok": False, "error": reason, "seconds": 0.0, "cpu_seconds": 0.0}
+
+
+def peak_bytes() -> int:
+    """Largest resident size of this process, see `attempt`."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def _prepare_worker(begin: Callable[[], object] | None) -> None:
+    end_with_parent()
+    # the parent handles Ctrl-C and ends its workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if begin:
+        begin()
+
+
+def _in_processes(
+    jobs: Mapping[str, Work],
+    workers: int,
+    fresh: bool,
+    seconds: float | None,
+    begin: Callable[[], object] | None,
+) -> Iterator[tuple[str, Row]]:
+    """Rows by threads that have a pool of one process each: if it dies, its job is known."""
+    todo, done = SimpleQueue[tuple[str, Work]](), SimpleQueue[tuple[str, Row]]()
+    for job in jobs.items():
+        todo.put(job)
+    pools: dict[int, Any] = {}
+    stop = threading.Event()
+
+    def drive(number: int) -> None:
+        while not stop.is_set():
+            try:
+                name, work = todo.get_nowait()
+            except Empty:
+                break
+            if number not in pools:
+                pools[number] = ProcessPoolExecutor(
+                    1, initializer=_prepare_worker, initargs=(begin,), env=ONE_THREAD
+                )
+            row = _row(pools[number], work, seconds)
+            if row.pop("ended", False) or fresh:
+                pools.pop(number).shutdown(kill_workers=True)
+            done.put((name, row))
+        if number in pools:
+            pools.pop(number).shutdown(kill_workers=True)
+
+    threads = [threading.Thread(target=drive, args=(k,), daemon=True) for k in range(workers)]
+    try:
+        for thread in threads:
+            thread.start()
+        for _ in jobs:
+            yield done.get()
+    finally:
+        stop.set()
+        for pool in list(pools.values()):
+            pool.shutdown(kill_workers=True)
+        for thread in threads:
+            thread.join()
+
+
+def _row(pool: Any, work: Work, seconds: float | None) -> Row:
+    """The row of a job that a pool of one process makes; "ended" says that the process is gone."""
+    try:
+        return dict(pool.submit(attempt, work).result(seconds))
+    except TimeoutError:
+        return failure(f"wall time limit of {seconds:g} s reached") | {"ended": True}
+    except BrokenProcessPool as error:
+        code = re.search(r"\{([A-Z]+)\(", str(error))
+        signal_name = code[1] if code and code[1] != "EXIT" else None
+        return failure(died(signal_name)) | {"ended": True}
+    except Exception as error:
+        # the job or its row cannot be sent to another process, or the pool is shut down
+        return failure(f"{type(error).__name__}: {error}")
+
+
+def died(signal_name: str | None) -> str:
+    """Reason of a row whose process ended without one."""
+    by = f" by {signal_name}" if signal_name else ""
+    return f"the process died{by} (out of memory, a time limit, or a crash of native code)"
+
+
+def _on_cluster(jobs: Mapping[str, Work], address: str) -> Iterator[tuple[str, Row]]:
+    """Rows from the workers of a Dask cluster, which solves the job of a lost worker elsewhere."""
+    distributed = optional("distributed", "cluster")
+    with distributed.Client(address, set_as_default=False) as client:
+        futures = {
+            client.submit(attempt, work, key=f"soup-nlp {name} {os.getpid()}", pure=False): name
+            for name, work in jobs.items()
+        }
+        for future in distributed.as_completed(list(futures)):
+            try:
+                row = dict(future.result())
+            except Exception as error:
+                row = failure(f"{type(error).__name__}: {str(error).strip()}")
+            yield futures[future], row

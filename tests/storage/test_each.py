@@ -1,0 +1,126 @@
+"""Many jobs: in this process, in worker processes, on a cluster of this machine."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+
+from soup_nlp.errors import ConfigError, optional
+from soup_nlp.storage.each import ONE_THREAD, attempt, each
+
+
+def job(number: int) -> dict:
+    """A row; 3 raises, and the processes of 4 and 5 die."""
+    if number == 3:
+        raise ValueError("out of numbers")
+    if number == 4:
+        os._exit(3)
+    if number == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return {"square": number**2, "process": os.getpid(), "threads": os.environ["OMP_NUM_THREADS"]}
+
+
+def jobs(count: int) -> dict:
+    return {str(k): partial(job, k) for k in range(count)}
+
+
+def test_a_row_is_plain_json(monkeypatch):
+    row = attempt(lambda: {"a": np.float64(np.nan), "b": [np.int64(3), float("inf")], "c": (1.5,)})
+    assert (row["a"], row["b"], row["c"], row["ok"]) == (None, [3, None], [1.5], True)
+    assert row["cpu_seconds"] >= 0 < row["peak_bytes"]
+    json.dumps(row, allow_nan=False)
+
+
+def test_one_worker_calls_the_jobs_here_in_their_order(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    rows = list(each(jobs(4)))
+    assert [name for name, _ in rows] == ["0", "1", "2", "3"]
+    assert {row["process"] for _, row in rows[:3]} == {os.getpid()}
+    assert rows[3][1]["error"] == "ValueError: out of numbers"
+
+
+def test_a_worker_that_dies_is_one_failed_row(monkeypatch):
+    for name in ONE_THREAD:
+        monkeypatch.delenv(name, raising=False)
+    rows = dict(each(jobs(8), workers=2))
+    assert [rows[str(k)].get("square") for k in (0, 1, 2, 6, 7)] == [0, 1, 4, 36, 49]
+    assert os.getpid() not in {rows[str(k)]["process"] for k in (0, 1, 2, 6, 7)}
+    assert {rows[str(k)]["threads"] for k in (0, 1, 2, 6, 7)} == {"1"}
+    assert rows["3"]["error"] == "ValueError: out of numbers"
+    assert "the process died (" in rows["4"]["error"]
+    assert "died by SIGKILL" in rows["5"]["error"]
+
+
+def test_fresh_processes_and_their_wall_time():
+    rows = dict(each({"a": partial(job, 1), "b": partial(job, 2)}, fresh=True))
+    assert rows["a"]["process"] != rows["b"]["process"]
+    (late,) = dict(each({"a": partial(time.sleep, 60)}, fresh=True, seconds=0.5)).values()
+    assert late["error"] == "wall time limit of 0.5 s reached"
+
+
+def test_what_cannot_be_sent_is_a_failed_row():
+    (row,) = dict(each({"a": partial(print, sys.stdout.buffer)}, fresh=True)).values()
+    assert not row["ok"]
+    assert "pickle" in row["error"].lower()
+
+
+SCRIPT = """
+from functools import partial
+from soup_nlp.storage.each import each
+
+def square(number):
+    return {"square": number * number}
+
+print(sorted(row["square"] for _, row in each({str(k): partial(square, k) for k in range(3)}, 2)))
+"""
+
+
+@pytest.mark.parametrize("stdin", [False, True])
+def test_a_script_needs_no_guard(tmp_path, stdin):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    words = [sys.executable, "-" if stdin else str(script)]
+    text = SCRIPT if stdin else None
+    ended = subprocess.run(words, input=text, capture_output=True, text=True, check=True)
+    assert ended.stdout == "[0, 1, 4]\n"
+
+
+INTERRUPTED = """
+import os, signal, time
+from functools import partial
+from soup_nlp.storage.each import each
+
+def wait(number):
+    time.sleep(60 * number)
+    return {"process": os.getpid()}
+
+rows = each({"0": partial(wait, 0), "1": partial(wait, 1), "2": partial(wait, 2)}, 2)
+try:
+    for name, row in rows:
+        print(name, row["process"], flush=True)
+        os.kill(os.getpid(), signal.SIGINT)
+except KeyboardInterrupt:
+    rows.close()
+    print("kept")
+"""
+
+
+def test_after_ctrl_c_no_worker_is_left():
+    ended = subprocess.run(
+        [sys.executable, "-"], input=INTERRUPTED, capture_output=True, text=True, check=True
+    )
+    first, kept = ended.stdout.splitlines()
+    assert kept == "kept"
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(first.split()[1]), 0)
+
+
+def test_a_missing_package_is_named_with_its_extra():
+    with pytest.raises(ConfigError, match=r"pip install 'soup-nlp\[cluster\]'"):
+        optional("no_such_package_of_ours", "cluster")
