@@ -54,28 +54,24 @@ versions: $(VENV)/.installed
 
 # every table and picture of results/; a command that fails does not end the others, one that was
 # stopped continues
-SOUP = -$(BIN)/soup-nlp
+BENCH = -$(BIN)/python -m benchmarks
 PAIRS = --suite rendered $(if $(DATA),--suite shared --data $(DATA))
 results: $(VENV)/.optional
-	$(SOUP) solve problems/motorcycle.yaml -o out/motorcycle --overwrite
+	-$(BIN)/soup-nlp solve problems/motorcycle.yaml -o out/motorcycle --overwrite
 	-cp out/motorcycle/overview.png results/motorcycle.png
-	$(SOUP) bench accuracy -o results/accuracy $(PAIRS) --overwrite
-	$(SOUP) bench accuracy -o results/accuracy --name banner --suite rendered --only banner \
-		--seeds 0,1,2,3,4,5 --flow truth --flow dis --overwrite
-	$(SOUP) bench search -o results/accuracy --suite rendered --only street --only room --only orbit \
-		--flow dis --trials 8 --seeds 0 --width 512 --set segmentation.superpixels=300 \
-		--set refine.enabled=false --overwrite
-	$(SOUP) bench chain -o results/accuracy $(if $(DATA),--data $(DATA)) --overwrite
-	$(SOUP) bench paper -o results/paper $(if $(DATA),--data $(DATA)) --limit 1 --superpixels 1000 \
-		--analysis 100 --overwrite
-	$(SOUP) bench speed -o results/speed --scenes street,room,orbit,motorcycle --superpixels 1000,2000 \
-		--neighbours 15 --seeds 0 --overwrite
-	$(SOUP) bench speed -o results/speed --name cost --scenes street --widths 512,1024,1792 \
-		--superpixels 250,1000,2000 --neighbours 15 --seeds 0 --set refine.enabled=true --overwrite
-	$(SOUP) family out/tangent --sizes 100,250 --starts hard --coordinates tangent --overwrite
-	$(SOUP) family out/matrix --sizes 100 --starts hard --overwrite
-	$(SOUP) compare out/tangent out/matrix -o results/solvers --seconds 10 --iterations 500 \
-		--solvers ipopt,ipopt-lbfgs,sqpmethod,uno,fatrop,pounce,soup-nlp --overwrite
+	$(BENCH) accuracy -o results/accuracy $(PAIRS)
+	$(BENCH) accuracy -o results/accuracy --name banner --suite rendered --only banner \
+		--seeds 0,1,2,3,4,5 --flow truth --flow dis
+	$(BENCH) chain -o results/accuracy $(if $(DATA),--data $(DATA))
+	$(BENCH) paper -o results/paper $(if $(DATA),--data $(DATA)) --limit 1 --superpixels 1000 \
+		--analysis 100
+	$(BENCH) speed -o results/speed --scenes street,room,orbit,motorcycle --superpixels 1000,2000
+	$(BENCH) speed -o results/speed --name cost --scenes street --widths 512,1024,1792 \
+		--superpixels 250,1000,2000 --set refine.enabled=true
+	$(BENCH) family out/tangent --sizes 100,250 --starts hard --formulation tangent
+	$(BENCH) family out/matrix --sizes 100 --starts hard
+	$(BENCH) solvers out/tangent out/matrix -o results/solvers --seconds 10 --iterations 500 \
+		--solvers ipopt,ipopt-lbfgs,sqpmethod,uno,fatrop,pounce,soup-nlp
 
 clean:
 	rm -rf $(VENV) out site

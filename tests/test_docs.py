@@ -107,7 +107,7 @@ def test_files_keys_and_commands_that_are_named_exist(page):
         # a picture flow.png is none
         assert key in known or key.endswith((".png", ".flo")), key
     known = commands()
-    assert {"solve", "batch"} <= known
+    assert {"solve", "chain"} <= known
     for command in re.findall(r"soup-nlp ([a-z]+)\b", text):
         assert command in known, command
 

@@ -44,6 +44,10 @@ LIBRARIES = {
 }
 """Which rooms may import a library; `importlib.metadata` names versions without importing."""
 
+BENCHMARKS = {"config", "data", "evaluate", "export", "geometry", "sequence", "storage"}
+"""Rooms that `benchmarks` enters; the SOUP set builds its NLPs, and enters those below too."""
+FAMILY = {"model", "pipeline", "start"}
+
 COMMON = {"arrays", "errors"}
 """Modules beside the rooms that every room may import."""
 TOP = {"", "__main__", *COMMON}
@@ -151,6 +155,18 @@ def test_every_room_has_its_place_in_the_order():
     for here, known in ALLOWED.items():
         later = {r for r in known & ALLOWED.keys() if order.index(r) >= order.index(here)}
         assert not later, f"{here} is placed before {later}"
+
+
+def test_benchmarks_enter_few_rooms_and_the_package_does_not_know_them():
+    entered: dict[bool, set[str]] = {True: set(), False: set()}
+    folder = PACKAGE.parent / "benchmarks"
+    for path in folder.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        names = [own(name) for name, _ in imports(tree, "", False)]
+        entered["family" in path.parts] |= {room(n) for n in names if n} - COMMON
+    assert entered[False] == BENCHMARKS
+    assert entered[True] <= BENCHMARKS | FAMILY
+    assert not any("benchmarks" in names for names in OUTSIDE.values())
 
 
 def test_nothing_else_stands_beside_the_rooms():
