@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from helpers_files import write_pair
 
+from benchmarks import __main__ as benchmarks
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -62,6 +63,8 @@ def run_line(words):
     """Run one command line; returns its exit code."""
     if words[0] == "soup-nlp":
         return main(words[1:])
+    if words[:3] == ["python", "-m", "benchmarks"]:
+        return benchmarks.main(words[3:])
     beside = str(Path(sys.executable).parent)
     program = shutil.which(words[0], path=beside) or shutil.which(words[0])
     if program is None:

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 import soup_nlp
-from soup_nlp.cli.main import BENCH, COMMANDS, first_line, main
+from soup_nlp.cli.main import COMMANDS, first_line, main
 from soup_nlp.config.problem import (
     Problem,
     dump_problem,
@@ -190,7 +190,7 @@ def test_libraries_are_imported_on_use(code, absent):
     assert done.stderr.strip() == "[]"
     if absent is HEAVY:
         assert f"soup-nlp {soup_nlp.__version__}" in done.stdout
-        assert "accuracy" in done.stdout
+        assert "compare" in done.stdout
 
 
 def test_a_version_has_its_changelog_and_citation():
@@ -201,7 +201,7 @@ def test_a_version_has_its_changelog_and_citation():
     assert released[1] == cited[1] == soup_nlp.__version__
 
 
-@pytest.mark.parametrize("home", [*COMMANDS.values(), *BENCH.values()])
+@pytest.mark.parametrize("home", COMMANDS.values())
 def test_help_has_the_first_line_of_the_docstring(home):
     module, _, function = home.partition(":")
     text = inspect.getdoc(getattr(import_module(f"soup_nlp.cli.{module}"), function))

@@ -46,7 +46,6 @@ READ = {
     "evaluate --depth": "evaluate {result} --depth {odd.npy}",
     "import DIR": "import {odd} {sol} -o {out}",
     "import .sol": "import {exported} {odd.sol} -o {out}",
-    "bench accuracy --data": "bench accuracy --suite sintel --data {odd} -o {out}",
 }
 """Commands that read a file or folder."""
 
@@ -67,15 +66,12 @@ PARTS = {
 """Suffixes by name of the files of an input folder."""
 MALFORMED = ("empty", "garbage", "line", "brackets", "digits", "braces")
 """Kinds of odd files with contents."""
-SMALL_SPEED = "bench speed --scenes street --sizes 12 --neighbours 4 --seeds 0 --width 64"
 WRITE = {
     "solve": "{solve} -o {odd}",
     "export": "export {p} -q -o {odd}",
     "compare": "compare {p} --solvers ipopt -o {odd}",
     "import": "import {exported} {sol} -o {odd}",
-    "bench speed": f"{SMALL_SPEED} -o {{odd}}",
     "chain": "chain {a} {b} {tiny} -q -o {odd}",
-    "family": "family {odd}",
     "convert": "convert {result} --to npy -o {odd}",
     "demo": "demo -o {odd}",
 }
@@ -225,11 +221,8 @@ def text_cases() -> Iterator[Case]:
     spoken = {k: v for k, v in spoken.items() if "\0" not in v and len(v) < 100_000}
     yield from cases(DOORS, "text --set {}", "show {p} --set name={x}", spoken, (0, 2))
     # the commands end with an error after they have read the rows
-    for verb, file, line in (
-        ("compare", "runs.jsonl", "compare {p} --solvers no_such_solver -o {o}"),
-        ("speed", "table.jsonl", f"{SMALL_SPEED} --set segmentation.superpixels=x -o {{o}}"),
-    ):
-        yield from cases(DOORS, f"rows {verb} {{}}", line, ROWS, ANY, make=written(file))
+    line = "compare {p} --solvers no_such_solver -o {o}"
+    yield from cases(DOORS, "rows {}", line, ROWS, ANY, make=written("runs.jsonl"))
     yield from cases(DOORS, "rows read {}", _rows, ROWS, make=written("r.jsonl"), quiet=True)
     yield from cases(DOORS, "rows read file {}", _odd_rows, KINDS, quiet=True)
 
@@ -286,7 +279,6 @@ UNTRUSTING: dict[str, tuple[str, Any, tuple[int, ...]]] = {
     "solver": ("compare {p} --solvers {x} -o {out}", None, (2,)),
     "formulation": ("export {p} --formulation {x} -o {out}", None, (2,)),
     "scale": ("evaluate {result} --depth {d} --scale {x}", None, (2,)),
-    "suite": ("bench accuracy --suite {x} -o {out}", None, (2,)),
     "flow": ("{solve} --flow {x}", None, (2,)),
     "summary": ("check {x}", changed("result", "summary.json", _status), (1, 2)),
 }  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 from helpers_odd_run import ANY, DOORS, Case, cases, words, write
 from helpers_odd_world import SIZE, World
 
-from soup_nlp.cli.main import BENCH, COMMANDS, _load, main
+from soup_nlp.cli.main import COMMANDS, _load, main
 from soup_nlp.config.problem import Problem
 from soup_nlp.schema.section import Section
 
@@ -179,12 +179,9 @@ BASES = {
     "import": "import {exported} {sol} -o {out}",
     "compare": "compare {p} --solvers no_such_solver -o {out}",
     # commands that would run for minutes: their target is a file, which they must reject first
-    "family": "family {odd} --sizes=100 --scenes=orbit",
-    "bench accuracy": "bench accuracy --suite=rendered --only=orbit --width=64 {tiny} -q -o {odd}",
-    "bench search": "bench search --suite=rendered --only=orbit --width=64 -q -o {odd}",
     "demo": "demo -q -o {odd}",
 }
-"""A call of every command that ends soon; the other analyses of bench are like `demo`."""
+"""A call of every command that ends soon."""
 ENDS = ("view", "check", "convert", "import", "export", "solve", "chain", "compare")
 """Commands whose calls end with any folder."""
 SOLVING = ("solve", "chain", "export", "import", "compare")
@@ -193,19 +190,18 @@ SOLVING = ("solve", "chain", "export", "import", "compare")
 
 def option_cases(values: tuple[str, ...] = ODD_VALUES) -> Iterator[Case]:
     """A case for every option that takes a value, and for every argument."""
-    for table, head in ((COMMANDS, ""), (BENCH, "bench ")):
-        for name, home in table.items():
-            for parameter in _load(name, home).params:
-                if parameter.name == "help" or getattr(parameter, "is_flag", False):
-                    continue
-                option = parameter.param_type_name == "option"
-                word = max(parameter.opts, key=len) if option else ""
-                # with a valid folder these commands would run to their end
-                ends = head + name in ENDS or word != "--out"
-                for value in values if ends else ("", "\x1b[31m", "/dev/full", "x" * 10_000):
-                    # --serve 0 takes any free port, and serves until it is stopped
-                    if (word, value) != ("--serve", "0"):
-                        yield _option_case(head + name, word, parameter.name, value)
+    for name, home in COMMANDS.items():
+        for parameter in _load(name, home).params:
+            if parameter.name == "help" or getattr(parameter, "is_flag", False):
+                continue
+            option = parameter.param_type_name == "option"
+            word = max(parameter.opts, key=len) if option else ""
+            # with a valid folder these commands would run to their end
+            ends = name in ENDS or word != "--out"
+            for value in values if ends else ("", "\x1b[31m", "/dev/full", "x" * 10_000):
+                # --serve 0 takes any free port, and serves until it is stopped
+                if (word, value) != ("--serve", "0"):
+                    yield _option_case(name, word, parameter.name, value)
 
 
 def _option_case(command: str, word: str, name: str, value: str) -> Case:
