@@ -352,7 +352,8 @@ def _plot(path: Path, studies: Mapping[str, Mapping[str, pd.DataFrame]]) -> None
 def _departures(rows: pd.DataFrame) -> list[str]:
     """Table of the departures, each undone alone."""
     table = rows.pivot(index="change", columns="name", values="mre").astype(float)
-    table = table.reindex(rows["change"].unique()).dropna(axis=1, how="all")
+    table = table.reindex(index=rows["change"].unique(), columns=rows["name"].unique())
+    table = table.dropna(axis=1, how="all")
     ratios = table / table.loc[BASE]
     table.insert(0, "mean", ratios.apply(geometric, axis=1))
     counts = zip((ratios > 1.01).sum(axis=1), (ratios < 0.99).sum(axis=1), strict=True)
