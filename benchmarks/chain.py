@@ -56,7 +56,7 @@ def measure_chain(cell: Cell, frames: int = 10) -> Row:
         solved = chain(
             source,
             Path(folder) / "chain",
-            most=frames,
+            frames=frames,
             depth_scale=256.0,
             overrides=cell.overrides,
         )

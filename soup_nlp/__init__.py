@@ -11,7 +11,7 @@ import soup_nlp.evaluate  # noqa: F401
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from soup_nlp.arrays import Float
+    from soup_nlp.arrays import Float, Mask
     from soup_nlp.config.problem import Problem, load_problem, make_problem
     from soup_nlp.data.pair import Flow, Pair, Truth
     from soup_nlp.errors import SoupError
@@ -78,11 +78,31 @@ def evaluate(
     scale: Scale = "median",
     cap: float | None = None,
     depth_scale: float | None = None,
+    moving: str | Path | Mask | None = None,
 ) -> dict[str, DepthMetrics]:
-    """Score a depth against the truth; see `evaluate.scoring.evaluate`."""
+    """Score a depth against the truth.
+
+    Args:
+        result: Result folder, `Run`, stored result, or depth of the reference frame (H, W).
+        depth: True depth of the reference frame (H, W), or a file: .dpt, .npy, .pfm, 16-bit .png.
+        scale: "median", "mre", "lsq", "affine" (scale and shift) or "none".
+        cap: Truth beyond this depth is dropped, positive.
+        depth_scale: Values per unit of length of a .png; None for 1000, with a warning.
+        moving: (H, W) True where something moves by itself, or a picture that is not black there:
+            "static" and "moving" are then scored by themselves, at the scale of all pixels.
+
+    Returns:
+        Metrics by "solution", "start", "nlp" and "rigid" (if known) and "constant".
+
+    Raises:
+        DataError: the cap is not positive, a file is missing, sizes differ, or the truth has no
+            pixel.
+    """
     from soup_nlp.evaluate import scoring
 
-    return scoring.evaluate(result, depth, scale=scale, cap=cap, depth_scale=depth_scale)
+    return scoring.evaluate(
+        result, depth, scale=scale, cap=cap, depth_scale=depth_scale, moving=moving
+    )
 
 
 def __getattr__(name: str) -> Any:
@@ -96,5 +116,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Public names beside what is loaded."""
-    return sorted({*globals(), *__all__})
+    """The public names."""
+    return sorted(__all__)

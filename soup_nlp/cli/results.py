@@ -24,8 +24,8 @@ from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import accuracy, sectioned
 from soup_nlp.sequence import folder as folders
 from soup_nlp.sequence.folder import is_chain, read_chain, renew_page
-from soup_nlp.sequence.frames import depth_files
-from soup_nlp.sequence.score import score, score_lines
+from soup_nlp.sequence.frames import DEPTHS, numbered_files
+from soup_nlp.sequence.score import read_path, score, score_lines
 from soup_nlp.storage.files import is_folder
 
 NOT_STATIONARY = 3
@@ -64,21 +64,38 @@ def evaluate(
     scale: Annotated[Scale, option("Rule of the one global scale.")] = "median",
     cap: Annotated[float | None, option("Drop truth beyond this depth.")] = None,
     depth_scale: options.DepthScale = None,
+    moving: Annotated[
+        Path | None, option("Picture that is not black where something moves: scored by itself.")
+    ] = None,
+    path: Annotated[
+        Path | None, option("True poses of a chain, a line a frame: TUM, or KITTI odometry.")
+    ] = None,
 ) -> None:
-    """Score a result against a truth file."""
-    if is_chain(folder):
-        if scale != "median" or cap is not None:
-            raise ConfigError(
-                "a chain is scored with a median scale and no cap",
-                where=folder,
-                found=f"--scale {scale}" if cap is None else f"--cap {cap:g}",
-                hint="soup-nlp evaluate DIR/pairs/000_001 scores one pair with other rules",
-            )
-        truths = [read_depth(path, depth_scale) for path in depth_files(depth)]
-        print("\n".join(score_lines(score(read_chain(folder), truths))))
+    """Score a result against a truth: MRE (Abs Rel), RMSE, delta < 1.25; of a chain its path."""
+    chain = is_chain(folder)
+    of_pair, found = ["--moving"] * (moving is not None), f"--scale {scale}"
+    of_pair += [f"--cap {cap:g}"] if cap is not None else []
+    of_pair += [found] if scale != "median" else []
+    wrong = of_pair if chain else ["--path"] * (path is not None)
+    if wrong:
+        raise ConfigError(
+            f"{'a chain' if chain else 'a pair'} is scored without this option",
+            where=folder,
+            found=wrong[0],
+            hint="soup-nlp evaluate DIR/pairs/000_001 scores one pair" if chain else None,
+        )
+    if chain:
+        files = numbered_files(depth, DEPTHS, "true depth", "depth_*")
+        truths = [read_depth(file, depth_scale) for file in files]
+        poses = None if path is None else read_path(path)
+        print("\n".join(score_lines(score(read_chain(folder), truths, poses))))
         return
-    scores = evaluate_folder(folder, depth, scale=scale, cap=cap, depth_scale=depth_scale)
-    print("\n".join(accuracy(scores)))
+    rules: list[Scale] = [scale] if scale == "affine" else [scale, "affine"]
+    for rule in rules:
+        scores = evaluate_folder(
+            folder, depth, scale=rule, cap=cap, depth_scale=depth_scale, moving=moving
+        )
+        print("\n".join(accuracy(scores)))
 
 
 def import_(

@@ -27,9 +27,11 @@ from soup_nlp.sequence.solve import AUTO, named, solve_chain
 from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.folders import default_folder
 from soup_nlp.storage.progress import interruptible
+from soup_nlp.storage.rows import Row
 from soup_nlp.storage.system import scratch
 
 SOURCE = "Two images, or a problem file or name (`soup-nlp list`)."
+KIND = "metric, relative, inverse, ordinal; default: by the flow."
 in_flow, in_prior = partial(option, panel="Flow"), partial(option, panel="Depth prior")
 
 
@@ -52,9 +54,7 @@ def solve(
     flow_backward: Annotated[Text, in_flow("Flow from next to ref; gives the confidence.")] = None,
     flow_confidence: Annotated[Text, in_flow(".npy in [0, 1], or a grey picture.")] = None,
     depth_prior: Annotated[Text, in_prior("Depth of ref: .npy, .npz, .pfm, .png, .onnx.")] = None,
-    depth_prior_kind: Annotated[
-        Text, in_prior("metric, relative, inverse, ordinal; default: by the flow.")
-    ] = None,
+    depth_prior_kind: Annotated[Text, in_prior(KIND)] = None,
     superpixels: options.Wanted = None,
     neighbours: options.Neighbours = None,
     max_size: options.MaxSize = None,
@@ -232,8 +232,13 @@ def chain(
     undistort: options.Undistort = False,
     stride: Annotated[str, option("Every n-th frame; auto: those with enough parallax.")] = "1",
     frames: Annotated[int | None, option("Most frames to use; of a scene 10.", min=2)] = None,
-    two_frame: Annotated[bool, option("Solve frames k and k + 2, too.", "--two-frame")] = False,
     depth_scale: options.DepthScale = None,
+    flow: Annotated[Text, in_flow("Folder or pattern of flows, one a pair; or a network.")] = None,
+    flow_backward: Annotated[Text, in_flow("The same from each next frame back.")] = None,
+    depth_prior: Annotated[
+        Text, in_prior("Folder or pattern of depth maps, one a frame; or a network.")
+    ] = None,
+    depth_prior_kind: Annotated[Text, in_prior(KIND)] = None,
     preset: options.PresetName = None,
     overrides: options.Set = None,
     superpixels: options.Wanted = None,
@@ -255,6 +260,19 @@ def chain(
             print(f"{len(sequence)} frames{spacing}; pairs to solve: {pairs}", file=sys.stderr)
 
     short = options.sizes(superpixels, neighbours, max_size)
+    flows = {"source": flow, "backward": flow_backward}
+    prior = {"source": depth_prior, "kind": depth_prior_kind}
+    sections: dict[str, Any] = {
+        name: {key: value for key, value in section.items() if value is not None}
+        for name, section in (("flow", flows), ("depth_prior", prior))
+        if any(section.values())
+    }
+    progress, solved = options.RowProgress(quiet), list[Row]()
+
+    def say(done: int, total: int, row: Row) -> None:
+        solved.append(row)
+        progress(done, total, row)
+
     kept = options.resumable("pairs that were finished before are kept", f"{out}/pairs")
     with kept, options.SolveLog(quiet).warnings():
         done = solve_chain(
@@ -264,15 +282,17 @@ def chain(
             fov=fov,
             undistort=undistort,
             stride=stride,
-            most=frames,
-            two_frame=two_frame,
+            frames=frames,
             depth_scale=depth_scale,
+            **sections,
             overrides=options.changed(preset, overrides, short),
             workers=workers,
             overwrite=overwrite,
             begin=begin,
-            say=options.RowProgress(quiet),
+            say=say,
         )
+    if not (solved or quiet):
+        print("every pair was solved before: the chain is finished", file=sys.stderr)
     print("\n".join(chain_lines(done)))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "pairs/"]))
     code, why = chain_exit_code(done)

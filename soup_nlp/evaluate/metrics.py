@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError, repr_of
 
-Scale = Literal["median", "mre", "lsq", "none"]
+Scale = Literal["median", "mre", "lsq", "affine", "none"]
 ERRORS = "mre", "median_relative", "sq_rel", "rmse", "log_rmse", "delta1", "delta2", "delta3"
 """Names of the errors of a depth map."""
 
@@ -30,6 +30,8 @@ class Convention:
             sum (z / z_gt) |z_gt / z - s|, so s is the weighted median of z_gt / z with weights
             z / z_gt.
         "lsq": the s that minimises the RMSE, sum z z_gt / sum z^2.
+        "affine": the s and the shift b that minimise the RMSE of s z + b; depths below the nearest
+            true one are set to it.
         "none": s = 1.
 
     Attributes:
@@ -91,11 +93,12 @@ class DepthMetrics:
         delta1: Share of pixels with max(z_gt / s z, s z / z_gt) < 1.25.
         delta2: The same below 1.25^2.
         delta3: The same below 1.25^3.
-        scale_rule: How s was chosen: "median", "mre", "lsq" or "none".
+        scale_rule: How s was chosen: "median", "mre", "lsq", "affine" or "none".
         scale: The factor s on the estimate.
         cap: Truth beyond this depth was left out, in the unit of the truth; None for no cap.
         coverage: Share of the true pixels (within the cap) that have an estimate.
         n_pixels: Number of pixels that the errors are over.
+        shift: What is added to the scaled estimate, 0 except for the rule "affine".
     """
 
     mre: float
@@ -111,6 +114,7 @@ class DepthMetrics:
     cap: float | None
     coverage: float
     n_pixels: int
+    shift: float = 0.0
 
     def __str__(self) -> str:
         return (
@@ -150,14 +154,19 @@ def depth_metrics(
     compared = true & np.isfinite(z) & (z > 0)
     coverage = np.count_nonzero(compared) / np.count_nonzero(true)
     z, gt = z[compared], gt[compared]
-    s = _scale(z, gt, convention.scale) if z.size else float("nan")
+    s, shift = _scale(z, gt, convention.scale) if z.size else float("nan"), 0.0
+    aligned = s * z
+    if convention.scale == "affine" and z.size:
+        s, shift = _affine(z, gt)
+        aligned = np.maximum(s * z + shift, gt.min())
     return DepthMetrics(
-        **_errors(s * z, gt),
+        **_errors(aligned, gt),
         scale_rule=convention.scale,
         scale=float(s),
         cap=None if convention.cap is None else float(convention.cap),
         coverage=float(coverage),
         n_pixels=int(z.size),
+        shift=shift,
     )
 
 
@@ -191,6 +200,16 @@ def _scale(z: Float, gt: Float, rule: Scale) -> float:
         unit = z / z.max()  # so that squares of tiny or huge depths stay in range
         return float(np.dot(unit, gt) / np.dot(unit, unit) / z.max())
     return 1.0
+
+
+def _affine(z: Float, gt: Float) -> tuple[float, float]:
+    """Scale and shift of z (M,) with the least squares of the truth gt (M,)."""
+    unit = z.max()  # so that squares of tiny or huge depths stay in range
+    centred = (z - z.mean()) / unit
+    spread = float(centred @ centred)
+    # rounding errors of a constant depth are no relief
+    s = float(centred @ gt) / spread / unit if np.ptp(z) > 1e-9 * unit else 0.0
+    return s, float(gt.mean() - s * z.mean())
 
 
 def skill(mre: float, mre_constant: float) -> float:

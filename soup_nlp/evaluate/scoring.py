@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.accept import array_of
+from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
@@ -100,23 +101,9 @@ def evaluate(
     scale: Scale = "median",
     cap: float | None = None,
     depth_scale: float | None = None,
+    moving: str | Path | Mask | None = None,
 ) -> dict[str, DepthMetrics]:
-    """Score a depth against the truth.
-
-    Args:
-        result: Result folder, `Run`, stored result, or depth of the reference frame (H, W).
-        depth: True depth of the reference frame (H, W), or a file: .dpt, .npy, .pfm, 16-bit .png.
-        scale: "median", "mre", "lsq" or "none".
-        cap: Truth beyond this depth is dropped, positive.
-        depth_scale: Values per unit of length of a .png; None for 1000, with a warning.
-
-    Returns:
-        Metrics by "solution", "start", "nlp" and "rigid" (if known) and "constant".
-
-    Raises:
-        DataError: the cap is not positive, a file is missing, sizes differ, or the truth has no
-            pixel.
-    """
+    """Score a depth against the truth; its text is that of `soup_nlp.evaluate`."""
     convention = Convention(scale=scale, cap=cap)
     depths = _depths(result)
     where = depth if isinstance(depth, str | Path) else "truth"
@@ -132,7 +119,19 @@ def evaluate(
             where=where,
             found="no finite, positive depth" + ("" if cap is None else f" up to the cap {cap:g}"),
         )
-    return score_depths(Truth(depth_ref=gt), depths, convention)
+    scores = score_depths(Truth(depth_ref=gt), depths, convention)
+    if moving is not None:
+        values = read_image(moving).any(axis=2) if isinstance(moving, str | Path) else moving
+        boolean = isinstance(values, np.ndarray) and values.dtype == bool
+        mask = _map(values.astype(np.uint8) if boolean else values, "mask") > 0
+        if mask.shape != expected:
+            raise DataError("mask and result differ in size", found=mask.shape, expected=expected)
+        m = scores["solution"]
+        aligned = m.scale * depths["solution"] + m.shift
+        for name, part in (("static", ~mask), ("moving", mask)):
+            if convention.counts(gt_part := np.where(part, gt, np.nan)):
+                scores[name] = depth_metrics(aligned, gt_part, Convention("none", cap))
+    return scores
 
 
 def _depths(result: object) -> dict[str, Float]:

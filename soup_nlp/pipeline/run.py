@@ -227,6 +227,19 @@ class ProblemKeys(TypedDict, total=False):
     output: Options | OutputOptions | None
 
 
+def sections(keys: ProblemKeys, where: str) -> dict[str, Any]:
+    """Keys of a problem that a caller of the function `where` gives, as those of a file."""
+    raw = {
+        key: value.model_dump(exclude_unset=True) if isinstance(value, BaseModel) else value
+        for key, value in keys.items()
+        if value is not None or key == "max_size"
+    }
+    # make_problem names the other unknown keys
+    if decided := sorted(raw.keys() & {"name", "input"}):
+        raise ConfigError("key follows from the images", where=where, found=decided[0])
+    return raw
+
+
 def solve_pair(
     pair: Pair,
     *,
@@ -259,14 +272,7 @@ def solve_pair(
     check_cameras((pair.K_ref, pair.K_next), images, names, cropped)
     if pair.flow is not None:
         check_flow(pair.flow, pair)
-    raw: dict[str, Any] = {
-        key: value.model_dump(exclude_unset=True) if isinstance(value, BaseModel) else value
-        for key, value in keys.items()
-        if value is not None or key == "max_size"
-    }
-    # make_problem names the other unknown keys
-    if decided := sorted(raw.keys() & {"name", "input"}):
-        raise ConfigError("key follows from the pair", where="solve_pair", found=decided[0])
+    raw = sections(keys, "solve_pair")
     raw |= {"name": title(pair.name), "input": {"kind": "memory", "hash": pair_hash(pair)}}
     begin = time.perf_counter()
 

@@ -1,9 +1,11 @@
 """A chain of solved pairs in one unit of length; a single pair is a chain of two frames."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +16,16 @@ from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.motion import RigidMotion
-from soup_nlp.report.colour import depth_range
-from soup_nlp.report.result import UNIT, Result
+from soup_nlp.report.colour import colourise_depth, colourise_shares, depth_range
+from soup_nlp.report.figures import Legend, Picture, shown, strip
 
+if TYPE_CHECKING:
+    from soup_nlp.report.result import Result
+
+UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
+"""Unit of lengths in files."""
+SHOWN = 12
+"""Largest number of frames of a chain that a notebook shows."""
 AXES = "x right, y down, z ahead"
 """Axes of a camera, in words."""
 STILL = RigidMotion(np.eye(3), np.zeros(3))
@@ -80,6 +89,21 @@ class Frame:
         """(H, W) True where the depth is a guess; False where it is unknown."""
         return np.asarray(self.sigma > MOST_SIGMA)
 
+    def _repr_html_(self) -> str:
+        near, far = depth_range(self.depth)
+        sigma = colourise_shares(self.sigma, 0.3, "viridis")
+        panels = [
+            Picture("image", "image", self.image),
+            self.picture(near, far, "depth, pale = a guess"),
+            Picture("sigma", "expected depth error (1 sigma), bright = 30 % and more", sigma),
+        ]
+        return shown(str(self), strip(panels, ""))
+
+    def picture(self, near: float, far: float, title: str) -> Picture:
+        """The depth in colours from `near` to `far`, pale where it is a guess."""
+        image = colourise_depth(self.depth, near, far, self.guess)
+        return Picture("depth", title, image, depth_legend(near, far))
+
     @property
     def points(self) -> Float:
         """(H, W, 3) points in world coordinates; NaN where unknown."""
@@ -110,7 +134,7 @@ class Chain:
     summary: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, result: Result) -> "Chain":
+    def of(cls, result: Result) -> Chain:
         """A result as a chain of two frames."""
         poses = STILL, result.components.camera.inverse
         tracks = {k: k for k in range(len(result.components))}
@@ -130,6 +154,12 @@ class Chain:
         )
 
     __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        near, far = depth_range(np.concatenate([frame.depth.ravel()[::7] for frame in self]))
+        chosen = sorted({*np.linspace(0, len(self) - 1, min(SHOWN, len(self))).astype(int)})
+        panels = [self[k].picture(near, far, f"depth of frame {self.names[k]}") for k in chosen]
+        return shown(str(self), strip(panels, ""))
 
     @property
     def name(self) -> str:
@@ -236,3 +266,10 @@ class Chain:
             out[k] = self.world_from_camera[k](part.centre)
             out[k + 1] = self.motion(k, part.label)(out[k])
         return out
+
+
+def depth_legend(near: float, far: float, unit: str = "") -> Legend:
+    """Legend of depths with five values; both ends name the unit."""
+    first, *middle, last = (f"{z:.3g}" for z in 1 / np.linspace(1 / far, 1 / near, 5))
+    colours = colourise_depth(1 / np.linspace(1 / far, 1 / near, 128)[None], near, far)
+    return Legend(colours, (first + unit, *middle, last + unit))

@@ -18,13 +18,13 @@ VIVID = (
 )
 """Colours of tab10 without its grey, which means unknown."""
 
+PALE = 0.35
+"""Share of its colour that the depth of a guess keeps; the rest is white."""
 LEAST_RANGE = 1.1
 """Least ratio of the two ends of a colour scale of depth.
 
 Bending papers have a relief of 7 to 27 %, guesses without parallax mostly one of 0 to 5 %.
 """
-
-_WHEEL = (15, 6, 4, 11, 13, 6)  # steps red-yellow-green-cyan-blue-magenta-red
 
 
 def depth_range(depth: AnyFloat) -> tuple[float, float]:
@@ -47,10 +47,6 @@ def depth_range(depth: AnyFloat) -> tuple[float, float]:
         middle, half = np.sqrt(near * far), np.sqrt(LEAST_RANGE)
         near, far = float(middle / half), float(middle * half)
     return near, far
-
-
-PALE = 0.35
-"""Share of its colour that the depth of a guess keeps; the rest is white."""
 
 
 def colourise_depth(depth: AnyFloat, near: float, far: float, guess: Mask | bool = False) -> Image:
@@ -80,15 +76,6 @@ def component_colours(count: int) -> Image:
     ]
 
 
-def wheel_key(size: int = 64) -> Image:
-    """(size, size, 3) legend of flow colours: no motion at the centre, the limit at the rim."""
-    at = (np.arange(size) + 0.5) / size * 2 - 1
-    u, v = np.meshgrid(at, at)
-    out = colourise_flow(np.stack([u, v], axis=2), 1.0)
-    out[np.hypot(u, v) > 1] = 255
-    return out
-
-
 def colourise_shares(values: AnyFloat, limit: float, name: str) -> Image:
     """Numbers (H, W) from 0 to a limit and above in a map of OpenCV, grey where not finite."""
     known = np.isfinite(values)
@@ -100,16 +87,6 @@ def _paint(level: NDArray[np.float64], known: Mask, name: str) -> Image:
     steps = (level * 255).round().astype(np.uint8)
     out = cv2.applyColorMap(steps, getattr(cv2, f"COLORMAP_{name.upper()}"))[..., ::-1]
     return np.where(known[..., None], out, np.uint8(UNKNOWN))
-
-
-def colour_wheel() -> NDArray[np.float64]:
-    """(55, 3) colours, 0 to 255, of the Middlebury flow wheel (Baker et al., IJCV 2011)."""
-    pure = np.array([[1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1], [1, 0, 1], [1, 0, 0]])
-    parts = []
-    for k, steps in enumerate(_WHEEL):
-        ramp = np.floor(255 * np.arange(steps) / steps)[:, None]
-        parts.append(255.0 * pure[k] + ramp * (pure[k + 1] - pure[k]))
-    return np.concatenate(parts)
 
 
 def flow_limit(uv: AnyFloat) -> float:
@@ -125,35 +102,20 @@ def flow_limit(uv: AnyFloat) -> float:
 
 
 def colourise_flow(uv: AnyFloat, limit: float) -> Image:
-    """Flow in the colours of the Middlebury wheel: hue is direction, white is no motion.
+    """Flow (H, W, 2) in colour: hue is direction, red to the right; white is no motion.
 
-    Args:
-        uv: (H, W, 2) displacement, pixels; black where not finite.
-        limit: Length, pixels, of full saturation, such as `flow_limit`; longer is darker.
+    Colours are full from the length `limit`, pixels; black where the flow is not finite.
     """
     known: Mask = np.asarray(np.isfinite(uv).all(axis=2))
-    flow = np.where(known[:, :, None], uv, 0.0).astype(np.float64)
-    length = np.hypot(flow[:, :, 0], flow[:, :, 1])
-    radius = (length / limit)[:, :, None]
-    wheel = colour_wheel() / 255
-    turn = np.arctan2(-flow[:, :, 1], -flow[:, :, 0]) / np.pi
-    position = (turn + 1) / 2 * (len(wheel) - 1)
-    low = np.floor(position).astype(np.intp)
-    part = (position - low)[:, :, None]
-    hue = (1 - part) * wheel[low] + part * wheel[(low + 1) % len(wheel)]
-    colour = np.where(radius <= 1, 1 - radius * (1 - hue), 0.75 * hue)
-    out = np.floor(255 * colour).astype(np.uint8)
-    out[~known] = 0
-    return np.asarray(out)
+    u, v = np.moveaxis(np.where(known[..., None], uv, 0.0), 2, 0)
+    hue = np.degrees(np.arctan2(v, u)) % 360
+    length = np.minimum(np.hypot(u, v) / limit, 1.0)
+    hsv = np.stack([hue, length, known], axis=2).astype(np.float32)
+    return np.asarray(np.rint(255 * cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)), np.uint8)
 
 
 def colourise_normals(n_map: AnyFloat) -> Image:
-    """Normals in colour: (x, -y, -z) from [-1, 1] to RGB; towards the camera is blue.
-
-    Args:
-        n_map: (H, W, 3) unit normals in the camera frame (x right, y down, z forward); grey where
-            not finite.
-    """
+    """Unit normals (H, W, 3) in colour: (x, -y, -z) from [-1, 1] to RGB, grey where not finite."""
     known: Mask = np.asarray(np.isfinite(n_map).all(axis=2))
     signed = np.where(known[:, :, None], n_map, 0.0) * np.array([1.0, -1.0, -1.0])
     out = ((np.clip(signed, -1, 1) + 1) * 127.5).round().astype(np.uint8)

@@ -1,10 +1,13 @@
-"""Pictures with titles and legends as PNG, alone and as an overview; 16-bit depth maps.
+"""Pictures with titles and legends as PNG, alone and in a grid; 16-bit depth maps.
 
 Every writer raises `DataError` if the file cannot be written.
 """
 
-from collections.abc import Mapping, Sequence
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
+from html import escape
 from importlib.resources import files
 from io import BytesIO
 
@@ -16,16 +19,44 @@ from PIL import ImageDraw, ImageFont
 
 from soup_nlp.arrays import AnyFloat, Image
 from soup_nlp.errors import printable
-from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 from soup_nlp.storage.files import PathLike, write_bytes
 
 _DPI = 100
-_HEAD, _CAPTION, _GAP = 42, 28, 8
-"""Height of the title, height of a caption, and space between panels, in pixels."""
-_LEGEND = {type(None): 0, Bar: 32, Swatches: 24, Wheel: 62}
-"""Height of a legend by its type, pixels."""
-_SPARE = ("depth_start", "normals")
-"""Panels that an overview leaves out, in this order, to fill its last row."""
+_HEAD, _CAPTION, _LEGEND, _GAP = 42, 28, 32, 8
+"""Height of the title, a caption and a legend, and space between panels, in pixels."""
+
+
+@dataclass(frozen=True)
+class Legend:
+    """Colours (1, M, 3) uint8 from left to right, and their meaning.
+
+    `texts` are at even steps from end to end, or one for each of the M classes.
+    """
+
+    colours: Image
+    texts: tuple[str, ...]
+
+    @property
+    def of_classes(self) -> bool:
+        """Whether every colour has a text of its own."""
+        return len(self.texts) == self.colours.shape[1]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of a result.
+
+    Attributes:
+        name: Stem of its file.
+        title: Title.
+        image: (H, W, 3) uint8 RGB.
+        legend: Meaning of the colours; None for photographs.
+    """
+
+    name: str
+    title: str
+    image: Image
+    legend: Legend | None = None
 
 
 def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: int = 420) -> Image:
@@ -37,8 +68,7 @@ def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: 
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     heights = [
-        max(_height(p, panel_width) for p in row) + max(_LEGEND[type(p.legend)] for p in row)
-        for row in rows
+        max(_height(p, panel_width) + _LEGEND * (p.legend is not None) for p in row) for row in rows
     ]
     head = _HEAD if title else _GAP
     size = columns * (panel_width + _GAP) + _GAP, head + sum(heights)
@@ -71,37 +101,15 @@ def _draw_panel(sheet: Pil.Image, panel: Picture, left: int, top: int, width: in
     frame = left - 1, top - 1, left + width, top + tall
     ImageDraw.Draw(sheet).rectangle(frame, outline="#999999")
     _place(sheet, panel.image, left, top, width, tall)
-    bottom = top + tall
-    if isinstance(panel.legend, Bar):
-        _draw_bar(sheet, panel.legend, left, bottom, width)
-    elif isinstance(panel.legend, Swatches):
-        _draw_swatches(sheet, panel.legend, left, bottom, width)
-    elif isinstance(panel.legend, Wheel):
-        size = 52
-        _place(sheet, panel.legend.image, left, bottom + 5, size, size)
-        x, room = left + size + 10, width - size - 10
-        _write(sheet, x, bottom + 5 + size // 2, panel.legend.text, room, points=8)
-
-
-def _draw_bar(sheet: Pil.Image, bar: Bar, left: int, bottom: int, width: int) -> None:
-    _place(sheet, bar.colours, left, bottom + 5, width, 10)
-    last = len(bar.texts) - 1
-    for k, text in enumerate(bar.texts):
-        side = "l" if k == 0 else "r" if k == last else "m"
-        _write(sheet, left + width * k / last, bottom + 24, text, points=8, side=side)
-
-
-def _draw_swatches(sheet: Pil.Image, key: Swatches, left: int, bottom: int, width: int) -> None:
-    x, y, last = float(left), bottom + 13, len(key.entries) - 1
-    for i, (colour, name) in enumerate(key.entries):
-        end = x + 16 + _font(8).getlength(name)
-        # room for the dots where more follow
-        if end + (20 if i < last else 0) > left + width:
-            _write(sheet, x, y, "...", points=8)
-            break
-        ImageDraw.Draw(sheet).rectangle((x, y - 5, x + 11, y + 4), fill=colour)
-        _write(sheet, x + 16, y, name, points=8)
-        x = end + 15
+    if panel.legend is None:
+        return
+    _place(sheet, panel.legend.colours, left, top + tall + 5, width, 10)
+    texts, last = panel.legend.texts, len(panel.legend.texts) - 1
+    for k, text in enumerate(texts):
+        side, x = "l" if k == 0 else "r" if k == last else "m", left + width * k / max(last, 1)
+        if panel.legend.of_classes:
+            side, x = "m", left + width * (k + 0.5) / len(texts)
+        _write(sheet, x, top + tall + 24, text, width / len(texts) - 4, points=8, side=side)
 
 
 @lru_cache(maxsize=100)
@@ -135,16 +143,12 @@ def _place(sheet: Pil.Image, image: Image, left: int, top: int, width: int, heig
     sheet.paste(Pil.fromarray(scaled), (left, top))
 
 
-def overview(drawn: Mapping[str, Picture], title: str) -> Image:
-    """The pictures of a result in a grid of three columns.
-
-    `_SPARE` ones are left out if they would leave a row incomplete.
-    """
-    panels = dict(drawn)
-    for name in _SPARE:
-        if len(panels) % 3:
-            panels.pop(name, None)
-    return strip([*panels.values()], title)
+def shown(text: str, image: Image) -> str:
+    """A text and a picture in HTML, for notebooks."""
+    data = BytesIO()
+    Pil.fromarray(image).save(data, format="png")
+    source = f"data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}"
+    return f'<pre>{escape(text)}</pre><img alt="overview" style="max-width:100%" src="{source}">'
 
 
 def write_png(path: PathLike, rgb: Image) -> None:

@@ -1,18 +1,16 @@
 """The result folder, written whole or not at all; a run that writes and draws itself."""
 
-import base64
 import os
 import shutil
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import wraps
-from html import escape
-from io import BytesIO
 from pathlib import Path
 from typing import Any, ParamSpec
 
-from PIL.Image import Image, fromarray
+import numpy as np
+from PIL.Image import Image
 
 from soup_nlp.arrays import AnyFloat
 from soup_nlp.config.problem import dump_problem
@@ -20,13 +18,12 @@ from soup_nlp.errors import DataError
 from soup_nlp.pipeline import run as pipeline
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.chain import Chain
-from soup_nlp.report.figures import overview, write_depth_png16, write_picture, write_png
-from soup_nlp.report.findings import guess_line
+from soup_nlp.report.figures import shown, write_depth_png16, write_picture, write_png
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import rows_in_file
 from soup_nlp.report.page import pair_page
-from soup_nlp.report.pictures import pictures
-from soup_nlp.report.result import PAGE, Result, result_of
+from soup_nlp.report.pictures import overview, pictures
+from soup_nlp.report.result import PAGE, result_of
 from soup_nlp.report.summary import summary
 from soup_nlp.report.verdict import facts
 from soup_nlp.storage.files import as_path, write_json, write_text
@@ -142,7 +139,7 @@ def write_folder(
         for name, file in PICTURES.items():
             if name in drawn:
                 write_picture(new / file, drawn[name])
-        write_png(new / "overview.png", overview(drawn, _title(result)))
+        write_png(new / "overview.png", overview(drawn, result.title))
         write_formats(new, Chain.of(result), ("motions", "ply", *formats))
         if run.problem.output.page:
             write_text(new / PAGE, pair_page(result, drawn))
@@ -153,11 +150,6 @@ def write_folder(
         files = [name for name in FILES if name in names] + sorted(names.difference(FILES))
         write_text(new / "log.txt", log if isinstance(log, str) else log(files))
     return files
-
-
-def _title(result: Result) -> str:
-    """The name of a result, and the share that is a guess."""
-    return ": ".join(filter(None, [result.name, guess_line(result.summary["certainty"])]))
 
 
 def _attributes(run: Run, config: str) -> dict[str, Any]:
@@ -227,16 +219,10 @@ class WritableRun(Run):
 
     def plot(self) -> Image:
         """The overview as a picture: notebooks show it, `.save` writes it."""
-        result = result_of(self, summary(self))
-        return fromarray(overview(pictures(Chain.of(result)), _title(result)))
+        return result_of(self, summary(self)).plot()
 
     def _repr_html_(self) -> str:
-        """Text and overview, for notebooks."""
-        picture = BytesIO()
-        self.plot().save(picture, format="png")
-        shown = base64.b64encode(picture.getvalue()).decode()
-        image = f'<img alt="overview" style="max-width:100%" src="data:image/png;base64,{shown}">'
-        return f"<pre>{escape(str(self))}</pre>{image}"
+        return shown(str(self), np.asarray(self.plot()))
 
 
 def _writable(solve: Callable[Given, Run]) -> Callable[Given, WritableRun]:

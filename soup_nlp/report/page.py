@@ -8,7 +8,7 @@ from html import escape
 from importlib.resources import files
 from io import BytesIO
 from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,8 +21,9 @@ from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, whole_cells
 from soup_nlp.report.chain import STILL, Chain
 from soup_nlp.report.colour import component_colours
+from soup_nlp.report.figures import Legend, Picture
 from soup_nlp.report.findings import ORIGINS, guess_line
-from soup_nlp.report.pictures import Bar, Legend, Picture, Swatches, Wheel, pictures
+from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import Result
 from soup_nlp.start.components import TIES
 from soup_nlp.storage.files import plain
@@ -45,8 +46,9 @@ LISTED = 8
 """Number of components whose motion is listed."""
 SHOWN = 3
 """Smallest number of frames of a track that is shown; shorter tracks are mostly no objects."""
-SIDES, QUALITY = (1600, 720), 80
-"""Larger side of a picture of a pair and of a chain, pixels; JPEG quality of those of a chain."""
+SIDES, MANY, QUALITY = (1600, 720), 16, 80
+"""Larger side of a picture of a pair and of a chain, pixels; number of pairs above which pictures
+are smaller; JPEG quality of those of a chain."""
 PIXELS = 600_000, 4_000_000
 """Largest number of shown pixels of a pair, and of all pairs; larger images are subsampled."""
 
@@ -78,14 +80,15 @@ def page(chain: Chain, parts: Mapping[str, str], drawn: Mapping[str, Picture] | 
 
 def pair_page(result: Result, drawn: Mapping[str, Picture] | None = None) -> str:
     """The page of a result; `drawn` are its pictures, where they are drawn already."""
+    chain = Chain.of(result)
     limits = "".join(f"<li>{escape(line)}</li>" for line in result.summary["limits"])
     parts = {
         "summary": _summary(result),
         "What limits this result": f"<ul>{limits}</ul>",
-        "Components and their motion": _components(result),
+        "Paths": path_table(chain),
         "Verdict": preformatted(result.summary["verdict"]),
     }
-    return page(Chain.of(result), parts, drawn)
+    return page(chain, parts, drawn)
 
 
 def _file(name: str) -> str:
@@ -110,9 +113,9 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def swatch(colour: Any) -> str:
+def swatch(colour: str) -> str:
     """A field of a colour in HTML."""
-    return f'<i style="background:{_css(colour)}"></i>'
+    return f'<i style="background:{colour}"></i>'
 
 
 def _css(colour: Any) -> str:
@@ -136,10 +139,11 @@ def encoded(image: Image, kind: str, most: int = SIDES[0], **options: Any) -> st
     return f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode('ascii')}"
 
 
-def _figure(picture: Picture, single: bool) -> dict[str, str]:
-    """A picture for the data; of a pair, those with a legend are stored without loss."""
-    if not single:
-        source = encoded(picture.image, "jpeg", SIDES[1], quality=QUALITY)
+def _figure(picture: Picture, pairs: int) -> dict[str, str]:
+    """A picture for the data; of a single pair, those with a legend are stored without loss."""
+    if pairs > 1:
+        side = round(SIDES[1] * min(1.0, np.sqrt(MANY / pairs)))
+        source = encoded(picture.image, "jpeg", side, quality=QUALITY)
     elif picture.legend is None:
         source = encoded(picture.image, "jpeg", quality=90)
     else:
@@ -150,19 +154,17 @@ def _figure(picture: Picture, single: bool) -> dict[str, str]:
 
 def _legend(legend: Legend | None) -> str:
     """A legend in HTML."""
-    if isinstance(legend, Bar):
-        stops = legend.colours[0, np.linspace(0, legend.colours.shape[1] - 1, 24).astype(int)]
-        ramp = ",".join(map(_css, stops))
-        texts = "".join(f"<span>{escape(text)}</span>" for text in legend.texts)
-        bar = f'<div class="bar" style="background:linear-gradient(to right,{ramp})"></div>'
-        return f'{bar}<div class="ticks">{texts}</div>'
-    if isinstance(legend, Swatches):
-        entries = (f"<span>{swatch(c)}{escape(text)}</span>" for c, text in legend.entries)
-        return f'<div class="swatches">{"".join(entries)}</div>'
-    if isinstance(legend, Wheel):
-        image = f'<img src="{encoded(legend.image, "png")}" alt="">'
-        return f'<div class="wheel">{image}<span>{escape(legend.text)}</span></div>'
-    return ""
+    if legend is None:
+        return ""
+    count, colours = legend.colours.shape[1], [*map(_css, legend.colours[0])]
+    if legend.of_classes:
+        stops = [f"{c} {k / count:.1%} {(k + 1) / count:.1%}" for k, c in enumerate(colours)]
+    else:
+        stops = [colours[k] for k in np.linspace(0, count - 1, 24).astype(int)]
+    texts = "".join(f"<span>{escape(text)}</span>" for text in legend.texts)
+    kind = "ticks classes" if legend.of_classes else "ticks"
+    bar = f'<div class="bar" style="background:linear-gradient(to right,{",".join(stops)})"></div>'
+    return f'{bar}<div class="{kind}">{texts}</div>'
 
 
 def _summary(result: Result) -> str:
@@ -185,30 +187,49 @@ def headline(guess: str, words: Sequence[str]) -> str:
     return " &middot; ".join([*strong, *map(escape, words)])
 
 
-def _components(result: Result) -> str:
-    """Motions of the largest components, the camera's first."""
-    parts, scale = result.components, result.scale
-    colours = component_colours(len(parts))
-    rows = []
-    for part in [*parts][:LISTED]:
-        motion = parts.camera.inverse if part.label == 0 else parts.own_motion(part.label)
-        # shift of the camera centre, or of the centre of a component
-        start = np.zeros(3) if part.label == 0 else part.centre
-        shift = scale * float(np.linalg.norm(motion(start) - start))
-        name = "0, the camera's motion" if part.label == 0 else str(part.label)
-        rows.append(
-            [
-                Markup(swatch(colours[part.label]) + escape(name)),
-                f"{part.pixels / result.labels.size:.1%}",
-                f"{motion.angle:.2f}\N{DEGREE SIGN}",
-                f"{shift:.3g} {result.length}",
-                f"{part.residual_px:.2g} px",
-            ]
-        )
-    rest = len(parts) - LISTED
-    note = f"<p>Smaller components that are not listed: {rest}.</p>" if rest > 0 else ""
-    head = ["component", "share of the image", "rotation", "shift", "not rigid by"]
-    return table(head, rows) + note
+class Path(NamedTuple):
+    """What moves, or the camera: its colour, first frame, points (3,) and share of the images."""
+
+    name: str
+    colour: str
+    first: int
+    points: list[Float]
+    share: float | None = None
+
+
+def paths(chain: Chain) -> list[Path]:
+    """Paths of the camera and of what moves, in the shown unit, the largest first."""
+    metre = chain.metre or 1.0
+    camera = [metre * pose.t for pose in chain.world_from_camera]
+    out = list[Path]()
+    colours = component_colours(max(chain.track_numbers, default=0) + 1)
+    for track in chain.track_numbers:
+        path, members = chain.path(track), chain.members(track)
+        points = [metre * point for point in path.values()]
+        moved = np.linalg.norm(points[-1] - points[0]) > 0.01 * abs(points[0][2])
+        if moved if chain.single else len(path) >= SHOWN:
+            share = sum(c.pixels / chain.pairs[k].labels.size for k, c in members.items())
+            own = Path(f"component {track}", _css(colours[track]), min(path), points)
+            out.append(own._replace(share=share / len(members)))
+    out.sort(key=lambda one: -(one.share or 0.0))
+    return [Path("camera", "#ffa94d", 0, camera), *out]
+
+
+def path_table(chain: Chain) -> str:
+    """The largest paths as a table."""
+    rows, known = [], paths(chain)
+    for path in known[: LISTED + 1]:
+        length = float(np.linalg.norm(np.diff(path.points, axis=0), axis=1).sum())
+        share = "" if path.share is None else f"{path.share:.1%}"
+        frames = f"{path.first} to {path.first + len(path.points) - 1}"
+        name = Markup(swatch(path.colour) + escape(path.name))
+        rows.append([name, share, frames, f"{length:.3g}"])
+    rest = f"<p>Smaller ones: {len(known) - LISTED - 1}.</p>" if len(known) > LISTED + 1 else ""
+    return (
+        table(["path of", "share of the images", "frames", f"length, {chain.length}"], rows)
+        + rest
+        + "<p>What moves by itself has a scale of its own: its path is as good as its depth.</p>"
+    )
 
 
 # --- the data of the page: planes, motions, cameras and pictures ----------------------------------
@@ -230,7 +251,7 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         shown = drawn or pictures(chain, k)
         kept = {n: p for n, p in shown.items() if chain.single or n in IN_CHAIN}
         pair = make_pair(chain, k, most)
-        figures = {name: _figure(picture, chain.single) for name, picture in kept.items()}
+        figures = {name: _figure(picture, len(chain.pairs)) for name, picture in kept.items()}
         pairs.append({**{n: _stored(v) for n, v in pair.items()}, "pictures": figures})
     z = metre * np.concatenate([pair.depths[0].ravel() for pair in chain.pairs])
     z = z[np.isfinite(z)]
@@ -243,7 +264,7 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "names": names or ["reference frame", "next frame"],
         "modes": [[n, word] for n, word in MODES.items() if n in pairs[0]["pictures"]],
         "cameras": [_pose(pose.matrix, metre) for pose in poses],
-        "paths": [{"colour": c, "points": points} for _, c, _, points in paths(chain)],
+        "paths": [{"colour": p.colour, "points": p.points} for p in paths(chain)],
         "middle": float(np.median(z)) if z.size else 1.0,
         "far": far,
         "deepest": deepest,
@@ -257,21 +278,6 @@ def _pose(matrix: Float, metre: float) -> list[list[float]]:
     out = matrix.copy()
     out[:3, 3] *= metre
     return out.tolist()
-
-
-def paths(chain: Chain) -> list[tuple[str, str, int, list[Float]]]:
-    """Name, colour, first frame and points (3,) of the paths of the camera and of what moves."""
-    metre = chain.metre or 1.0
-    camera = [metre * pose.t for pose in chain.world_from_camera]
-    out = [] if chain.single else [("camera", "#ffa94d", 0, camera)]
-    colours = component_colours(max(chain.track_numbers, default=0) + 1)
-    for track in chain.track_numbers:
-        path = chain.path(track)
-        points = [metre * point for point in path.values()]
-        moved = np.linalg.norm(points[-1] - points[0]) > 0.01 * abs(points[0][2])
-        if moved if chain.single else len(path) >= SHOWN:
-            out.append((f"track {track}", _css(colours[track]), min(path), points))
-    return out
 
 
 def _stored(value: Any) -> Any:

@@ -1,16 +1,17 @@
-"""The pictures of a result with titles, and legends with units."""
+"""The pictures of a result with titles, and legends with units; their overview."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from soup_nlp.arrays import AnyFloat, Mask
+from soup_nlp.arrays import AnyFloat, Image, Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA
-from soup_nlp.report.chain import Chain
+from soup_nlp.report.chain import Chain, depth_legend
 from soup_nlp.report.colour import (
-    Image,
     colourise_depth,
     colourise_flow,
     colourise_normals,
@@ -18,58 +19,19 @@ from soup_nlp.report.colour import (
     component_colours,
     draw_superpixels,
     flow_limit,
-    wheel_key,
 )
+from soup_nlp.report.figures import Legend, Picture, strip
 from soup_nlp.report.findings import LEAST
-from soup_nlp.report.result import Result
+
+if TYPE_CHECKING:
+    from soup_nlp.report.result import Result
 
 DENSE = 0.5
 """If a smaller share of the pixels is known, as with laser points, each is drawn larger."""
 ERROR_TICKS, SIGMA_TICKS = (0.0, 0.05, 0.1, 0.15, 0.2), (0.0, 0.1, 0.2, 0.3)
 """Values below the legends of error and sigma; the last one has the brightest colour."""
-
-
-@dataclass(frozen=True)
-class Bar:
-    """Legend of numbers: colours (1, M, 3) uint8, and texts at even steps, both left to right."""
-
-    colours: Image
-    texts: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Swatches:
-    """Legend of classes as (colour, text)."""
-
-    entries: tuple[tuple[tuple[int, int, int], str], ...]
-
-
-@dataclass(frozen=True)
-class Wheel:
-    """Legend of a flow: picture of the wheel (S, S, 3), and the meaning of its rim."""
-
-    image: Image
-    text: str
-
-
-Legend = Bar | Swatches | Wheel
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A picture of a result.
-
-    Attributes:
-        name: Stem of its file.
-        title: Title.
-        image: (H, W, 3) uint8 RGB.
-        legend: Meaning of the colours; None for photographs.
-    """
-
-    name: str
-    title: str
-    image: Image
-    legend: Legend | None = None
+SPARE = ("depth_start", "normals")
+"""Pictures that an overview leaves out, in this order, to fill its last row."""
 
 
 def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
@@ -110,10 +72,7 @@ def _components(chain: Chain, k: int) -> Picture:
     count = len(track)
     colours = component_colours(max(track) + 1)[track]
     pixels = np.bincount(part.ravel(), minlength=count) / part.size
-    first = [
-        ((int(c[0]), int(c[1]), int(c[2])), f"{number}: {share:.1%}")
-        for number, c, share in zip(track, colours, pixels, strict=True)
-    ][:6]
+    texts = [f"{number}: {share:.1%}" for number, share in zip(track, pixels, strict=True)][:6]
     kind = "component" if result.bends.any() else "rigid component"
     word = f"one {kind}" if count == 1 else f"{count} {kind}s, share of the image"
     grey = result.images[0].astype(float).mean(axis=2, keepdims=True)
@@ -124,7 +83,9 @@ def _components(chain: Chain, k: int) -> Picture:
     shaded[unsure[part] & stripe] = 255
     if unsure.any():
         word += "; striped: most of its depth is a guess"
-    return Picture("components", word, shaded.astype(np.uint8), Swatches(tuple(first)))
+    return Picture(
+        "components", word, shaded.astype(np.uint8), Legend(colours[None, :6], tuple(texts))
+    )
 
 
 def _flow(result: Result) -> list[Picture]:
@@ -132,15 +93,17 @@ def _flow(result: Result) -> list[Picture]:
     sure = np.clip(result.flow_confidence, 0, 1).astype(float)
     used = np.where((sure > 0)[..., None], result.flow.astype(float), np.nan)
     limit = flow_limit(used)
-    title = "flow from the reference to the next frame; black = unusable"
-    rim = f"hue = direction, white = 0 px, rim = {limit:.3g} px, darker = longer"
+    title = f"flow to the next frame: white = 0 px, full colour = {limit:.3g} px, black = unusable"
     grey = np.repeat((255 * sure).round().astype(np.uint8)[:, :, None], 3, axis=2)
     ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
-    bar = Bar(ramp, ("0", "0.5", "1"))
     share = f"{np.mean(sure > 0):.0%} of the pixels usable"
+    turns = np.linspace(0, 2 * np.pi, 128)
+    hues = colourise_flow(np.stack([np.cos(turns), np.sin(turns)], axis=1)[None], 1.0)
+    ways = Legend(hues, ("right", "down", "left", "up", "right"))
+    ends = Legend(ramp, ("0", "0.5", "1"))
     return [
-        Picture("flow", title, colourise_flow(used, limit), Wheel(wheel_key(), rim)),
-        Picture("flow_confidence", f"flow confidence; black = unusable ({share})", grey, bar),
+        Picture("flow", title, colourise_flow(used, limit), ways),
+        Picture("flow_confidence", f"flow confidence; black = unusable ({share})", grey, ends),
     ]
 
 
@@ -148,7 +111,7 @@ def _depths(chain: Chain, k: int) -> list[Picture]:
     """Depths of both frames, of the start and of the truth, with one colour scale."""
     result, scores = chain.pairs[k], chain.pairs[k].summary.get("metrics", {})
     truth, (near, far) = result.true_depth, chain.depth_range
-    bar, out = depth_bar(near, far, f" {chain.length}"), []
+    bar, out = depth_legend(near, far, f" {chain.length}"), []
 
     def add(name: str, title: str, z: AnyFloat, scored: str, guess: Mask | None = None) -> None:
         mre = scores.get(scored, {}).get("mre")
@@ -170,13 +133,6 @@ def _depths(chain: Chain, k: int) -> list[Picture]:
         true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)
         out.append(Picture("depth_true", "true depth; grey = no truth", true, bar))
     return out
-
-
-def depth_bar(near: float, far: float, unit: str = "") -> Bar:
-    """Legend of depths with five values; both ends name the unit."""
-    first, *middle, last = (f"{z:.3g}" for z in 1 / np.linspace(1 / far, 1 / near, 5))
-    colours = colourise_depth(1 / np.linspace(1 / far, 1 / near, 128)[None], near, far)
-    return Bar(colours, (first + unit, *middle, last + unit))
 
 
 def _enlarged(values: AnyFloat) -> AnyFloat:
@@ -205,7 +161,7 @@ def _shares(
     """Picture of shares (H, W) in a colour map of OpenCV that ends at the last tick."""
     limit, texts = ticks[-1], [f"{100 * x:.0f} %" for x in ticks]
     texts[-1] = f"\u2265 {texts[-1]}"
-    bar = Bar(colourise_shares(np.linspace(0, limit, 128)[None], limit, colours), tuple(texts))
+    bar = Legend(colourise_shares(np.linspace(0, limit, 128)[None], limit, colours), tuple(texts))
     return Picture(name, title, colourise_shares(values, limit, colours), bar)
 
 
@@ -213,7 +169,17 @@ def _normals(result: Result) -> Picture:
     n = result.reconstruction.normals
     entries = {"faces the camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
                "up": (0, -1, 0), "down": (0, 1, 0)}  # fmt: skip
-    # one pixel for each direction
-    row = colourise_normals(np.array([list(entries.values())], float))[0].tolist()
-    keys = [((r, g, b), text) for (r, g, b), text in zip(row, entries)]
-    return Picture("normals", "surface normals", colourise_normals(n), Swatches(tuple(keys)))
+    row = colourise_normals(np.array([list(entries.values())], float))
+    return Picture("normals", "surface normals", colourise_normals(n), Legend(row, tuple(entries)))
+
+
+def overview(drawn: Mapping[str, Picture], title: str) -> Image:
+    """The pictures of a result in a grid of three columns.
+
+    `SPARE` ones are left out if they would leave a row incomplete.
+    """
+    panels = dict(drawn)
+    for name in SPARE:
+        if len(panels) % 3:
+            panels.pop(name, None)
+    return strip([*panels.values()], title)

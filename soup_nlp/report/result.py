@@ -8,6 +8,8 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL.Image import Image as Picture
+from PIL.Image import fromarray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError
@@ -21,14 +23,16 @@ from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run
+from soup_nlp.report.chain import UNIT, Chain
+from soup_nlp.report.figures import shown
+from soup_nlp.report.findings import guess_line
 from soup_nlp.report.layout import require_layout, result_tree
+from soup_nlp.report.pictures import overview, pictures
 from soup_nlp.storage.files import as_path, plain, read_json
 from soup_nlp.storage.store import ReadTree, read_h5, require
 
 PAGE = "report.html"
 """Name of the page in a result folder."""
-UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
-"""Unit of lengths in files."""
 INPUTS = ("image_ref", "image_next", "K_ref", "K_next", "confidence")
 """Arrays of the pair without which there is no `Result`."""
 
@@ -58,6 +62,18 @@ class Result:
         return f"Result({self.name}, {w}x{h}, {self.reconstruction}, {self.components})"
 
     __repr__ = __str__
+
+    def plot(self) -> Picture:
+        """The overview as a picture: notebooks show it, `.save` writes it."""
+        return fromarray(overview(pictures(Chain.of(self)), self.title))
+
+    def _repr_html_(self) -> str:
+        return shown(str(self), overview(pictures(Chain.of(self)), self.title))
+
+    @property
+    def title(self) -> str:
+        """The name, and the share that is a guess."""
+        return ": ".join(filter(None, [self.name, guess_line(self.summary["certainty"])]))
 
     @property
     def name(self) -> str:
@@ -156,19 +172,9 @@ class Result:
         return scale if np.isfinite(scale) else None
 
     @property
-    def scale(self) -> float:
-        """The same; 1 where it is not known."""
-        return 1.0 if self.metre is None else self.metre
-
-    @property
     def metre_unit(self) -> str:
         """Name of the unit of the truth."""
         return str(self.summary.get("truth_unit") or "m")
-
-    @property
-    def length(self) -> str:
-        """Name of the unit of length in which depths are shown."""
-        return "units" if self.metre is None else self.metre_unit
 
     @property
     def labels(self) -> NDArray[np.integer]:
@@ -279,6 +285,8 @@ def load(folder: str | Path) -> Result:
 
 def _metrics(row: Mapping[str, Any]) -> DepthMetrics:
     """Scores of summary.json, in which null stands for NaN."""
-    scores: dict[str, Any] = {f.name: row[f.name] for f in fields(DepthMetrics)}
+    scores: dict[str, Any] = {
+        f.name: row[f.name] for f in fields(DepthMetrics) if f.name != "shift"
+    }
     scores |= {k: np.nan for k, v in scores.items() if v is None and k != "cap"}
     return DepthMetrics(**scores)

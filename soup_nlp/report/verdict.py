@@ -39,15 +39,12 @@ TITLES = {
     "rigid": "one rigid motion",
     "constant": "constant depth",
     "solution_next": "next frame",
+    "static": "what stands still",
+    "moving": "what moves",
 }
 """Rows of the table of scores; the others have their own names."""
-DELIVERED = {
-    "constrained NLP": "its answer, retracted to the constraints",
-    "presolve": "the presolve's answer, whose exact energy is lower",
-    "start": "the start",
-}
-OF_ANSWER = ("nlp_infeasibility", "dual_infeasibility", "complementarity")
-"""Residuals of Ipopt's answer; all others are residuals of the delivered soup."""
+RULES = {"none": "no scale", "affine": "one scale and shift each, of least squares"}
+"""Words for rules of the scale of scores."""
 PAD = " " * 12
 
 
@@ -121,17 +118,28 @@ def sectioned(sections: Mapping[str, Sequence[str]]) -> str:
 
 
 def _details(run: Run) -> dict[str, list[str]]:
-    """Sections on the flow and the solver."""
-    delivered = {k: v for k, v in run.residuals.items() if k not in OF_ANSWER}
-    answer = {k: v for k in OF_ANSWER if (v := run.solution.residuals.get(k)) is not None}
+    """Sections on the flow and the solver: iterations, exact energies by term, residuals."""
+    s, r, solver = run.solution, run.refined, list[str]()
+    if s.stages:
+        every = sum(stage.iterations for stage in s.stages)
+        solver.append(
+            f"constrained NLP: {s.stages[-1].iterations} iterations of {every}, delivered:"
+            f" {run.delivered}; E {_numbers(s.ends, '.5g')}"
+        )
+    if r is not None and r.rounds:
+        last, begin, end = r.rounds[-1], r.energy_begin["total"], r.energy["total"]
+        what = "E + E_photo" if "photo" in r.energy else "E"
+        solver.append(
+            f"refinement: {len(r.rounds)} rounds ({r.status}), {what} {begin:.5g} -> {end:.5g};"
+            f" the last choice is at most"
+            f" {max(last.gap, 0) / last.mrf_energy:.2%} above the best among its particles"
+        )
+    energies = {"start": s.energy_start, "NLP": s.energy, "solution": run.energy}
     return {
         "flow": flow_words(run),
-        "solver": [*_minimum(run), *_refinement(run)],
-        "energy": _energies(run),
-        "residuals": [
-            _numbers(delivered, ".1e"),
-            *[f"Ipopt's answer: {_numbers(answer, '.1e')}"] * bool(answer),
-        ],
+        "solver": solver,
+        "energy": [f"{name:<9} {_numbers(e, '.5g')}" for name, e in energies.items()],
+        "residuals": [_numbers(run.residuals, ".1e")],
     }
 
 
@@ -147,67 +155,6 @@ def _status(run: Run) -> list[str]:
     return [f"{words} ({s.status})", *[far] * (s.far and not s.converged)]
 
 
-def _minimum(run: Run) -> list[str]:
-    """Iterations of Ipopt, what it delivered, and the exact energy at the end of its stages."""
-    s = run.solution
-    if not s.stages:
-        return []
-    every = sum(stage.iterations for stage in s.stages)
-    made = "refined" if run.refined else "delivered"
-    outcome = "minimum found by Ipopt" if s.converged else "no minimum reached"
-    stages = ", ".join(f"{k} {e:.5g}" for k, e in s.ends.items())
-    return [
-        f"constrained NLP {s.stages[-1].iterations} iterations of {every}; {made}:"
-        f" {DELIVERED[run.delivered]}",
-        f"{outcome}: E {stages}" if stages else outcome,
-    ]
-
-
-def _refinement(run: Run) -> list[str]:
-    """How far the refinement lowers its objective, and the gap of its last choice of labels."""
-    r = run.refined
-    if r is None:
-        return []
-    if not r.rounds:
-        return [f"refinement: {r.status} before its first round"]
-    last, images = r.rounds[-1], "photo" in r.energy
-    begin, end = r.energy_begin["total"], r.energy["total"]
-    lines = [
-        f"refinement {len(r.rounds)} round{'s' * (len(r.rounds) > 1)} ({r.status}):"
-        f" E{' + E_photo' * images} {begin:.5g} -> {end:.5g}, {1 - end / begin:.1%} lower; the last"
-        f" choice is at most {max(last.gap, 0) / last.mrf_energy:.2%} above the best among its"
-        " particles"
-    ]
-    if images:
-        lines.append(
-            f"the images contradict the flow at {r.contradicted} superpixels and outweigh it there:"
-            " E may rise"
-        )
-    return lines
-
-
-def _energies(run: Run) -> list[str]:
-    """Table of E by stage and term.
-
-    Its last column is what the refinement minimised, where that is not E.
-    """
-    s, r = run.solution, run.refined
-    given = {"start": s.energy_start, "NLP": s.energy, "solution": run.energy}
-    rows = {title: dict(energy) for title, energy in given.items()}
-    if r is not None and "photo" in r.energy:
-        for row, energy in zip(rows.values(), (r.energy_start, r.energy_begin, r.energy)):
-            row["E + E_photo"] = energy["total"]
-    columns = list(rows["solution"])
-    if r is None or not s.stages:
-        del rows["NLP"]
-    widths = [max(11, len(name) + 2) for name in columns]
-    lines = [" " * 9 + "".join(f"{k:>{w}}" for k, w in zip(columns, widths))]
-    for title, row in rows.items():
-        cells = (f"{row[k]:>{w}.5g}" for k, w in zip(columns, widths))
-        lines.append(f"{title:<9}" + "".join(cells))
-    return lines
-
-
 def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
     """Scale rule and cap of the scores, then their table; empty without scores.
 
@@ -217,17 +164,19 @@ def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
         return []
     first = next(iter(metrics.values()))
     cap = "no depth cap" if first.cap is None else f"depth cap {first.cap:g}"
-    rule = "no scale" if first.scale_rule == "none" else f"one global {first.scale_rule} scale each"
+    rule = RULES.get(first.scale_rule, f"one global {first.scale_rule} scale each")
     frame = "reference" if "constant" in metrics else "next"
     lines = [f"depth of the {frame} frame, {rule}, {cap}"]
     worst = metrics["constant"].mre if "constant" in metrics else np.nan
-    order = ["solution", *SURE, "nlp", "start", "rigid", "constant"]
-    lines.append(f"{'':<17}{'MRE':>8}{'median':>9}{'skill':>8}{'coverage':>10}")
+    order = ["solution", "static", "moving", *SURE, "nlp", "start", "rigid", "constant"]
+    heads = f"{'MRE':>8}{'median':>9}{'RMSE':>10}{'d<1.25':>9}{'skill':>8}{'coverage':>10}"
+    lines.append(f"{'':<17}{heads}")
     for name in order if "constant" in metrics else [*order, "solution_next"]:
         if (m := metrics.get(name)) is not None:
             gain = np.nan if name == "solution_next" else skill(m.mre, worst)
             lines.append(
                 f"{TITLES.get(name, name):<17}{m.mre:>8.4f}{m.median_relative:>9.4f}"
+                f"{m.rmse:>10.4g}{m.delta1:>9.1%}"
                 f"{'' if np.isnan(gain) else f'{gain:.3f}':>8}{m.coverage:>10.1%}"
             )
     return lines

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic._internal._model_construction import ModelMetaclass
 
 from soup_nlp.errors import ConfigError, printable
 from soup_nlp.schema.limits import LEAST, MAX_ROUNDS, MAX_SAMPLES, MAX_SEED, MOST
@@ -162,7 +163,18 @@ Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
 
 
-class Section(BaseModel):
+class _Checked(ModelMetaclass):
+    """Classes whose calls raise ConfigError; as a part of a larger record pydantic checks them."""
+
+    def __call__(cls, *args: Any, **values: Any) -> Any:  # noqa: N805
+        try:
+            return super().__call__(*args, **values)
+        except ValidationError as error:
+            model: Any = cls
+            raise explain(error, model, values, cls.__name__, {}) from None
+
+
+class Section(BaseModel, metaclass=_Checked):
     """Options with bounds and help on every field; unknown names and type conversions are errors.
 
     The docstring under a field is its help: it is the comment beside the key in a dumped problem.
@@ -187,10 +199,7 @@ class Section(BaseModel):
         Raises:
             ConfigError: a name is unknown, or a value is of the wrong type or out of range.
         """
-        try:
-            return cls(**values)
-        except ValidationError as error:
-            raise explain(error, cls, values, cls.__name__, {}) from None
+        return cls(**values)
 
     @classmethod
     def help(cls) -> dict[str, str]:

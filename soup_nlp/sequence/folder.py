@@ -88,14 +88,14 @@ def read_chain(folder: Path) -> Chain:
     contents = read_json(folder / CHAIN, CHAIN)
     try:
         count = int(contents["frames"])
-        over = [(int(a), int(b)) for a, b in contents.get("over", ())]
     except (KeyError, TypeError, ValueError) as error:
         raise DataError("chain.json cannot be read", where=folder, found=error) from error
-    solved = [
-        read_pair(a, b, folder / PAIRS / f"{a:03d}_{b:03d}")
-        for a, b in [*((k, k + 1) for k in range(count - 1)), *over]
-    ]
-    return make_chain(solved[: count - 1], solved[count - 1 :], contents)
+    return make_chain([read_pair(pair_folder(folder, k)) for k in range(count - 1)], contents)
+
+
+def pair_folder(folder: Path, k: int) -> Path:
+    """Folder of the result of the frames k and k + 1."""
+    return folder / PAIRS / f"{k:03d}_{k + 1:03d}"
 
 
 def check(folder: Path) -> CheckReport:
@@ -108,7 +108,7 @@ def check(folder: Path) -> CheckReport:
         return check_folder(folder)
     chain, claims = read_chain(folder), []
     for k in range(len(chain.pairs)):
-        pair = folder / PAIRS / f"{k:03d}_{k + 1:03d}"
+        pair = pair_folder(folder, k)
         right = float(check_folder(pair).ok)
         claims.append(Claim(f"pair {pair.name}: every claim", 1.0, right))
     poses = np.array([m.matrix for m in chain.world_from_camera])
@@ -177,13 +177,7 @@ def chain_files(count: int) -> list[str]:
     return [*SINGLE, *(f"depth/{k:04d}.png" for k in range(count))]
 
 
-def write_chain(
-    folder: Path,
-    chain: Chain,
-    name: str,
-    sources: Sequence[str],
-    over: Sequence[tuple[int, int]] = (),
-) -> Chain:
+def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -> Chain:
     """Write every file of a chain, `chain_files`, into an existing folder.
 
     Args:
@@ -191,13 +185,12 @@ def write_chain(
         chain: The chain.
         name: Name of the sequence.
         sources: Path or description of every frame.
-        over: Frames of the further pairs that link the chain.
 
     Returns:
         The chain with the contents of its chain.json.
     """
     _, scale = write_depths(folder, chain)
-    contents = {"name": name, "sources": list(sources), "over": list(over), **summary(chain)}
+    contents = {"name": name, "sources": list(sources), **summary(chain)}
     contents |= {"depth_png_scale": scale, "score": score(chain)}
     chain = replace(chain, summary=contents)
     write_json(folder / CHAIN, contents)

@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import lru_cache, partial
@@ -36,8 +36,10 @@ VIDEOS = (
     ".mpeg", ".wmv", ".flv", ".gif", ".mxf", ".vob",
 )  # fmt: skip
 """Suffixes by which a message knows a video; any file that is no image is tried as one."""
-DEPTHS = (".png", ".npy", ".pfm", ".dpt")
+DEPTHS = (".png", ".npy", ".npz", ".pfm", ".dpt")
 """Suffixes of depth maps."""
+FLOWS = (".flo", ".png", ".npy")
+"""Suffixes of flows."""
 PROBED = 3
 """Number of pairs in which points are tracked before a folder is solved."""
 LAYOUT = "frame_*"
@@ -54,6 +56,7 @@ class Frames:
         depths: True depth of every frame, for evaluation only; empty if unknown.
         depth_scale: Values per unit of length of a 16-bit .png depth.
         scene: Name of the scene, whose camera and bodies repeat their first motion.
+        files: Files of consecutive pairs by key of a problem, such as ("flow", "source").
     """
 
     names: tuple[str, ...]
@@ -61,25 +64,25 @@ class Frames:
     depths: Sequence[Path] = ()
     depth_scale: float | None = None
     scene: str | None = None
+    files: Mapping[tuple[str, str], Sequence[Path]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.names)
 
-    def pair(self, first: int, second: int) -> Raw:
-        """Section `input` of the problem of two frames, by their numbers.
+    def problem(self, k: int, keys: Raw) -> Raw:
+        """The problem of the frames k and k + 1, with keys of all problems."""
+        raw = {**keys, "input": self.pair(k), "base": str(Path.cwd())}
+        for (section, key), paths in self.files.items():
+            raw[section] = {**(raw.get(section) or {}), key: str(paths[k])}
+        return raw
 
-        Raises:
-            DataError: frames of a scene do not follow each other.
-        """
+    def pair(self, k: int) -> Raw:
+        """Section `input` of the problem of the frames k and k + 1."""
         if self.scene is not None:
-            if second != first + 1:
-                raise DataError(
-                    "frames of a scene are solved one after the other", found=second - first
-                )
-            return {"kind": "scene", "frame": first, "scene": self.scene}
-        out = {"kind": "files", "ref": self.names[first], "next": self.names[second], **self.camera}
+            return {"kind": "scene", "frame": k, "scene": self.scene}
+        out = {"kind": "files", "ref": self.names[k], "next": self.names[k + 1], **self.camera}
         if self.depths:
-            truth = {"depth": str(self.depths[first]), "depth_next": str(self.depths[second])}
+            truth = {"depth": str(self.depths[k]), "depth_next": str(self.depths[k + 1])}
             out.update(truth, depth_scale=self.depth_scale)
         return out
 
@@ -131,20 +134,25 @@ def find_depths(images: list[Path]) -> list[Path]:
     return out
 
 
-def depth_files(folder: Path) -> list[Path]:
-    """Depth maps of a folder, in the order of their numbers: those named depth_*, or all.
+def numbered_files(folder: Path, kinds: Sequence[str], what: str, first: str = "") -> list[Path]:
+    """Files of a folder, or of a pattern such as `flow/*.flo`, in the order of their numbers.
+
+    Args:
+        folder: The folder or the pattern.
+        kinds: Suffixes of the files.
+        what: What they hold, for messages.
+        first: Pattern of those that are preferred.
 
     Raises:
         DataError: there is none.
     """
-    folder = as_path(folder, "folder of depth maps")
-    maps = [p for p in folder.glob("*") if p.suffix.lower() in DEPTHS]
-    depths = [p for p in maps if p.name.startswith("depth_")] or maps
-    if not depths:
-        raise DataError(
-            "folder holds no depth maps", where=folder, expected="one for every frame of the chain"
-        )
-    return in_order(depths)
+    folder = as_path(folder, f"folder of {what}", home=True)
+    found = folder.glob("*") if folder.is_dir() else folder.parent.glob(folder.name)
+    files = [path for path in found if path.suffix.lower() in kinds]
+    files = [path for path in files if first and path.match(first)] or files
+    if not files:
+        raise DataError(f"there is no {what}", where=folder, expected=f"files {', '.join(kinds)}")
+    return in_order(files)
 
 
 def check_sizes(images: Sequence[Path], turn: bool) -> None:

@@ -1,30 +1,27 @@
 """Links between solved pairs, their common scale, the camera path, and tracks of components."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares, linear_sum_assignment
+from scipy.optimize import linear_sum_assignment
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError, expect
 from soup_nlp.evaluate.metrics import overlap_shares
-from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.superpixels import Labels
 from soup_nlp.report.chain import STILL, Chain, Link
 from soup_nlp.report.result import Result, load
 
 MIN_PIXELS = 200
 """Links with fewer pixels are flagged."""
-LEAST_SPREAD = 0.005
-"""Smallest spread of a log ratio in the weight of a link."""
 MAX_GUESSED = 0.5
 """A pair has no parallax if the depth of a larger share of its background is a guess, and a chain
 is not good if that of a larger share of all its images is."""
-MADE_BY = "soup_nlp.sequence.solve.solve_pairs(...)"
+MADE_BY = "soup_nlp.load(...) of the folder of each pair"
 """Where pairs of a chain come from, for messages."""
 SAME = 0.3
 """Smallest intersection over union of two components of one track."""
@@ -32,31 +29,15 @@ KEPT = ("input", "start", "truth", "solution", "weights", "energy")
 """Groups of arrays of a pair that a chain needs."""
 
 
-@dataclass(frozen=True, eq=False)
-class SolvedPair:
-    """A pair of frames, by their numbers, with its result."""
-
-    first: int
-    second: int
-    result: Result
-
-    @property
-    def still(self) -> bool:
-        """Whether most of the background has no parallax, so that its depth is a guess."""
-        return self.result.components.background.borrowed > MAX_GUESSED
-
-    def view(self, frame: int) -> tuple[Float, Mask]:
-        """(H, W) z of one of the two frames, and its confident pixels of the static scene."""
-        side, static = int(frame != self.first), self.result.static
-        return self.result.depths[side], self.result.in_next(static, False) if side else static
-
-
-def read_pair(first: int, second: int, folder: Path) -> SolvedPair:
-    """The pair of two frames from its result folder."""
+def read_pair(folder: Path) -> Result:
+    """The result of a folder, with the arrays that a chain needs."""
     result = load(folder)
-    # a chain holds many pairs, whose other arrays it does not need
-    kept = {name: result.tree[name] for name in KEPT if name in result.tree}
-    return SolvedPair(first, second, replace(result, tree=kept))
+    return replace(result, tree={name: result.tree[name] for name in KEPT if name in result.tree})
+
+
+def still(result: Result) -> bool:
+    """Whether most of the background has no parallax, so that its depth is a guess."""
+    return result.components.background.borrowed > MAX_GUESSED
 
 
 def link(
@@ -77,89 +58,61 @@ def link(
     return Link(*ends, middle, spread, pixels, flagged=flagged or pixels < MIN_PIXELS)
 
 
-def find_links(pairs: Sequence[SolvedPair]) -> list[Link]:
-    """Links of all pairs that share a frame, from static pixels that are confident in both.
+def find_links(pairs: Sequence[Result]) -> list[Link]:
+    """Links of consecutive pairs, from static pixels that are confident in both.
 
     The depth of a pair without parallax is a guess, so its links are flagged, as are those of pairs
     without a pixel that is confident in both. The pairs before and after a run of pairs without
     parallax are linked directly, with the depth of the former moved by the flow of the run.
     """
     out: list[Link | None] = []
-    for b, second in enumerate(pairs):
-        for a, first in enumerate(pairs[:b]):
-            for frame in {first.first, first.second} & {second.first, second.second}:
-                (z1, keep1), (z2, keep2) = first.view(frame), second.view(frame)
-                guess = first.still or second.still
-                shared = link((a, b), z1, z2, keep1 & keep2, guess)
-                out.append(shared or link((a, b), z1, z2, np.ones_like(keep1), flagged=True))
-    # consecutive pairs are the first of those that start at a frame
-    at = {pair.first: b for b, pair in reversed([*enumerate(pairs)])}
-    for a, pair in enumerate(pairs):
-        frame, (z, keep) = pair.second, pair.view(pair.second)
-        while not pair.still and frame in at and pairs[at[frame]].still:
-            still = pairs[at[frame]]
-            static = still.result.components.of_pixel == 0
-            keep = still.result.in_next(keep & static, False)
-            z, frame = still.result.in_next(z, np.nan), still.second
-        if frame > pair.second and frame in at:
-            other, sure = pairs[at[frame]].view(frame)
-            bridge = link((a, at[frame]), z, other, keep & sure)
+    for a, (first, second) in enumerate(pairwise(pairs)):
+        z, keep = first.depths[1], first.in_next(first.static, False)
+        guess, every = still(first) or still(second), np.ones_like(keep)
+        near = link((a, a + 1), z, second.depths[0], keep & second.static, guess)
+        out.append(near or link((a, a + 1), z, second.depths[0], every, flagged=True))
+    for a, first in enumerate(pairs):
+        z, keep, b = first.depths[1], first.in_next(first.static, False), a + 1
+        while not still(first) and b < len(pairs) and still(pairs[b]):
+            keep = pairs[b].in_next(keep & (pairs[b].components.of_pixel == 0), False)
+            z, b = pairs[b].in_next(z, np.nan), b + 1
+        if a + 1 < b < len(pairs):
+            bridge = link((a, b), z, pairs[b].depths[0], keep & pairs[b].static)
             out.append(bridge and replace(bridge, bridge=True))
     return [shared for shared in out if shared]
 
 
-def solve_scales(total: int, links: Sequence[Link]) -> Float:
-    """(total,) scales of all pairs, 1 for the first, by robust least squares of their logarithms.
-
-    A link is weighted by its spread; the Cauchy loss lowers the weight of contradictory links.
+def chained_scales(total: int, links: Sequence[Link]) -> Float:
+    """(total,) scales of pairs, 1 for the first: links in a row, a bridge before flagged ones.
 
     Raises:
-        DataError: a pair is linked to no other.
+        DataError: a pair is linked to none before it.
     """
-    ends = np.array([(k.first, k.second) for k in links], np.int64).reshape(-1, 2)
-    part = connected(ends, total)
-    if part.any():
-        alone = int(np.argmax(part > 0))
-        raise DataError("a pair shares no pixel with the others", where=f"pair {alone}")
-    if total == 1:
-        return np.ones(1)
-    unit = np.eye(total)
-    rows = unit[ends[:, 1]] - unit[ends[:, 0]]
-    value = np.array([k.log_ratio for k in links])
-    sigma = np.maximum([k.spread for k in links], LEAST_SPREAD)
-    # a flagged link gets a low weight
-    sigma = np.where([k.flagged for k in links], 10 * np.maximum(sigma, 0.1), sigma)
-    A, b = rows[:, 1:] / sigma[:, None], value / sigma
-    answer = np.linalg.lstsq(A, b, rcond=None)[0]
-    if len(links) > total - 1:
-        answer = least_squares(lambda x: A @ x - b, answer, jac=lambda x: A, loss="cauchy").x
-    return np.exp(np.concatenate([[0.0], answer]))
+    out = np.ones(total)
+    for k in range(1, total):
+        before = sorted((link for link in links if link.second == k), key=lambda one: one.flagged)
+        if not before:
+            raise DataError("a pair shares no pixel with the others", where=f"pair {k}")
+        out[k] = out[before[0].first] * np.exp(before[0].log_ratio)
+    return out
 
 
-def make_chain(
-    pairs: Sequence[SolvedPair],
-    over: Sequence[SolvedPair] = (),
-    summary: Mapping[str, Any] | None = None,
-) -> Chain:
+def make_chain(pairs: Sequence[Result], summary: Mapping[str, Any] | None = None) -> Chain:
     """Determine a common scale of consecutive pairs, the camera path, and tracks of components.
 
     Args:
-        pairs: Pairs of the frames (0, 1), (1, 2), ...
-        over: Further pairs of the same frames, such as (0, 2), for more links.
+        pairs: Results of the frames (0, 1), (1, 2), ..., at least one.
         summary: Contents of chain.json.
 
     Raises:
-        DataError: the pairs are not consecutive, or share no pixel.
+        DataError: a pair shares no pixel with those before it.
     """
-    for several in (pairs, over):
-        expect(several, (list, tuple), "pairs of a chain", MADE_BY)
-        for pair in several:
-            expect(pair, SolvedPair, "pair of a chain", MADE_BY)
-    if not pairs or [(p.first, p.second) for p in pairs] != [(k, k + 1) for k in range(len(pairs))]:
-        raise DataError("pairs of a chain are not consecutive", found=[p.first for p in pairs])
-    links = find_links([*pairs, *over])
-    scales = solve_scales(len(pairs) + len(over), links)[: len(pairs)]
-    results = [pair.result.scaled(s) for pair, s in zip(pairs, scales, strict=True)]
+    expect(pairs, (list, tuple), "pairs of a chain", MADE_BY)
+    for pair in pairs or (None,):
+        expect(pair, Result, "pair of a chain", MADE_BY)
+    links = find_links(pairs)
+    scales = chained_scales(len(pairs), links)
+    results = [pair.scaled(s) for pair, s in zip(pairs, scales, strict=True)]
     poses = [STILL]
     for result in results:
         poses.append(poses[-1] @ result.components.camera.inverse)
@@ -169,8 +122,8 @@ def make_chain(
     ]
     tracks = number(matches, [len(result.components) for result in results])
     names = tuple(f"{k:04d}" for k in range(len(poses)))
-    chained = tuple(results), tuple(poses), tuple(tracks), names
-    return Chain(*chained, scales, tuple(links), {} if summary is None else summary)
+    parts = tuple(results), tuple(poses), tuple(tracks), names
+    return Chain(*parts, scales, tuple(links), {} if summary is None else summary)
 
 
 def follow(before: Labels, after: Labels) -> dict[int, int]:

@@ -1,32 +1,45 @@
 """Errors of a chain: depth with one scale for all or one for each frame, and the camera path."""
 
 from collections.abc import Mapping, Sequence
-from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import MEDIAN, UNSCALED, depth_metrics
+from soup_nlp.evaluate.metrics import MEDIAN, UNSCALED, Convention, depth_metrics
+from soup_nlp.geometry.rotation import log
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import certainty_lines, guess_line
-from soup_nlp.report.page import Markup, headline, page, paths, preformatted, table
+from soup_nlp.report.page import headline, page, path_table, preformatted, table
 from soup_nlp.report.verdict import sectioned
 from soup_nlp.sequence.links import MAX_GUESSED
+from soup_nlp.storage.files import read_text
 
+AFFINE = Convention("affine")
+AVERAGED = ("mre_own_scale", "mre_one_scale", "mre_affine", "rmse", "delta1")
+"""Scores of frames of which a chain has the mean."""
 WIDTHS = {"ratio of scales": 16, "spread (log)": 13, "true ratio": 11, "pixels": 9, "": 8}
 """Columns of `link_table` after the first one, and their characters in the terminal."""
 
 
-def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any] | None:
+def score(
+    chain: Chain, truths: Sequence[Float] | None = None, poses: Float | None = None
+) -> dict[str, Any] | None:
     """Errors of depth and path; None without a truth.
 
-    `truths` (H, W) of every frame stand for those of the pairs.
+    Args:
+        chain: The chain.
+        truths: True depth (H, W) of every frame; None for that of the pairs.
+        poses: (K + 1, 4, 4) true world_from_camera; None for the motions of the pairs' truth.
 
-    "frames" has the MRE of every frame with its own median scale and with one for the sequence,
-    "links" the estimated and the true ratio of scales, and "path" the error of the camera positions
-    after the best similarity relative to the length of the true path, if it is known.
+    Returns:
+        "frames": MRE of every frame with its own median scale, with one for all ("scale") and with
+        a scale and a shift of its own; RMSE and delta < 1.25 with one scale. The same without
+        "frames" as means over the frames. "links": estimated and true ratio of scales. "path": see
+        `path_errors`; None if it is not known.
     """
     if truths is not None and len(truths) != len(chain):
         raise DataError("truth and chain differ in length", found=len(truths), expected=len(chain))
@@ -37,23 +50,25 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
     if not true:
         return None
     depths = {k: chain.depth(k) for k in true}
-    separate = {k: depth_metrics(z, true[k]) for k, z in depths.items()}
     compared = {k: MEDIAN.mask(true[k]) & (z > 0) for k, z in depths.items()}
     ratios = [true[k][mask] / depths[k][mask] for k, mask in compared.items()]
-    scale = float(np.median(np.concatenate(ratios)))
-    frames = [
-        {
-            "frame": k,
-            "mre_own_scale": own.mre,
-            "mre_one_scale": depth_metrics(scale * depths[k], true[k], UNSCALED).mre,
-            "own_scale": own.scale,
-            "coverage": own.coverage,
-        }
-        for k, own in separate.items()
-    ]
-    averaged = "mre_own_scale", "mre_one_scale"
-    mre = {key: float(np.mean([f[key] for f in frames])) for key in averaged}
-    own_scale = {k: own.scale for k, own in separate.items()}
+    scale, own_scale, frames = float(np.median(np.concatenate(ratios))), {}, []
+    for k, z in depths.items():
+        own, one = depth_metrics(z, true[k]), depth_metrics(scale * z, true[k], UNSCALED)
+        own_scale[k] = own.scale
+        frames.append(
+            {
+                "frame": k,
+                "mre_own_scale": own.mre,
+                "mre_one_scale": one.mre,
+                "mre_affine": depth_metrics(z, true[k], AFFINE).mre,
+                "rmse": one.rmse,
+                "delta1": one.delta1,
+                "own_scale": own.scale,
+                "coverage": own.coverage,
+            }
+        )
+    means = {key: float(np.mean([f[key] for f in frames])) for key in AVERAGED}
     # the true ratio is that of the pairs' own depths, without the scales of the chain
     ratio = chain.scales[1:] / chain.scales[:-1]
     links = [
@@ -61,13 +76,14 @@ def score(chain: Chain, truths: Sequence[Float] | None = None) -> dict[str, Any]
         for k, r in enumerate(ratio)
         if own_scale.keys() >= {k, k + 1}
     ]
+    poses = true_poses(chain) if poses is None else poses
     return {
         "scale": scale,
         "frames": frames,
-        **mre,
-        "cost": mre["mre_one_scale"] / mre["mre_own_scale"] - 1,
+        **means,
+        "cost": means["mre_one_scale"] / means["mre_own_scale"] - 1,
         "links": links,
-        "path": path_error(chain),
+        "path": None if poses is None else path_errors(chain, poses),
     }
 
 
@@ -95,7 +111,10 @@ def score_text(scores: Mapping[str, Any]) -> str:
         f" {scores['mre_one_scale']:.4f} with one for the sequence ({scores['cost']:+.1%})"
     )
     if path := scores["path"]:
-        text += f"; camera path off by {path['share']:.2%} of its length after a similarity"
+        text += (
+            f"; camera path off by {path['share']:.2%} of its length after a similarity (ATE"
+            f" {path['ate']:.4g}, RPE {path['rpe']:.4g} and {path['rpe_degrees']:.3g} degrees)"
+        )
     return text
 
 
@@ -134,63 +153,103 @@ def score_lines(scores: Mapping[str, Any] | None) -> list[str]:
     """Scores by frame as lines of text."""
     if scores is None:
         return ["the truth knows no pixel of any frame"]
+    heads = ("frame", "own scale", "one scale", "scale, shift", "RMSE", "d<1.25", "coverage")
     rows = [
-        f"{f['frame']:>5}{f['mre_own_scale']:>12.4f}{f['mre_one_scale']:>12.4f}"
-        f"{f['coverage']:>10.1%}"
+        f"{f['frame']:>5}{f['mre_own_scale']:>13.4f}{f['mre_one_scale']:>13.4f}"
+        f"{f['mre_affine']:>13.4f}{f['rmse']:>13.4g}{f['delta1']:>13.1%}{f['coverage']:>13.1%}"
         for f in scores["frames"]
     ]
-    head = f"{'frame':>5}{'own scale':>12}{'one scale':>12}{'coverage':>10}"
-    return ["MRE of the depth, median scales, no depth cap", head, *rows, score_text(scores)]
+    head = f"{heads[0]:>5}" + "".join(f"{word:>13}" for word in heads[1:])
+    title = "MRE (Abs Rel) of the depth by its scale, no depth cap; RMSE and delta with one scale"
+    return [title, head, *rows, score_text(scores)]
 
 
-def path_error(chain: Chain) -> dict[str, float] | None:
-    """Error of the camera positions after a similarity; None if the true path is unknown."""
-    pose, positions = np.eye(4), [np.zeros(3)]
+def true_poses(chain: Chain) -> Float | None:
+    """(K + 1, 4, 4) world_from_camera by the truth of the pairs; None if it is not known."""
+    poses = [np.eye(4)]
     for pair in chain.pairs:
         # component 0 of a truth is the static scene
         motions = pair.tree["truth"].get("motions")
         if motions is None or not np.isfinite(motions[0]).all():
             return None
-        pose = pose @ np.linalg.inv(motions[0])
-        positions.append(pose[:3, 3])
-    true = np.array(positions)
+        poses.append(poses[-1] @ np.linalg.inv(motions[0]))
+    return np.array(poses)
+
+
+def read_path(path: Path) -> Float:
+    """(M, 4, 4) world_from_camera of a trajectory of TUM (8 numbers a line) or KITTI (12).
+
+    Raises:
+        DataError: the file is neither.
+    """
+    try:
+        rows = np.loadtxt(read_text(path, "trajectory").splitlines(), ndmin=2)
+        out = np.tile(np.eye(4), (len(rows), 1, 1))
+        if rows.shape[1] == 12:
+            out[:, :3] = rows.reshape(-1, 3, 4)
+        else:
+            _, out[:, 0, 3], out[:, 1, 3], out[:, 2, 3], *turns = rows.T
+            out[:, :3, :3] = Rotation.from_quat(np.stack(turns, axis=1)).as_matrix()
+    except ValueError as error:
+        expected = "lines of 8 (TUM) or 12 (KITTI) numbers"
+        raise DataError("no trajectory", where=path, found=error, expected=expected) from None
+    return out
+
+
+def path_errors(chain: Chain, poses: Float) -> dict[str, float] | None:
+    """Errors of the camera's path after the best similarity, as evo computes them.
+
+    Args:
+        chain: The chain.
+        poses: (K + 1, 4, 4) true world_from_camera.
+
+    Returns:
+        "ate": root mean square of the distances of the cameras. "rpe", "rpe_degrees": of the shifts
+        and turns by which motions from frame to frame differ. "length" of the true path; "share" is
+        "ate" over it. None for fewer than three frames, or a path of no length.
+
+    Raises:
+        DataError: there is not one pose for each frame.
+    """
+    if len(poses) != len(chain):
+        raise DataError("path and chain differ in length", found=len(poses), expected=len(chain))
+    true, found = poses[:, :3, 3], np.array([m.matrix for m in chain.world_from_camera])
     length = float(np.linalg.norm(np.diff(true, axis=0), axis=1).sum())
     if length == 0 or len(true) < 3:
         return None
-    error = true - aligned(np.array([m.t for m in chain.world_from_camera]), true)
-    rmse = float(np.sqrt((error**2).sum(axis=1).mean()))
-    return {"rmse": rmse, "length": length, "share": rmse / length}
+    scale, turn, shift = similarity(found[:, :3, 3], true)
+    found[:, :3, 3] = scale * found[:, :3, 3] @ turn.T + shift
+    found[:, :3, :3] = turn @ found[:, :3, :3]
+    steps = [np.linalg.inv(way[:-1]) @ way[1:] for way in (poses, found)]
+    off = np.linalg.inv(steps[0]) @ steps[1]
+
+    def rms(vectors: Float) -> float:
+        return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+
+    ate, turns = rms(true - found[:, :3, 3]), np.degrees(log(off[:, :3, :3]))
+    errors = {"ate": ate, "rpe": rms(off[:, :3, 3]), "rpe_degrees": rms(turns)}
+    return {**errors, "length": length, "share": ate / length}
 
 
-def aligned(points: Float, target: Float) -> Float:
-    """Points (M, 3) after the least-squares similarity to `target` (M, 3) (Umeyama, 1991)."""
+def similarity(points: Float, target: Float) -> tuple[float, Float, Float]:
+    """Scale, rotation and shift of points (M, 3) to `target` by least squares (Umeyama, 1991)."""
     a, b = points - points.mean(axis=0), target - target.mean(axis=0)
     U, S, Vt = np.linalg.svd(b.T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
     size = (a**2).sum()
     scale = float((S * sign).sum() / size) if size > 0 else 1.0
-    return scale * a @ (U * sign @ Vt).T + target.mean(axis=0)
+    R = U * sign @ Vt
+    return scale, R, target.mean(axis=0) - scale * R @ points.mean(axis=0)
 
 
 def chain_page(chain: Chain) -> str:
     """The page of a chain."""
-    rows = [
-        [
-            Markup(f'<i style="background:{escape(colour)}"></i>{escape(name)}'),
-            f"{first} to {first + len(points) - 1}",
-            f"{length:.3g}",
-        ]
-        for name, colour, first, points in paths(chain)
-        for length in [float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())]
-    ]
     heads, links = link_table(chain.summary)
     scores = chain.summary["score"]
     words = [f"{len(chain)} frames", score_text(scores) if scores else f"in {chain.unit}"]
     parts = {
         "summary": headline(guess_line(certainty(chain), "all images"), words),
-        "Paths": table(["path", "frames", f"length, {chain.length}"], rows)
-        + "<p>What moves by itself has a scale of its own in every pair: its path is as good as its"
-        " depth.</p>",
+        "Paths": path_table(chain),
         "Links between pairs": table(heads, links) if links else "",
         "Verdict": preformatted(chain_lines(chain)),
     }

@@ -4,9 +4,10 @@ import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
@@ -15,11 +16,23 @@ from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
 from soup_nlp.pipeline.case import observed_pair
+from soup_nlp.pipeline.run import ProblemKeys, sections
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import write_png
 from soup_nlp.report.folder import run
-from soup_nlp.sequence.folder import CHAIN, PAIRS, ROWS, SINGLE, chain_files, write_chain
+from soup_nlp.report.result import Result
+from soup_nlp.sequence.folder import (
+    CHAIN,
+    PAIRS,
+    ROWS,
+    SINGLE,
+    chain_files,
+    pair_folder,
+    write_chain,
+)
 from soup_nlp.sequence.frames import (
+    DEPTHS,
+    FLOWS,
     MAX_STEP,
     PROBED,
     Frames,
@@ -30,20 +43,28 @@ from soup_nlp.sequence.frames import (
     find_images,
     is_video,
     key_frames,
+    numbered_files,
     video_frames,
 )
-from soup_nlp.sequence.links import SolvedPair, make_chain, read_pair
+from soup_nlp.sequence.links import make_chain, read_pair
 from soup_nlp.storage.each import Row
-from soup_nlp.storage.files import as_path, is_file
+from soup_nlp.storage.files import as_path, is_file, is_folder, plain
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import Job, Say, failed, measure_all, read_rows
 from soup_nlp.storage.versions import code_version
 
 SCENE = "scene:"
 """Prefix of the name of a rendered scene."""
-OF_PAIRS = "output.page=false", "refine.rounds=1"
-"""Overrides of every pair: the sequence has its own page, and one round of the refinement does most
-of its work."""
+OF_PAIRS: Raw = {"output": {"page": False}, "refine": {"rounds": 1}}
+"""Keys of every pair unless others are given: the sequence has its own page, and one round of the
+refinement does most of its work."""
+FILES = {
+    ("flow", "source"): FLOWS,
+    ("flow", "backward"): FLOWS,
+    ("flow", "confidence"): (".npy", ".png"),
+    ("depth_prior", "source"): DEPTHS,
+}
+"""Keys that may name a folder with a file for each pair, and the suffixes of these."""
 AUTO = "auto"
 """Stride that is chosen by parallax."""
 
@@ -52,42 +73,45 @@ Source = str | Path | Sequence[ImageLike]
 
 
 def solve_chain(
-    frames: Source,
+    source: Source,
     out: str | Path,
     *,
+    frames: int | None = None,
     intrinsics: Sequence[float] | str | None = None,
     fov: float | None = None,
     undistort: bool = False,
     stride: int | str = 1,
-    most: int | None = None,
-    two_frame: bool = False,
     depth_scale: float | None = None,
     overrides: Sequence[str] = (),
     workers: int = 1,
     overwrite: bool = False,
     begin: Callable[[Frames, int], None] | None = None,
     say: Say | None = None,
+    **keys: Unpack[ProblemKeys],
 ) -> Chain:
     """Solve consecutive frames as pairs, put them on one scale, and write the chain's folder.
 
     A call that was interrupted goes on where it stopped.
 
     Args:
-        frames: See `Source`.
+        source: See `Source`.
         out: Folder of the chain.
+        frames: Most frames; of a scene 10 unless given.
         intrinsics: fx, fy, cx, cy in pixels, or a file; None for `fov`, K.txt beside the images,
             EXIF, or a guess.
         fov: Horizontal field of view, degrees.
         undistort: Remove the distortion that the file of the camera holds.
         stride: Take every so many frames; "auto" takes those with enough parallax.
-        most: Most frames; of a scene 10 unless given.
-        two_frame: Solve frames k and k + 2 too, for more links.
         depth_scale: Values per unit of length of true depth_*.png beside frame_*.
-        overrides: Keys of a problem file, such as `["segmentation.superpixels=500"]`.
+        overrides: Keys as on the command line, such as `["segmentation.superpixels=500"]`.
         workers: Processes.
         overwrite: Replace the result of another sequence.
         begin: Called with the frames and the number of pairs before the first is solved.
         say: Called with (done, total, row) after every pair.
+        keys: Those of `solve_pair`: `preset`, `seed`, `max_size`, and sections such as
+            `segmentation={"superpixels": 500}`. `source` and `backward` of `flow`, and `source` of
+            `depth_prior`, may be a folder, or a pattern such as "flow/*.flo", with a file for each
+            pair, in the order of their numbers.
 
     Raises:
         ConfigError: two cameras are given, the stride or a key is wrong, a scene is unknown or has
@@ -97,29 +121,32 @@ def solve_chain(
         SolverError: a pair cannot be solved; the others are kept.
     """
     folder = as_path(out, "output folder")
-    name, subject = named(frames, folder)
+    name, subject = named(source, folder)
     if intrinsics is not None and fov is not None:
         raise ConfigError("two cameras are named", found="intrinsics and fov", expected="one")
     values = intrinsics if isinstance(intrinsics, str | None) else [*intrinsics]
-    keys: Raw = {"undistort": undistort or None, "fov": fov, "intrinsics": values}
-    camera = {key: value for key, value in keys.items() if value is not None}
+    raw: Raw = {"undistort": undistort or None, "fov": fov, "intrinsics": values}
+    camera = {key: value for key, value in raw.items() if value is not None}
     step = _step(stride)
     # frames of a video, or of arrays, are written before their number is known
     claim(folder, SINGLE, overwrite, subject)
     # every solve gives the warnings of its images
     with warnings.catch_warnings(action="ignore", category=DataWarning):
-        chosen = _frames(frames, folder, camera, step, most, depth_scale)
+        chosen = _frames(source, folder, camera, step, frames, depth_scale)
+    common = sections(keys, "chain")
+    for section, defaults in OF_PAIRS.items():
+        common[section] = {**defaults, **common.get(section, {})}
+    chosen = replace(chosen, files=_files_of_pairs(common, len(chosen) - 1, step))
+    options = Options(common, tuple(overrides))
     # a wrong key or scene is found before the first pair is solved
-    _problem(chosen, 0, overrides)
+    options.problem(chosen, 0)
     count = len(chosen)
     # nothing is called so, but no file or link of the user may be in its way
     claim(folder, [*chain_files(count), f"{PAIRS}/-"], overwrite, subject, ROWS)
-    which = [(k, k + 1) for k in range(count - 1)]
-    over = [(k, k + 2) for k in range(count - 2)] if two_frame else []
     if begin:
-        begin(chosen, len(which) + len(over))
-    chosen = one_camera(chosen, overrides)
-    named_pairs = _named_pairs(chosen, [*which, *over], overrides)
+        begin(chosen, count - 1)
+    chosen = one_camera(chosen, options)
+    named_pairs = _named_pairs(chosen, options)
     # a pair that is solved otherwise ends the chain that it was part of
     others = named_pairs.keys() - _kept(named_pairs, folder)
     stale = any((folder / PAIRS / key).exists() for key in others)
@@ -133,39 +160,70 @@ def solve_chain(
     with staged(folder, whole=stale, overwrite=overwrite, subject=subject):
         # from here on, the folder is this chain's
         pass
-    pairs = solve_pairs(chosen, [*which, *over], folder, overrides, workers, say)
-    chain = make_chain(pairs[: len(which)], pairs[len(which) :])
+    chain = make_chain(solve_pairs(chosen, folder, options, workers, say))
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
-        return write_chain(new, chain, name, chosen.names, over)
+        return write_chain(new, chain, name, chosen.names)
+
+
+def _files_of_pairs(keys: Raw, count: int, step: int | None) -> dict[tuple[str, str], list[Path]]:
+    """Files of every pair, by section and key of the problem that name their folder or pattern.
+
+    Raises:
+        ConfigError: frames are left out between those that the files are of.
+        DataError: there are fewer files than pairs.
+    """
+    out = {}
+    for (section, key), kinds in FILES.items():
+        name = (keys.get(section) or {}).get(key)
+        if not isinstance(name, str | Path) or not ("*" in str(name) or is_folder(name)):
+            continue
+        found = numbered_files(Path(name), kinds, f"{section}.{key}")
+        if step != 1:
+            raise ConfigError("files of pairs need all frames", where="stride", expected="1")
+        if len(found) < count:
+            expected = f"one for each of {count} pairs"
+            raise DataError("a file is missing", where=name, found=len(found), expected=expected)
+        out[section, key] = [path.absolute() for path in found]
+    return out
+
+
+@dataclass(frozen=True)
+class Options:
+    """Keys of the problems of all pairs: sections as in a file, and overrides of these."""
+
+    keys: Raw = field(default_factory=dict)
+    overrides: tuple[str, ...] = ()
+
+    def problem(self, frames: Frames, k: int) -> Problem:
+        """The problem of two frames that follow each other."""
+        return make_problem(frames.problem(k, self.keys), self.overrides, where="sequence")
 
 
 def solve_pairs(
     frames: Frames,
-    which: Sequence[tuple[int, int]],
     folder: Path,
-    overrides: Sequence[str] = (),
+    options: Options,
     workers: int = 1,
     say: Say | None = None,
-) -> list[SolvedPair]:
-    """Solve pairs of frames in parallel processes; stored results are read.
+) -> list[Result]:
+    """Solve consecutive frames in parallel processes; stored results are read.
 
     Args:
         frames: The sequence.
-        which: Indices of the frames of every pair.
         folder: Output folder for `pairs/000_001/` ... and `pairs.jsonl`.
-        overrides: Overrides of the problems, such as segmentation.superpixels=500.
+        options: Keys of the problems.
         workers: Number of processes.
         say: Called with (done, total, row) after every solve.
 
     Raises:
         SolverError: a pair cannot be solved.
     """
-    jobs, named_pairs = [], _named_pairs(frames, which, overrides)
+    jobs, named_pairs = [], _named_pairs(frames, options)
     kept = _kept(named_pairs, folder)
     paths = [folder.resolve() / PAIRS / key for key in named_pairs]
     for path, name in zip(paths, named_pairs.values(), strict=True):
-        raw = {"name": path.name, "input": name["input"], "base": str(Path.cwd())}
-        work = partial(_solve, raw, tuple(name["overrides"]), path)
+        raw = {**name["problem"], "base": str(Path.cwd())}
+        work = partial(_solve, raw, options.overrides, path)
         jobs.append(Job(name, work, stale=path.name not in kept))
 
     def report(done: int, total: int, row: Row) -> None:
@@ -184,16 +242,21 @@ def solve_pairs(
             found=failures[0]["error"],
             hint="the others are kept: the same command goes on",
         )
-    return [read_pair(*pair, path) for pair, path in zip(which, paths, strict=True)]
+    return [read_pair(path) for path in paths]
 
 
-def _named_pairs(
-    frames: Frames, which: Sequence[tuple[int, int]], overrides: Sequence[str]
-) -> dict[str, Raw]:
+def _named_pairs(frames: Frames, options: Options) -> dict[str, Raw]:
     """What identifies each pair, by the name of its folder."""
-    keys = {f"{first:03d}_{second:03d}": (first, second) for first, second in which}
-    every = [*OF_PAIRS, *overrides]
-    return {k: {"key": k, "input": frames.pair(*p), "overrides": every} for k, p in keys.items()}
+    out = {}
+    for k in range(len(frames) - 1):
+        raw = {"name": pair_folder(Path(), k).name, **frames.problem(k, options.keys)}
+        problem = plain({key: value for key, value in raw.items() if key != "base"})
+        out[raw["name"]] = {
+            "key": raw["name"],
+            "problem": problem,
+            "overrides": [*options.overrides],
+        }
+    return out
 
 
 def _kept(named_pairs: Mapping[str, Raw], folder: Path) -> set[str]:
@@ -225,7 +288,7 @@ def _solve(raw: Raw, overrides: tuple[str, ...], folder: Path) -> Row:
     }
 
 
-def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:
+def one_camera(frames: Frames, options: Options) -> Frames:
     """The frames with one focal length for all, where it is only a guess.
 
     The flows of up to `PROBED` pairs across the sequence are independent measurements of its
@@ -236,14 +299,14 @@ def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:
         return frames
     # every solve gives the warnings of its images
     with warnings.catch_warnings(action="ignore", category=DataWarning):
-        first = _problem(frames, 0, overrides).load_pair()
+        first = options.problem(frames, 0).load_pair()
         if not first.focal_sigma > 0:
             return frames
         last = len(frames) - 2
         pairs = []
         for k in np.unique(np.linspace(0, last, min(last + 1, PROBED)).astype(int)):
             with suppress(SoupError):
-                pairs.append(observed_pair(_problem(frames, int(k), overrides)))
+                pairs.append(observed_pair(options.problem(frames, int(k))))
     if not pairs:
         return frames
     guess = first.K_ref[0, 0] / first.size[1]
@@ -262,12 +325,6 @@ def one_camera(frames: Frames, overrides: Sequence[str] = ()) -> Frames:
         stacklevel=3,
     )
     return replace(frames, camera={**frames.camera, "fov": fov, "focal_sigma": sigma})
-
-
-def _problem(frames: Frames, k: int, overrides: Sequence[str]) -> Problem:
-    """The problem of two frames that follow each other."""
-    raw = {"input": frames.pair(k, k + 1), "base": str(Path.cwd())}
-    return make_problem(raw, overrides, where="sequence")
 
 
 def named(frames: Source, folder: Path | None = None) -> tuple[str, str]:
@@ -347,7 +404,7 @@ def _frames(
         check_sequence(images)
     if step:
         return frames
-    first = make_problem({"input": frames.pair(0, 1)}, where="sequence").load_pair()
+    first = make_problem({"input": frames.pair(0)}, where="sequence").load_pair()
     keep = key_frames(images, first.K_ref, most)
     kept = tuple(frames.names[k] for k in keep)
     return replace(frames, names=kept, depths=[depths[k] for k in keep] if depths else [])

@@ -73,9 +73,20 @@ def test_config_of_a_result_solves_to_the_same(solved, tmp_path):
 
 def test_evaluate_scores_against_a_file(solved, tmp_path, capsys):
     with h5py.File(solved / "result.h5") as file:
-        np.save(tmp_path / "gt.npy", 7.0 * file["depth/ref"][:])
-    assert main(["evaluate", str(solved), "--depth", str(tmp_path / "gt.npy")]) == 0
-    assert "solution" in capsys.readouterr().out
+        truth = 7.0 * file["depth/ref"][:]
+    mask = np.zeros(truth.shape, np.uint8)
+    mask[:, :9] = 255
+    # what moves is twice as far as the solution says
+    np.save(tmp_path / "gt.npy", truth * np.where(mask, 2, 1))
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    call = ["evaluate", str(solved), "--depth", str(tmp_path / "gt.npy")]
+    assert main([*call, "--moving", str(tmp_path / "mask.png")]) == 0
+    said = capsys.readouterr().out
+    moves = next(line for line in said.splitlines() if line.startswith("what moves"))
+    assert moves.split()[2] == "0.5000"
+    assert "scale and shift" in said
+    assert "RMSE   d<1.25" in said
+    assert main([*call, "--path", "x.txt"]) == 2
     np.save(tmp_path / "gt.npy", np.ones((3, 3)))
     assert main(["evaluate", str(solved), "--depth", str(tmp_path / "gt.npy")]) == 2
     assert main(["evaluate", str(solved), "--depth", "x.npy", "--scale", "best"]) == 2

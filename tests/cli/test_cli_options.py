@@ -163,6 +163,15 @@ def test_streams_that_are_closed_or_full(words, code):
     assert "Traceback" not in done.stderr
 
 
+def test_a_closed_pipe_ends_as_in_other_tools():
+    end, ours = os.pipe()
+    os.close(end)
+    command = [sys.executable, "-m", "soup_nlp", "show", "street", "--all"]
+    done = subprocess.run(command, stdout=ours, stderr=subprocess.PIPE, text=True)
+    os.close(ours)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
 def test_a_working_folder_that_is_gone(tmp_path, monkeypatch, capsys):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")

@@ -93,9 +93,16 @@ def test_editors_know_every_key_of_a_problem():
     assert set(ProblemKeys.__annotations__) == set(Problem.model_fields) - {"base", "input", "name"}
 
 
+def test_options_raise_the_errors_of_the_program():
+    with pytest.raises(soup_nlp.SoupError, match="did you mean superpixels"):
+        SegmentationOptions(superpixel=80)
+    with pytest.raises(ConfigError, match="value does not fit"):
+        SegmentationOptions(superpixels="many")
+
+
 @pytest.mark.parametrize(
     ("key", "said"),
-    [("sead", "did you mean seed"), ("input", "follows from the pair"), ("name", "follows from")],
+    [("sead", "did you mean seed"), ("input", "follows from the images"), ("name", "follows from")],
 )
 def test_a_key_that_solve_pair_does_not_take_is_refused(key, said):
     with pytest.raises(ConfigError, match=said):
@@ -111,6 +118,12 @@ def test_depth_is_scored_from_run_array_or_stored_result(run, saved):
     assert soup_nlp.evaluate(run, truth.astype(np.float32)).keys() == {
         "solution", "start", "rigid", "constant",
     }  # fmt: skip
+    assert soup_nlp.evaluate(run, truth / 3 + 1, scale="affine")["solution"].rmse == pytest.approx(
+        soup_nlp.evaluate(run, truth, scale="affine")["solution"].rmse / 3
+    )
+    assert "<img" in stored._repr_html_()
+    assert "<img" in run._repr_html_()
+    assert (np.asarray(stored.plot()) == np.asarray(run.plot())).mean() > 0.99
     with pytest.raises(DataError, match="depth is no array of its kind"):
         soup_nlp.evaluate(None, truth)
     with pytest.raises(DataError, match="differ in size"):

@@ -76,7 +76,7 @@ def test_negative_and_infinite_estimates_cost_coverage_not_error():
 def test_names_of_scores_are_stable():
     keys = (
         "mre median_relative sq_rel rmse log_rmse delta1 delta2 delta3 scale_rule scale cap "
-        "coverage n_pixels"
+        "coverage n_pixels shift"
     )
     m = depth_metrics([1.0], [2.0])
     assert list(vars(m)) == keys.split()
@@ -120,6 +120,19 @@ def test_each_scale_rule_minimises_its_error(z, gt, factor):
         assert best <= depth_metrics(z, gt, Convention(scale=rule)).mre * (1 + 1e-9) + 1e-12
     assert best <= depth_metrics(factor * z, gt, UNSCALED).mre * (1 + 1e-9) + 1e-12
     assert rmse <= depth_metrics(factor * z, gt, UNSCALED).rmse * (1 + 1e-9) + 1e-12
+
+
+@quick
+@given(depths, depths, st.floats(1e-2, 1e2), st.floats(-1, 1))
+def test_scale_and_shift_have_the_least_squares(z, gt, factor, shift):
+    m = depth_metrics(z, gt, Convention(scale="affine"))
+    assert m.rmse <= depth_metrics(z, gt, Convention(scale="lsq")).rmse * (1 + 1e-6) + 1e-9
+    moved = factor * (z + (shift - 0.1) * z.min() / 2)
+    if np.ptp(z) > 0.01 * z.max() and (moved > 0).all():
+        assert depth_metrics(moved, gt, Convention(scale="affine")).mre == pytest.approx(m.mre)
+    exact = depth_metrics(2 * gt + 3, gt, Convention(scale="affine"))
+    if np.ptp(gt) > 0.01 * gt.max():
+        assert (exact.scale, exact.shift) == (pytest.approx(0.5), pytest.approx(-1.5))
 
 
 def test_constant_depth_and_skill():

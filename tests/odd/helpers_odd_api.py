@@ -88,6 +88,7 @@ CALLS: dict[str, Call] = {
     "evaluate folder": lambda w, o, x: soup_nlp.evaluate(x, w.good("d.npy")),
     "evaluate depth": lambda w, o, x: soup_nlp.evaluate(w.result, x),
     "evaluate cap": lambda w, o, x: soup_nlp.evaluate(w.result, w.good("d.npy"), cap=x),
+    "evaluate moving": lambda w, o, x: soup_nlp.evaluate(w.result, w.good("d.npy"), moving=x),
     "evaluate scale": lambda w, o, x: soup_nlp.evaluate(w.result, w.good("d.npy"), scale=x),
     "evaluate depth_scale": lambda w, o, x: soup_nlp.evaluate(
         w.result, depth_png(o), depth_scale=x
@@ -135,6 +136,7 @@ FINE = {
     "Truth scene_flow": "None, image",
     "evaluate cap": "None, int, huge int",
     "evaluate depth_scale": "None, int",
+    "evaluate moving": "None",
     "make_problem": "dict",
     "make_problem preset": "None",
     "make_problem overrides": "list",

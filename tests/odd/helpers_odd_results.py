@@ -238,7 +238,6 @@ CHAINS: dict[str, Any] = {
     "scene and image": "chain scene:street a.png -q -o {out}",
     "scene with stride": "chain scene:orbit --stride=2 -o {out}",
     "scene with camera": "chain scene:orbit --fov=50 -o {out}",
-    "scene over two": "chain scene:orbit --two-frame -q -o {out}",
     "images of two sizes": clip(sizes=(SIZE, (48, 80))),
     "images too small": clip(sizes=((8, 8),)),
     "superscripts": clip("1²3.png", "1²4.png", options="--fov=400"),

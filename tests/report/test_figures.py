@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import DataError
+from soup_nlp.report import pictures
 from soup_nlp.report.colour import (
     UNKNOWN,
-    colour_wheel,
     colourise_depth,
     colourise_flow,
     colourise_normals,
@@ -15,16 +15,15 @@ from soup_nlp.report.colour import (
     depth_range,
     draw_superpixels,
     flow_limit,
-    wheel_key,
 )
 from soup_nlp.report.figures import (
-    overview,
+    Legend,
+    Picture,
     strip,
     write_depth_png16,
     write_picture,
     write_png,
 )
-from soup_nlp.report.pictures import Bar, Picture, Swatches, Wheel
 
 
 def level(name, k):
@@ -56,10 +55,10 @@ BRIGHT = level("inferno", 255)
             [[128, 128, 255], [255, 128, 128], [128, 0, 128], GREY],
         ),
         (
-            # red, and darker beyond the limit
+            # red to the right, cyan to the left
             lambda uv: colourise_flow(uv, 1.0),
-            [[1.0, 0.0], [5.0, 0.0], [0.0, 0.0], [np.nan, np.nan]],
-            [[255, 0, 0], [191, 0, 0], WHITE, BLACK],
+            [[1.0, 0.0], [5.0, 0.0], [-1.0, 0.0], [0.0, 0.0], [np.nan, np.nan]],
+            [[255, 0, 0], [255, 0, 0], [0, 255, 255], WHITE, BLACK],
         ),
     ],
     ids=["depth", "error", "normals", "flow"],
@@ -90,35 +89,6 @@ def test_depth_range_is_robust():
     assert (colourise_depth(np.full((2, 2), np.nan), 1.0, 2.0) == UNKNOWN).all()
     constant = np.full((2, 2), 5.0)
     assert (colourise_depth(constant, *depth_range(constant)) != UNKNOWN).any()
-
-
-def test_flow_wheel():
-    assert colour_wheel().shape == (55, 3)
-    down, left, up = (
-        colourise_flow(np.array([[uv]], float), 1.0)[0, 0] for uv in ((0, 1), (-1, 0), (0, -1))
-    )
-    # yellow, cyan, blue to violet
-    assert min(down[:2]) > 200
-    assert min(left[1:]) > 200
-    assert up[2] > 200 > 50 > up[1]
-    key = wheel_key(65).astype(int)
-    assert (key[0, 0] == 255).all()
-    np.testing.assert_allclose(key[32, 32], 255, atol=4)
-    # motion to the right is red, as in the flow
-    assert key[32, 63][0] > 240
-    assert key[32, 63][1] < 30
-
-
-def test_flow_colour_is_continuous_except_at_the_seam():
-    """The published wheel has a seam of 43 grey levels in blue, between its last and first."""
-    angle = np.linspace(-np.pi, np.pi, 2000)
-    uv = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[None]
-    out = colourise_flow(uv, 1.01).astype(int)[0]
-    step = np.abs(np.diff(out, axis=0))
-    assert (step.max(axis=1) > 12).sum() == 1
-    assert step.max() <= 43
-    assert step[:, :2].max() < 12
-    assert np.abs(out[0] - out[-1]).max() < 12
 
 
 @pytest.mark.parametrize("name", ["turbo", "inferno", "viridis"])
@@ -196,11 +166,10 @@ def test_strip():
 @pytest.mark.parametrize(
     "legend",
     [
-        Bar(np.full((1, 8, 3), BLUE, np.uint8), ("0", "1 m")),
-        Swatches(((BLUE, "a car"), ((255, 255, 255), "none"))),
-        Wheel(np.full((8, 8, 3), BLUE, np.uint8), "rim = 3 px"),
+        Legend(np.full((1, 8, 3), BLUE, np.uint8), ("0", "1 m")),
+        Legend(np.array([[BLUE, (255, 255, 255)]], np.uint8), ("a car", "none")),
     ],
-    ids=["bar", "swatches", "wheel"],
+    ids=["numbers", "classes"],
 )
 def test_a_legend_is_drawn_below_its_picture(legend, tmp_path):
     write_picture(tmp_path / "p.png", flat(RED, height=300, width=600, legend=legend))
@@ -224,15 +193,13 @@ def test_a_title_that_is_too_long_is_made_smaller():
 
 
 def test_an_overview_has_no_gaps(monkeypatch):
-    from soup_nlp.report import figures
-
     seen = {}
-    monkeypatch.setattr(figures, "strip", lambda panels, title: seen.update(p=panels))
+    monkeypatch.setattr(pictures, "strip", lambda panels, title: seen.update(p=panels))
     always = [f"panel_{k}" for k in range(8)]
 
     def names(*extra):
         found = {name: flat(RED, name) for name in (*always, *extra)}
-        overview(found, "")
+        pictures.overview(found, "")
         return {picture.name for picture in seen["p"]}
 
     assert len(names("normals")) == 9

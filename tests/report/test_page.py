@@ -17,7 +17,7 @@ from soup_nlp.geometry.rotation import exp
 from soup_nlp.report import page as page_module
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import SHARES
-from soup_nlp.report.folder import _title, write_folder
+from soup_nlp.report.folder import write_folder
 from soup_nlp.report.page import MODES, make_pair, make_scene, pair_page, surface_cells
 from soup_nlp.report.pictures import _enlarged, pictures
 from soup_nlp.report.result import result_of
@@ -76,7 +76,7 @@ def test_the_page_is_one_file_that_fetches_nothing(text):
     assert [*data_of(text)["pairs"][0]["pictures"]][:5] == [
         "image_ref", "image_next", "superpixels", "components", "flow",
     ]  # fmt: skip
-    assert re.search(r"rim = [\d.]+ px", text)
+    assert re.search(r"full colour = [\d.]+ px", text)
 
 
 def test_planes_and_motions_rebuild_both_frames(text, small_run):
@@ -195,7 +195,7 @@ def test_page_pictures_and_overview_begin_with_the_guess(guess, said, shown):
         assert mask[frame.guess].all()
     assert pale[0].mean() == pytest.approx(guess, abs=0.05)
     assert (f"<p><strong>{sentence}</strong> &middot; " in header) == bool(said)
-    assert _title(one) == (f"{one.name}: {sentence}" if said else one.name)
+    assert one.title == (f"{one.name}: {sentence}" if said else one.name)
 
 
 def test_sparse_truth_is_drawn_larger():

@@ -160,7 +160,7 @@ def test_a_click_tells_depth_sigma_and_component(browser, small_run):
     browser.value(f"soupView.tell({found})")
     said = browser.value("document.getElementById('picked').textContent")
     shown = result_of(small_run, summary(small_run))
-    z = shown.scale * small_run.reconstruction.depth_ref[found // width, found % width]
+    z = shown.metre * small_run.reconstruction.depth_ref[found // width, found % width]
     assert f"depth {z:.4g}"[:9] in said
     assert "sigma" in said
     assert "superpixel" in said
@@ -202,7 +202,7 @@ def test_what_is_shown_is_saved_for_other_viewers(browser, small_run, tmp_path, 
     (found,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     assert isinstance(found, trimesh.PointCloud if points else trimesh.Trimesh)
     shown = result_of(small_run, summary(small_run))
-    own = shown.scale * small_run.reconstruction.points_ref.reshape(-1, 3)
+    own = shown.metre * small_run.reconstruction.points_ref.reshape(-1, 3)
     assert len(found.vertices) > 0.5 * len(own)
     # the scene at time 1 in the reference camera's axes, y up
     depth = np.median(-found.vertices[:, 2])

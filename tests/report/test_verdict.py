@@ -8,7 +8,7 @@ import pytest
 
 from soup_nlp.report import findings
 from soup_nlp.report.summary import certainty
-from soup_nlp.report.verdict import _energies, exit_code, facts
+from soup_nlp.report.verdict import exit_code, facts
 
 
 def titles(text):
@@ -124,22 +124,6 @@ def test_limits_name_what_is_wrong(small_run):
         " constant depth explains the flow nearly as well, 4% little information.",
         "Try a better flow (--flow); frames farther apart in time.",
     ]
-
-
-def test_the_table_of_energies_ends_with_what_the_refinement_lowers():
-    start, nlp, end = ({"total": v, "arap": 1.0} for v in (9.0, 5.0, 6.0))
-    solution = SimpleNamespace(energy_start=start, energy=nlp, stages=("one",))
-    photo = {"energy_start": 90.0, "energy_begin": 50.0, "energy": 40.0}
-    refined = SimpleNamespace(**{k: {"total": v, "photo": 2.0} for k, v in photo.items()})
-    run = SimpleNamespace(solution=solution, refined=refined, energy=end)
-    head, *rows = _energies(run)
-    assert head.split()[-3:] == ["E", "+", "E_photo"]
-    assert [row.split() for row in rows] == [
-        ["start", "9", "1", "90"], ["NLP", "5", "1", "50"], ["solution", "6", "1", "40"],
-    ]  # fmt: skip
-    assert _energies(SimpleNamespace(solution=solution, refined=None, energy=end))[0].split() == [
-        "total", "arap",
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -10,15 +10,9 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.chain import Link
 from soup_nlp.report.clouds import fuse
-from soup_nlp.sequence.links import (
-    SolvedPair,
-    follow,
-    link,
-    make_chain,
-    number,
-    solve_scales,
-)
-from soup_nlp.sequence.score import aligned
+from soup_nlp.report.formats import write_formats
+from soup_nlp.sequence.links import chained_scales, follow, link, make_chain, number
+from soup_nlp.sequence.score import path_errors, read_path, similarity
 
 pytestmark = pytest.mark.slow
 
@@ -49,15 +43,13 @@ def test_scales_follow_their_links():
         return Link(a, b, float(np.log(true[b] / true[a]) + error), 0.02, 5000, **marks)
 
     chain = [between(0, 1), between(1, 2), between(2, 3)]
-    np.testing.assert_allclose(solve_scales(4, chain), true, rtol=1e-9)
-    assert solve_scales(1, []) == [1.0]
-    # one of several that contradict each other gives way, a guess even more
-    more = [*chain, between(0, 2), between(1, 3), between(0, 3, error=0.5)]
-    np.testing.assert_allclose(solve_scales(4, more), true, rtol=0.02)
+    np.testing.assert_allclose(chained_scales(4, chain), true, rtol=1e-9)
+    assert chained_scales(1, []) == [1.0]
+    # a guess gives way to a bridge
     guess = [*chain[:2], between(2, 3, error=0.5, flagged=True), between(1, 3, bridge=True)]
-    np.testing.assert_allclose(solve_scales(4, guess), true, rtol=0.01)
+    np.testing.assert_allclose(chained_scales(4, guess), true, rtol=1e-9)
     with pytest.raises(DataError, match="pair 3"):
-        solve_scales(4, chain[:2])
+        chained_scales(4, chain[:2])
 
 
 def test_components_are_followed_by_overlap():
@@ -75,7 +67,7 @@ def test_components_are_followed_by_overlap():
 def test_a_chain_has_one_scale_and_one_frame_of_reference():
     chain = make_chain(toy_pairs())
     np.testing.assert_allclose(chain.scales, [1, 2], rtol=1e-9)
-    np.testing.assert_allclose(chain.depth(1), 2 * toy_pairs()[1].result.depths[0])
+    np.testing.assert_allclose(chain.depth(1), 2 * toy_pairs()[1].depths[0])
     np.testing.assert_allclose(
         chain.world_from_camera[1].matrix, np.linalg.inv(CAMERA.matrix), atol=1e-9
     )
@@ -84,8 +76,8 @@ def test_a_chain_has_one_scale_and_one_frame_of_reference():
     )
     # the static scene stands still in the world
     np.testing.assert_allclose(chain.motion(1, 0).matrix, np.eye(4), atol=1e-9)
-    with pytest.raises(DataError, match="consecutive"):
-        make_chain(toy_pairs()[1:])
+    with pytest.raises(DataError, match="another kind"):
+        make_chain([])
 
 
 def test_the_static_scene_becomes_one_cloud():
@@ -114,10 +106,8 @@ def test_a_pair_without_parallax_is_bridged():
         source_next=identity,
     )
     middle = replace(still, reconstruction=rec, components=replace(still.components, members=rest))
-    still = [SolvedPair(k, k + 1, middle) for k in range(5)]
-    moving = replace(first, first=1, second=2), replace(second, first=3, second=4)
     # also before the first and after the last motion
-    chain = make_chain([still[0], moving[0], still[2], moving[1], still[4]])
+    chain = make_chain([middle, first, middle, second, middle])
     ends = [(k.first, k.second) for k in chain.links]
     assert ends == [(0, 1), (1, 2), (2, 3), (3, 4), (1, 3)]
     assert [k.flagged for k in chain.links] == [True] * 4 + [False]
@@ -146,7 +136,35 @@ def test_frames_of_a_chain_have_all_that_is_known_of_them():
 
 def test_similarities_are_found_exactly():
     rng = np.random.default_rng(3)
-    points = rng.normal(size=(6, 3))
-    target = 2.5 * points @ exp([0.3, -0.2, 0.5]).T + [1, 2, 3]
-    np.testing.assert_allclose(aligned(points, target), target, atol=1e-12)
-    assert not np.allclose(aligned(points * [1, 1, -1], target), target)
+    points, R = rng.normal(size=(6, 3)), exp([0.3, -0.2, 0.5])
+    scale, turn, shift = similarity(points, 2.5 * points @ R.T + [1, 2, 3])
+    assert scale == pytest.approx(2.5)
+    np.testing.assert_allclose(turn, R, atol=1e-12)
+    np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-12)
+    # a mirror image is no rotation
+    assert np.linalg.det(similarity(points * [1, 1, -1], points)[1]) == pytest.approx(1)
+
+
+def test_errors_of_a_path_are_those_of_evo(tmp_path):
+    """ATE and RPE of a path that differs by a similarity and by one turn of known size."""
+    chain = make_chain(toy_pairs())
+    found = np.array([m.matrix for m in chain.world_from_camera])
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = exp([0.1, 0.2, -0.3]), (1, 2, 3)
+    true = world @ (found * np.array([[1, 1, 1, 5.0]] * 3 + [[1, 1, 1, 1]]))
+    errors = path_errors(chain, true)
+    assert max(errors[k] for k in ("ate", "rpe", "rpe_degrees", "share")) < 1e-6
+    # the last camera turns by one degree in place: one of two steps differs by it
+    true[2, :3, :3] = true[2, :3, :3] @ exp([0, 0, np.radians(1)])
+    errors = path_errors(chain, true)
+    assert errors["ate"] < 1e-6
+    assert errors["rpe_degrees"] == pytest.approx(np.sqrt(0.5), rel=1e-6)
+    np.savetxt(tmp_path / "kitti.txt", true[:, :3].reshape(3, 12))
+    np.testing.assert_allclose(read_path(tmp_path / "kitti.txt"), true)
+    rows = write_formats(tmp_path, chain, ["motions"])
+    np.testing.assert_allclose(read_path(tmp_path / rows[-1]), found, atol=1e-8)
+    with pytest.raises(DataError, match="length"):
+        path_errors(chain, true[:2])
+    (tmp_path / "bad.txt").write_text("1 2 3")
+    with pytest.raises(DataError, match="TUM"):
+        read_path(tmp_path / "bad.txt")

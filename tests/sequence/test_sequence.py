@@ -13,9 +13,8 @@ from helpers_result import CAMERA, CERTAINTY, toy_pairs
 
 import soup_nlp
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.errors import DataError, SolverError
+from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.clouds import fuse
 from soup_nlp.report.figures import write_png
@@ -26,7 +25,7 @@ from soup_nlp.sequence.folder import chain_files, write_chain
 from soup_nlp.sequence.frames import Frames
 from soup_nlp.sequence.links import make_chain
 from soup_nlp.sequence.score import chain_exit_code, chain_lines, chain_page, link_table
-from soup_nlp.sequence.solve import one_camera
+from soup_nlp.sequence.solve import Options, one_camera
 
 pytestmark = pytest.mark.slow
 
@@ -69,9 +68,9 @@ def test_a_chain_says_which_depth_is_a_guess(tmp_path):
     sure = toy_pairs()
 
     def unsure(pair):
-        rec = replace(pair.result.reconstruction, sigma_ref=np.full((60, 80), 1.2))
-        summary = {**pair.result.summary, "certainty": shares}
-        return replace(pair, result=replace(pair.result, reconstruction=rec, summary=summary))
+        rec = replace(pair.reconstruction, sigma_ref=np.full((60, 80), 1.2))
+        summary = {**pair.summary, "certainty": shares}
+        return replace(pair, reconstruction=rec, summary=summary)
 
     half, none = make_chain([sure[0], unsure(sure[1])]), make_chain([*map(unsure, sure)])
     for chain, share, code in ((make_chain(sure), 0, 0), (half, 50, 0), (none, 100, 1)):
@@ -216,7 +215,9 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert len(np.loadtxt(tmp_path / "out" / "trajectory.tum")) == 3
     # what is solved is not solved again
     rows = (tmp_path / "out" / "pairs.jsonl").read_text()
-    assert main(call) == 0
+    capsys.readouterr()
+    assert main([word for word in call if word != "-q"]) == 0
+    assert "the chain is finished" in capsys.readouterr().err
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
     # a file of the user is overwritten on request only
     (tmp_path / "out" / "chain.json").write_text("mine")
@@ -270,13 +271,14 @@ def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch,
         return {}
 
     monkeypatch.setattr(solving, "_solve", solve)
-    monkeypatch.setattr(solving, "read_pair", lambda first, second, place: (first, second))
-    street = Frames(("a", "b", "c"), scene="street")
+    monkeypatch.setattr(solving, "read_pair", lambda place: place.name)
+    street, longer = (Frames(tuple("abc")[:k], scene="street") for k in (2, 3))
     for own in (["a"], ["a"], ["b"], ["a"]):
-        assert solving.solve_pairs(street, [(0, 1)], tmp_path, own) == [(0, 1)]
-    assert seen == [(*solving.OF_PAIRS, own) for own in "aba"]
-    with pytest.raises(SolverError, match="1 of 1 pairs"):
-        solving.solve_pairs(street, [(1, 2)], tmp_path)
+        options = Options(overrides=tuple(own))
+        assert solving.solve_pairs(street, tmp_path, options) == ["000_001"]
+    assert seen == [("a",), ("b",), ("a",)]
+    with pytest.raises(SolverError, match="1 of 2 pairs"):
+        solving.solve_pairs(longer, tmp_path, Options(overrides=("a",)))
     for command in ("view", "check"):
         assert main([command, str(tmp_path)]) == 2
         error = capsys.readouterr().err
@@ -291,13 +293,13 @@ def test_frames_without_a_camera_get_one_focal_length(tmp_path):
     for k, name in enumerate(names):
         pair = render_scene("room", 1, 200, 135, k)
         write_png(tmp_path / name, pair.image_ref)
-    fast = ["segmentation.superpixels=30"]
+    fast = Options({"segmentation": {"superpixels": 30}})
     camera = one_camera(Frames(tuple(names)), fast).camera
     focal = 100 / np.tan(np.radians(camera["fov"] / 2))
     assert focal == pytest.approx(pair.K_ref[0, 0], rel=0.1)  # the guess is 1.5 times as long
     assert 0.05 <= camera["focal_sigma"] < 0.2
     # the solve of a pair takes it as it is
-    found = prepare(make_problem({"input": Frames(tuple(names), camera).pair(0, 1)}, fast)).pair
+    found = prepare(fast.problem(Frames(tuple(names), camera), 0)).pair
     assert found.K_ref[0, 0] == pytest.approx(focal)
     assert found.focal_sigma == camera["focal_sigma"]
     known = Frames(tuple(names), {"fov": 60})
@@ -310,4 +312,43 @@ def test_a_pair_without_flow_says_nothing_of_the_focal_length(tmp_path):
     for name in names:
         write_png(tmp_path / name, np.full((216, 320, 3), 128, np.uint8))
     flat = Frames(tuple(names))
-    assert one_camera(flat, ["segmentation.superpixels=20"]) is flat
+    assert one_camera(flat, Options(overrides=("segmentation.superpixels=20",))) is flat
+
+
+def test_a_chain_takes_the_keys_of_a_pair_and_files_of_every_pair(tmp_path):
+    """In Python as on the command line: flows and depths of a folder, sections, frames."""
+    for kind in ("clip", "flow", "depth"):
+        (tmp_path / kind).mkdir()
+    for k in range(3):
+        pair = render_scene("street", 0, 128, 86, k)
+        write_png(tmp_path / "clip" / f"{k}.png", pair.image_ref)
+        np.save(tmp_path / "depth" / f"{k}.npy", 7 * pair.truth.depth_ref)
+        if k < 2:
+            np.save(tmp_path / "flow" / f"{k}.npy", pair.truth.flow)
+    keys = {
+        "segmentation": {"superpixels": 20, "neighbours": 5},
+        "refine": {"enabled": False},
+        "solver": {"presolve": False, "max_iter": 1},
+        "flow": {"source": f"{tmp_path}/flow/*.npy"},
+        "depth_prior": {"source": str(tmp_path / "depth"), "kind": "relative"},
+    }
+    K = pair.K_ref
+    camera = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    source = str(tmp_path / "clip")
+    chain = soup_nlp.chain(source, tmp_path / "out", frames=3, intrinsics=camera, **keys)
+    for k, pair in enumerate(chain.pairs):
+        told = pair.summary
+        assert told["flow"].startswith("Flow")
+        assert told["depth_prior"]
+        true = np.load(tmp_path / "flow" / f"{k}.npy")
+        known = pair.flow_confidence > 0
+        np.testing.assert_allclose(pair.flow[known], true[known], atol=1e-5)
+        assert told["sizes"]["superpixels"] == pytest.approx(20, rel=0.3)
+    assert (tmp_path / "out" / "pairs" / "000_001" / "log.txt").is_file()
+    assert not (tmp_path / "out" / "pairs" / "000_001" / "report.html").exists()
+    for more, message in (({"stride": 2}, "all frames"), ({"frames": 3}, "one for each of 2")):
+        (tmp_path / "flow" / "1.npy").unlink(missing_ok=True)
+        with pytest.raises(SoupError, match=message):
+            soup_nlp.chain(source, tmp_path / "more", intrinsics=camera, **{**keys, **more})
+    with pytest.raises(ConfigError, match="superpixel"):
+        soup_nlp.chain(source, tmp_path / "more", segmentation={"superpixel": 9})

@@ -276,7 +276,7 @@ const cameras = new THREE.Group(), paths = new THREE.Group();
 const cameraRef = frustum(0x6fb7ff), cameraNext = frustum(0xffa94d);
 cameras.add(cameraRef, cameraNext);
 for (const { colour: tint, points: path } of data.paths)
-  paths.add(lines(path.slice(1).flatMap((q, k) => [path[k], q]), last > 1 ? tint : 0xff5566, true));
+  paths.add(lines(path.slice(1).flatMap((q, k) => [path[k], q]), tint, true));
 body.add(cameras, paths);
 
 /* place and visibility of everything, after any change */
@@ -349,7 +349,9 @@ const VIEWS = {
   top: () => {
     fit(1.3);
     const reach = Math.min(shared.far.value, 3 * m), height = 0.55 * reach / Math.tan(eye.fov * Math.PI / 360);
-    look(1.3, [0, -height, 0.5 * reach - 0.01 * m], [0, 0, 0.5 * reach]);
+    /* ahead is up, whatever the camera's tilt */
+    const level = new THREE.Matrix4().copyPosition(place(now.k));
+    look(1.3, [0, -height, 0.5 * reach - 0.01 * m], [0, 0, 0.5 * reach], level);
   },
 };
 async function setView(name) {
