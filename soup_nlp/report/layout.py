@@ -101,7 +101,15 @@ refine/kinds              text  C       kinds of particles
 multipliers/lam_x         1     X       of the bounds of the variables, in the order of the NLP
 multipliers/lam_g_*       1     G       of the constraints *, in the order of the NLP
 
-iterations/*              1     I       Ipopt's record by iteration: *
+iterations/*/obj          1     I       objective of the solver's form, by iteration
+iterations/*/inf_pr       1     I       largest constraint violation, by iteration
+iterations/*/inf_du       1     I       largest dual infeasibility, scaled by Ipopt, by iteration
+iterations/*/mu           1     I       barrier parameter, by iteration
+iterations/*/d_norm       1     I       largest entry of the step, by iteration
+iterations/*/regularization_size  1  I  inertia correction, by iteration
+iterations/*/alpha_pr     1     I       step size, variables, by iteration
+iterations/*/alpha_du     1     I       step size, multipliers, by iteration
+iterations/*/ls_trials    1     I       trial points of the line search, by iteration
 
 depth/ref                 soup  H,W     z of the reference frame, NaN if none
 depth/next                soup  H,W     z of the next frame, NaN if none
