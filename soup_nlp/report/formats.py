@@ -109,21 +109,13 @@ def _write_moving(path: Path, chain: Chain, k: int) -> None:
     encode_png(path, np.where(chain[k].components > 0, 255, 0).astype(np.uint8))
 
 
-def write_depths(folder: Path, chain: Chain) -> tuple[list[str], float]:
-    """Write depth maps as 16-bit PNG; returns their names and values per unit, one for all."""
-    depths = [frame.depth for frame in chain]
-    scale = depth_png_scale(np.concatenate([z.ravel() for z in depths]))
-    names = [file_of(chain, "depth", frame, ".png") for frame in chain.names]
-    for name, z in zip(names, depths, strict=True):
-        (folder / name).parent.mkdir(exist_ok=True)
-        write_depth_png16(folder / name, z, scale)
-    return names, scale
-
-
-def _png(folder: Path, chain: Chain) -> list[str]:
-    names, scale = write_depths(folder, chain)
-    write_json(folder / "depth_png.json", {"values_per_unit": scale, "unit": chain.unit})
-    return [*names, "depth_png.json"]
+def write_depths(folder: Path, chain: Chain) -> float:
+    """Write depth maps as 16-bit PNG; returns the values per unit, the same for all."""
+    scale = depth_png_scale(np.concatenate([frame.depth.ravel() for frame in chain]))
+    _each("depth", ".png", lambda path, _, k: write_depth_png16(path, chain[k].depth, scale))(
+        folder, chain
+    )
+    return scale
 
 
 def _write_cameras(path: Path, chain: Chain) -> None:
@@ -279,7 +271,6 @@ FORMATS: Mapping[str, tuple[Writer, str]] = {
         "depth and sigma as float32 arrays, K.txt",
     ),
     "pfm": (_each("depth", ".pfm", _write_pfm), "depth as portable float maps"),
-    "png": (_png, "depth as 16-bit PNG"),
     "masks": (
         _all(_each("components", ".png", _write_labels), _each("moving", ".png", _write_moving)),
         "labels of the components, and 255 where something moves by itself",

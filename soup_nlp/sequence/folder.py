@@ -189,7 +189,7 @@ def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -
     Returns:
         The chain with the contents of its chain.json.
     """
-    _, scale = write_depths(folder, chain)
+    scale = write_depths(folder, chain)
     contents = {"name": name, "sources": list(sources), **summary(chain)}
     contents |= {"depth_png_scale": scale, "score": score(chain)}
     chain = replace(chain, summary=contents)

@@ -155,7 +155,7 @@ def result_cases() -> Iterator[Case]:
         flip = changed("result", "result.h5", _flip)
         ends = ("start", "middle", "end")
         yield from cases(DOORS, f"h5 {verb} flipped {{}}", line, ends, ANY, make=flip)
-    formats = "ply,glb,colmap,npy,pfm,png,rrd,motions"
+    formats = "ply,glb,colmap,npy,pfm,rrd,motions,masks,flow,transforms,kitti"
     for line in (f"convert {{x}} --to {formats}", "view {x} --renew --no-open"):
         title = f"{line.split()[0]} h5 {{}}"
         yield from cases(DOORS, title, line, CONTENTS, (0, 2), make=broken)
