@@ -105,7 +105,6 @@ def paper(
 ) -> int:
     """The paper's tables by `preset: paper` and the defaults; a run that was stopped goes on."""
     plan = papers.make_plan(data, superpixels, analysis, limit, tuple(overrides or ()))
-    print("\n".join(papers.pairs_found(plan)), file=sys.stderr)
     page, cells = out / "README.md", list(plan.drop_duplicates("key")["cell"])
     frame = measure(cells, measure_pair, page.with_suffix(".jsonl"), workers)
     note = f"Superpixels wanted: {superpixels} in the comparison, {analysis} elsewhere."

@@ -50,19 +50,6 @@ SIGMA_COLUMNS = {
     "guess": "guess",
 }
 """Titles of the columns on sigma."""
-DETAILS = {
-    "metrics.solution.sq_rel": "SqRel",
-    "metrics.solution.rmse": "RMSE",
-    "metrics.solution.log_rmse": "log-RMSE",
-    "metrics.solution.delta2": "d<1.25^2",
-    "metrics.solution.delta3": "d<1.25^3",
-    "flow_error.mean": "flow EPE px",
-    "scene_flow.mean": "3D EPE",
-    "scene_flow.mean_truth_length": "of length",
-    "bending_share": "bending",
-}
-"""Titles of further columns of the solution's errors."""
-SECONDS = {"cpu_seconds": "s"}
 ABOUT_ERRORS = (
     "Means over the pairs. On rigid: the solution, only where one rigid motion of the same flow has"
     " a depth; rigid: that motion. Seen: superpixels with usable flow (mean confidence above 0.5);"
@@ -116,11 +103,11 @@ def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = F
         blocks += ["## By half", ABOUT_HALVES, _halves(scored)]
         blocks += ["## By family", ABOUT_ERRORS, _by_family(scored, ERROR_COLUMNS)]
         blocks += [*_better_baselines(scored), "## Sigma", ABOUT_SIGMA]
-        blocks += [_by_family(scored, SIGMA_COLUMNS), _columns(by_pair, SIGMA_COLUMNS)]
+        blocks.append(_by_family(scored, SIGMA_COLUMNS))
+        by_pair = pd.DataFrame({t: numbers(by_pair, c) for c, t in SIGMA_COLUMNS.items()})
+        blocks.append(markdown(by_pair.dropna(axis=1, how="all")))
         if picture:
             blocks.append(f"![Sparsification by sigma, and its reliability]({name}.png)")
-        details = _columns(by_pair, DETAILS, "status", *SECONDS)
-        blocks += ["## The solution", details]
     return page_text(blocks, frame)
 
 
@@ -155,14 +142,8 @@ def _by_pair(frame: pd.DataFrame) -> str:
     columns |= {k: metric(frame, name=k) for k in ("skill", "coverage")}
     table = pd.DataFrame(columns).dropna(axis=1, how="all")
     table.insert(0, "family", frame["family"])
-    return markdown(table)
-
-
-def _columns(frame: pd.DataFrame, titles: dict[str, str], *texts: str) -> str:
-    """Table of columns under their titles, without numbers that no row has, then of `texts`."""
-    out = pd.DataFrame({title: numbers(frame, c) for c, title in titles.items()})
-    out = out.dropna(axis=1, how="all").join(frame[list(texts)].rename(columns=SECONDS))
-    return markdown(out, dict.fromkeys(out.columns, ".4f") | {"s": ".0f"})
+    table["status"], table["CPU s"] = frame["status"], frame["cpu_seconds"]
+    return markdown(table, dict.fromkeys(table, ".4f") | {"CPU s": ".0f"})
 
 
 def _by_family(frame: pd.DataFrame, titles: dict[str, str]) -> str:

@@ -5,14 +5,12 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
-from textwrap import shorten
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from benchmarks.scores import has_depth
-from benchmarks.suites import MOTORCYCLE, RENDERED, SUITES, Options, list_suite, spread
+from benchmarks.suites import MOTORCYCLE, RENDERED, Options, list_suite, spread
 from benchmarks.table import (
     Cell,
     Item,
@@ -21,9 +19,7 @@ from benchmarks.table import (
     markdown,
     metric,
     page_text,
-    panels,
     provenance,
-    save,
 )
 from soup_nlp import SoupError
 from soup_nlp.config.presets import overrides_of
@@ -221,15 +217,6 @@ def _scaled(method: str, n: int) -> Overrides:
 LENGTHS = ("energy.weights.arap", "energy.weights.cont")
 
 
-def pairs_found(plan: pd.DataFrame) -> list[str]:
-    """A line for each section, and dataset of the comparison: number and names of its pairs."""
-    groups = plan.groupby(["section", "dataset"], sort=False)["name"].unique()
-    return [
-        f"{' '.join(filter(None, key))}: {len(names)} pairs: {shorten(', '.join(names), 90)}"
-        for key, names in groups.items()
-    ]
-
-
 def _families(
     names: tuple[str, ...], datasets: Mapping[str, list[Item]], data: Path | None
 ) -> list[Item]:
@@ -289,10 +276,8 @@ def write_paper(page: Path, frame: pd.DataFrame, plan: pd.DataFrame, note: str) 
         *("# The paper, row by row", f"{provenance(frame)}; {os.cpu_count()} cores.", ABOUT),
         *(f"{note} {measured}", *_comparison(of_section["comparison"]), *ablation),
         *(block for text in texts for block in text),
-        *("![MRE by variant](studies.png)", *_departures(of_section["departures"])),
-        *_missing({*plan["dataset"]}),
+        *_departures(of_section["departures"]),
     ]
-    _plot(page.with_name("studies.png"), tables)
     page.write_text(page_text(blocks, frame), encoding="utf-8")
 
 
@@ -333,22 +318,6 @@ def _study(head: str, tables: Mapping[str, pd.DataFrame]) -> list[str]:
     return [head, *(block for text in texts for block in text)]
 
 
-def _plot(path: Path, studies: Mapping[str, Mapping[str, pd.DataFrame]]) -> None:
-    """Lines of the studies' tables over their variants, a panel for each; the mean in black."""
-    picture, axes = panels(len(studies), len(METHODS), 4.5, 2.8)
-    for line, (name, tables) in zip(axes, studies.items(), strict=True):
-        for ax, (method, table) in zip(line, tables.items(), strict=False):
-            style: dict[str, Any] = {"marker": "o", "ms": 3, "lw": 1, "fontsize": 7, "rot": 20}
-            means = [str(pair).startswith("mean of") for pair in table.index]
-            style["color"] = ["black" if mean else f"C{k % 10}" for k, mean in enumerate(means)]
-            if table.notna().any(axis=None):
-                ticks = range(table.shape[1])
-                table.T.plot(ax=ax, xlabel=name, ylabel="MRE", logy=True, xticks=ticks, **style)
-                ax.legend(fontsize=5)
-            ax.set_title(method, fontsize=8)
-    save(picture, path)
-
-
 def _departures(rows: pd.DataFrame) -> list[str]:
     """Table of the departures, each undone alone."""
     table = rows.pivot(index="change", columns="name", values="mre").astype(float)
@@ -364,13 +333,3 @@ def _departures(rows: pd.DataFrame) -> list[str]:
         " than 1 %."
     )
     return ["## Departures, one at a time", text, markdown(table.rename_axis("departure"))]
-
-
-def _missing(present: set[str]) -> list[str]:
-    """List of the paper's datasets without rows, with where they are from."""
-    lines = [
-        f"- {name}: no pair was given; from {SUITES[suites[0]].source}"
-        for name, suites in DATASETS.items()
-        if name not in present
-    ]
-    return ["## What is not here", "\n".join(lines)] if lines else []

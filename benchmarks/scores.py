@@ -26,17 +26,13 @@ from soup_nlp.evaluate.scoring import at_truth, coverage, fill_nearest, score_de
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.storage.each import Row
 
-METHODS: Mapping[str, str] = {
-    "solution": "what the product delivers",
-    "nlp": "the NLP alone, before refinement",
-    "start": "the start: shared motions, scales by contact",
-    "unorganised": "independent superpixels: each with a translation of length 1, no assembly",
-    "solution_rigid": "the solution, only where one rigid motion has a depth",
-    "rigid": "one rigid motion, triangulated; only where it has a depth",
-    "rigid_filled": "the same, holes filled from the nearest pixel",
-    "constant": "a constant depth",
-}
-"""Descriptions of the depth maps, in the order of the tables."""
+METHODS = (
+    *("solution", "nlp", "start", "unorganised", "solution_rigid", "rigid", "rigid_filled"),
+    "constant",
+)
+"""Depth maps in the order of the tables: what is delivered, the NLP alone, the start, independent
+superpixels (each with a translation of length 1), the solution where one rigid motion has a depth,
+that motion triangulated, the same with holes filled from the nearest pixel, a constant depth."""
 KEPT_METRICS = (*ERRORS, "scale", "coverage", "n_pixels")
 """Depth metrics that a row has beside the skill."""
 SEEN = 0.5

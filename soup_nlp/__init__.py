@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from soup_nlp.arrays import Float, Mask
+    from soup_nlp.batches.run import batch
     from soup_nlp.config.problem import Problem, load_problem, make_problem
     from soup_nlp.data.pair import Flow, Pair, Truth
     from soup_nlp.errors import SoupError
@@ -37,6 +38,7 @@ __all__ = [
     "SoupError",
     "Truth",
     "__version__",
+    "batch",
     "chain",
     "constraints",
     "evaluate",
@@ -59,6 +61,7 @@ _HOMES = {
     "SoupError": "errors",
     "Truth": "data.pair",
     "__version__": "storage.versions",
+    "batch": "batches.run",
     "chain": "sequence.solve:solve_chain",
     "constraints": "geometry.constraints",
     "load": "sequence.folder",

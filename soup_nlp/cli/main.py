@@ -83,6 +83,7 @@ COMMANDS: Mapping[str, str] = {
     "view": "results:view",
     "check": "results:check",
     "chain": "solve:chain",
+    "batch": "batch:batch",
     "convert": "results:convert",
     "evaluate": "results:evaluate",
     "show": "problems:show",

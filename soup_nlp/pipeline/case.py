@@ -277,20 +277,25 @@ NEIGHBOURS = 3
 
 
 def check_fits(problem: Problem, pair: Pair) -> None:
-    """Raise DataError for more superpixels than the image has room for, or too little memory.
-
-    The bytes of a solve are sums of measured parts, right within a factor of two.
-    """
-    s, r = problem.segmentation, problem.refine
-    height, width = pair.size
-    pixels, n = height * width, s.superpixels
-    if n > pixels // 4:
+    """Raise DataError for more superpixels than the image has room for, or too little memory."""
+    (height, width), n = pair.size, problem.segmentation.superpixels
+    if n > height * width // 4:
         raise DataError(
             "number of superpixels does not fit the image",
             where="segmentation.superpixels",
             found=n,
-            expected=f"1 to {pixels // 4} for {width}x{height}",
+            expected=f"1 to {height * width // 4} for {width}x{height}",
         )
+    parts = solve_bytes(problem, pair)
+    total, (_, hint) = sum(size for size, _ in parts.values()), max(parts.values())
+    shares = ", ".join(f"{name} {size / 1e9:.3g} GB" for name, (size, _) in parts.items())
+    require_memory(total, "this problem", shares, hint)
+
+
+def solve_bytes(problem: Problem, pair: Pair) -> dict[str, tuple[float, str]]:
+    """Bytes of a solve, right within a factor of two, and how to need fewer, by measured part."""
+    s, r = problem.segmentation, problem.refine
+    pixels, n = pair.size[0] * pair.size[1], s.superpixels
     graph = n * (s.neighbours + NEIGHBOURS)
     # a superpixel has no more samples than pixels, and no more boundary points than its outline
     sampled = problem.energy.pixel_samples
@@ -298,7 +303,7 @@ def check_fits(problem: Problem, pair: Pair) -> None:
     around = 4 * (pixels / n) ** 0.5
     points = around if s.boundary_samples == "all" else min(around, s.boundary_samples)
     tables = 2.0 * graph * r.particles**2 * 8 if r.enabled else 0.0
-    parts = {
+    return {
         "images": (PIXEL * pixels, "smaller images, with their intrinsics"),
         "sampled pixels": (ROW * inside, "a lower energy.pixel_samples"),
         "boundary points": (
@@ -314,6 +319,3 @@ def check_fits(problem: Problem, pair: Pair) -> None:
             "a lower refine.particles, segmentation.superpixels or segmentation.neighbours",
         ),
     }
-    total, (_, hint) = sum(size for size, _ in parts.values()), max(parts.values())
-    shares = ", ".join(f"{name} {size / 1e9:.3g} GB" for name, (size, _) in parts.items())
-    require_memory(total, "this problem", shares, hint)

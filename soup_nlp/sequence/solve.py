@@ -11,6 +11,7 @@ from typing import Unpack
 
 import numpy as np
 
+from soup_nlp.config.identity import identity
 from soup_nlp.config.problem import Problem, make_problem, title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import DataWarning
@@ -246,15 +247,18 @@ def solve_pairs(
 
 
 def _named_pairs(frames: Frames, options: Options) -> dict[str, Raw]:
-    """What identifies each pair, by the name of its folder."""
+    """What identifies each pair, by the name of its folder: options, contents of its files."""
     out = {}
     for k in range(len(frames) - 1):
         raw = {"name": pair_folder(Path(), k).name, **frames.problem(k, options.keys)}
         problem = plain({key: value for key, value in raw.items() if key != "base"})
+        solved = {**raw, "base": str(Path.cwd())}
+        contents = identity(make_problem(solved, options.overrides, where="sequence"))
         out[raw["name"]] = {
             "key": raw["name"],
             "problem": problem,
             "overrides": [*options.overrides],
+            "identity": contents,
         }
     return out
 

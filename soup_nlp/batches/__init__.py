@@ -1,0 +1,1 @@
+"""Many pairs: a table and a folder of results."""

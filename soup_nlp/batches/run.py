@@ -1,0 +1,244 @@
+"""A batch: every pair solved into a folder of its own, a row of a table as soon as it ends."""
+
+import csv
+import io
+import os
+import socket
+import threading
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from soup_nlp.batches.page import page
+from soup_nlp.batches.sources import Source, problems_of
+from soup_nlp.config.identity import identity
+from soup_nlp.config.problem import Problem
+from soup_nlp.errors import DataError, SoupError
+from soup_nlp.pipeline.case import solve_bytes
+from soup_nlp.report.folder import run
+from soup_nlp.report.verdict import exit_code
+from soup_nlp.storage.each import Row, each, failure
+from soup_nlp.storage.files import as_path, write_text
+from soup_nlp.storage.folders import claim, staged
+from soup_nlp.storage.rows import Say, append_row, failed, read_rows, reason
+from soup_nlp.storage.versions import code_version
+
+FILES = ("table.csv", "index.html")
+ROWS = "pairs.jsonl"
+"""Every row that was ever made; the last good one of a pair counts."""
+COLUMNS = (
+    *("pair", "exit_code", "reason", "mre", "constant", "guess", "seconds", "cpu_seconds"),
+    *("peak_bytes", "superpixels", "seed", "code", "identity"),
+)
+"""Columns of table.csv; seconds are wall seconds, guess is the share of the image."""
+BEAT, STALE = 10.0, 120.0
+"""Seconds between the signs of life of a run, and without one after which its pairs are free."""
+PAUSE = 1.0
+"""Seconds between looks at pairs that another run solves."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The rows of a batch, in the order of the pairs, and its folder."""
+
+    rows: list[Row]
+    folder: Path
+
+    @property
+    def good(self) -> bool:
+        """Whether every pair was solved, whatever its exit code."""
+        return not any(failed(row) for row in self.rows)
+
+    def __repr__(self) -> str:
+        bad = sum(failed(row) for row in self.rows)
+        return f"Batch({len(self.rows)} pairs, {bad} failed, {self.folder})"
+
+
+def batch(
+    pairs: Source,
+    out: str | Path,
+    *,
+    overrides: Sequence[str] = (),
+    workers: int = 1,
+    cluster: str | None = None,
+    retry_failed: bool = False,
+    overwrite: bool = False,
+    say: Say | None = None,
+) -> Batch:
+    """Solve many pairs, each in a process of its own, into `out/pairs/NAME`.
+
+    `table.csv` and `index.html` are written after every pair. A later call keeps the pairs whose
+    inputs (by content), options and code are the same; two calls with one folder, also on machines
+    that share it, do not solve a pair twice.
+
+    Args:
+        pairs: See `Source`.
+        out: Folder of the batch.
+        overrides: Keys of every problem, such as `["segmentation.superpixels=500"]`.
+        workers: Processes of this machine; fewer run where their memory would not suffice.
+        cluster: Address of the scheduler of a Dask cluster instead, tcp://HOST:PORT.
+        retry_failed: Also solve pairs again that failed with the same input.
+        overwrite: Overwrite files of your own.
+        say: Called with (done, total, row) after every pair.
+
+    Raises:
+        ConfigError: a key is wrong, or Dask is not installed.
+        DataError: there is no pair, or the folder cannot be written.
+    """
+    folder = as_path(out, "output folder")
+    problems = problems_of(pairs, overrides)
+    claim(folder, FILES, overwrite, journal=ROWS)
+    rows: dict[str, Row] = {}
+    heads, needs = {}, 0.0
+    for name, problem in problems.items():
+        heads[name] = head = {"key": name, "pair": name, "seed": problem.seed}
+        try:
+            head |= {"identity": identity(problem), "code": code_version()}
+            parts = solve_bytes(problem, problem.load_pair())
+            needs = max(needs, sum(size for size, _ in parts.values()))
+        except SoupError as error:
+            rows[name] = {**head, **failure(f"{type(error).__name__}: {error}")}
+    left = [name for name in problems if name not in rows]
+    free = psutil.virtual_memory().available
+    workers = max(1, min(workers, int(free / max(needs, 1.0))))
+    token = f"{socket.gethostname()} {os.getpid()} {time.time_ns()}"
+
+    def tell(tries: int = 20) -> None:
+        known = [rows[name] for name in problems if name in rows]
+        try:
+            with staged(folder, overwrite=overwrite) as new:
+                write_text(new / FILES[0], table(known))
+                write_text(new / FILES[1], page(known, len(problems)))
+        except DataError:
+            # another run may write its own at the same time
+            if not tries:
+                raise
+            time.sleep(PAUSE / 10)
+            tell(tries - 1)
+
+    with _alive(folder / "pairs", left, token):
+        while left:
+            rows |= _stored(folder, [heads[name] for name in left], retry_failed)
+            todo = [name for name in left if name not in rows]
+            works = {
+                name: partial(_solve, problems[name], folder.absolute() / "pairs" / name, token)
+                for name in todo
+            }
+            tell()
+            left = []
+            for name, result in each(works, workers, cluster=cluster, fresh=True):
+                if result.get("claimed"):
+                    left.append(name)
+                    continue
+                rows[name] = {**heads[name], **result}
+                append_row(folder / ROWS, rows[name])
+                tell()
+                if say:
+                    say(len(rows), len(problems), rows[name])
+            # a failed pair is not tried again by the same call
+            retry_failed = False
+            time.sleep(PAUSE * bool(left))
+    tell()
+    return Batch([rows[name] for name in problems], folder)
+
+
+def _stored(folder: Path, heads: Sequence[Row], retry_failed: bool) -> dict[str, Row]:
+    """Rows of an earlier or another run that have the same input and code, by name."""
+    out: dict[str, Row] = {}
+    wanted = {head["key"]: head for head in heads}
+    for row in read_rows(folder / ROWS):
+        head = wanted.get(str(row.get("key")))
+        if head is None or any(row.get(k) != head.get(k) for k in ("identity", "code")):
+            continue
+        gone = not failed(row) and not (folder / "pairs" / head["key"] / "result.h5").is_file()
+        if not gone and not (failed(row) and (retry_failed or head["key"] in out)):
+            out[head["key"]] = row
+    return out
+
+
+def _solve(problem: Problem, folder: Path, token: str) -> Row:
+    """Solve a pair into its folder, unless another run does: then the row says "claimed"."""
+    mark = folder.with_name(f"{folder.name}.claim")
+    if not _claimed(mark, token):
+        return {"claimed": True}
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            solved = run(problem)
+            solved.save(folder)
+    finally:
+        mark.unlink(missing_ok=True)
+    code, why = exit_code(solved, problem.expected.mre_at_most)
+    scores = {name: m.mre for name, m in solved.metrics.items()}
+    return {
+        "exit_code": code,
+        "reason": why,
+        "mre": scores.get("solution"),
+        "constant": scores.get("constant"),
+        "guess": solved.confidence.guessed,
+        "superpixels": len(solved),
+        "warnings": [str(w.message) for w in caught],
+    }
+
+
+def _claimed(mark: Path, token: str) -> bool:
+    """Whether the run of a token now has a pair; one that gives no sign of life loses it."""
+    mark.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(OSError):
+        host, process, _ = mark.read_text().split()
+        dead = host == socket.gethostname() and not psutil.pid_exists(int(process))
+        if dead or time.time() - mark.stat().st_mtime > STALE:
+            mark.unlink()
+    try:
+        with mark.open("x") as file:
+            file.write(token)
+    except FileExistsError:
+        return mark.read_text() == token
+    return True
+
+
+@contextmanager
+def _alive(folder: Path, names: Sequence[str], token: str) -> Iterator[None]:
+    """Context in which the marks of a run show that it lives; its last ones are removed."""
+    stop = threading.Event()
+
+    def marks() -> Iterator[Path]:
+        for name in names:
+            with suppress(OSError):
+                mark = folder / f"{name}.claim"
+                if mark.read_text() == token:
+                    yield mark
+
+    def beat() -> None:
+        while not stop.wait(BEAT):
+            for mark in marks():
+                with suppress(OSError):
+                    os.utime(mark)
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+        for mark in marks():
+            mark.unlink(missing_ok=True)
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """table.csv of rows; a failed pair has exit code 2 and its reason."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        bad = {"exit_code": 2, "reason": reason(row)} if failed(row) else {}
+        writer.writerow({**row, **bad})
+    return text.getvalue()

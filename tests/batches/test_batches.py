@@ -1,0 +1,293 @@
+"""Many pairs: their sources, table, page, resumption, two runs in one folder, a cluster."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import soup_nlp
+from soup_nlp.batches.page import interval, page
+from soup_nlp.batches.run import _claimed, batch, table
+from soup_nlp.batches.sources import problems_of
+from soup_nlp.cli.main import main
+from soup_nlp.config.identity import identity
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.storage.rows import read_rows
+
+TINY = [
+    "segmentation.superpixels=12",
+    "segmentation.neighbours=4",
+    "energy.pixel_samples=4",
+    "refine.enabled=false",
+    "output.page=false",
+]
+
+
+def write_folder(folder: Path, scene: str, seed: int = 0) -> None:
+    pair = render_scene(scene, seed, 96, 64)
+    folder.mkdir(parents=True)
+    for name, image in (("frame_0", pair.image_ref), ("frame_1", pair.image_next)):
+        cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
+    np.savetxt(folder / "K.txt", pair.K_ref)
+    np.save(folder / "depth.npy", pair.truth.depth_ref)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory) -> Path:
+    """A folder of three pairs, one of which is damaged."""
+    root = tmp_path_factory.mktemp("pairs")
+    for k, scene in enumerate(("orbit", "street")):
+        write_folder(root / f"{k}_{scene}", scene)
+    (root / "2_bad").mkdir()
+    for name in ("frame_0.png", "frame_1.png", "K.txt"):
+        (root / "2_bad" / name).write_text("not an image")
+    return root
+
+
+# --- sources -------------------------------------------------------------------------------------
+
+
+def test_a_folder_a_pattern_and_a_list_name_the_same_pairs(pairs):
+    names = ["0_orbit", "1_street", "2_bad"]
+    assert list(problems_of(pairs)) == names
+    assert list(problems_of(f"{pairs}/[01]*")) == names[:2]
+    listed = problems_of([pairs / "0_orbit", str(pairs / "0_orbit")], ["seed=7"])
+    # a second pair of a name has a folder of its own
+    assert [(k, p.name, p.seed) for k, p in listed.items()] == [
+        ("0_orbit", "0_orbit", 7), ("0_orbit-2", "0_orbit-2", 7),
+    ]  # fmt: skip
+    raw = {"input": {"kind": "scene", "scene": "street"}}
+    assert list(problems_of([raw, make_problem({**raw, "name": "other"})]))[1] == "other"
+    for wrong, error in ((pairs / "0_orbit" / "nothing*", DataError), ([{}], ConfigError)):
+        with pytest.raises(error):
+            problems_of(wrong)
+
+
+def test_a_table_has_keys_of_the_problem_as_columns(pairs, tmp_path):
+    rows = [
+        "name,ref,next,intrinsics,segmentation.superpixels,depth_prior.kind",
+        f"first,{pairs}/0_orbit/frame_0.png,{pairs}/0_orbit/frame_1.png,{pairs}/0_orbit/K.txt,30,",
+        f",{pairs}/1_street/frame_0.png,{pairs}/1_street/frame_1.png,,,",
+    ]
+    path = tmp_path / "pairs.csv"
+    path.write_text("\n".join(rows) + "\n")
+    first, second = problems_of(path, ["segmentation.neighbours=5"]).values()
+    assert (first.name, first.segmentation.superpixels, first.segmentation.neighbours) == (
+        "first", 30, 5,
+    )  # fmt: skip
+    assert second.name == "1_street-frame_0"
+    assert second.segmentation.superpixels != 30
+    assert first.load_pair().size == (64, 96)
+    for text, said in (
+        ("a,b\n1,2\n", "no pairs"),
+        ("ref,next\n1.png\n", "names no pair"),
+        ("ref,next\n1.png,2.png,3\n", "more cells"),
+    ):
+        path.write_text(text)
+        with pytest.raises(DataError, match=said):
+            problems_of(path)
+
+
+def test_a_data_set_has_every_pair_whose_frames_are_there(tmp_path):
+    folder = tmp_path / "training" / "image_2"
+    folder.mkdir(parents=True)
+    for name in ("000001_10", "000001_11", "000004_10"):
+        (folder / f"{name}.png").touch()
+    (problem,) = problems_of(f"kitti2015:{tmp_path}").values()
+    assert (problem.name, problem.input.index) == ("000001", "000001")
+
+
+# --- identity ------------------------------------------------------------------------------------
+
+
+def test_the_same_input_has_the_same_contents(pairs, tmp_path):
+    place = tmp_path / "moved"
+    shutil.copytree(pairs / "0_orbit", place)
+
+    def named(folder: Path, **keys: object) -> str:
+        (problem,) = problems_of(
+            [{"input": {"kind": "folder", "path": str(folder)}, **keys}]
+        ).values()
+        return identity(problem)
+
+    before = named(place)
+    assert before == named(pairs / "0_orbit", name="other")
+    assert before != named(place, seed=3)
+    # other bytes under the same name
+    shutil.copy(place / "frame_0.png", place / "frame_1.png")
+    assert named(place) != before
+
+    def files(**keys: object) -> str:
+        names = {"ref": "frame_0.png", "next": "frame_1.png", "intrinsics": "K.txt"}
+        raw = {"input": {"kind": "files", **names}, "base": str(place), **keys}
+        return identity(make_problem(raw))
+
+    np.save(place / "flow.npy", np.zeros((64, 96, 2)))
+    flow = {"flow": {"source": "flow.npy"}}
+    first, with_flow = files(), files(**flow)
+    assert first != with_flow
+    np.save(place / "flow.npy", np.ones((64, 96, 2)))
+    assert files(**flow) != with_flow
+    assert files() == first
+    np.savetxt(place / "K.txt", 1.1 * np.loadtxt(place / "K.txt"))
+    assert files() != first
+    (place / "K.txt").unlink()
+    with pytest.raises(DataError, match=r"K\.txt"):
+        files()
+
+
+# --- the batch -----------------------------------------------------------------------------------
+
+
+def rows_of(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "table.csv").open() as file:
+        return {row["pair"]: row for row in csv.DictReader(file)}
+
+
+@pytest.mark.slow
+def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys):
+    root, out = tmp_path / "in", tmp_path / "out"
+    shutil.copytree(pairs, root)
+    words = ["batch", str(root), "-o", str(out), "--workers", "2"]
+    words += [word for key in TINY for word in ("--set", key)]
+    assert main(words) == 1
+    rows = rows_of(out)
+    assert [row["exit_code"] for row in rows.values()][2] == "2"
+    assert "image" in rows["2_bad"]["reason"]
+    assert 0 < float(rows["0_orbit"]["mre"]) < float(rows["0_orbit"]["constant"])
+    result = soup_nlp.load(out / "pairs" / "0_orbit")
+    assert result.summary["metrics"]["solution"]["mre"] == float(rows["0_orbit"]["mre"])
+    text = (out / "index.html").read_text()
+    assert 'href="pairs/0_orbit/report.html"' in text
+    assert "3 of 3 pairs, 1 failed; MRE mean" in text
+    assert "3 of 3 pairs, 1 failed" in capsys.readouterr().out
+    # what is finished is kept; what was replaced under its name, or repaired, is solved
+    solved = len(read_rows(out / "pairs.jsonl"))
+    assert main(words) == 1
+    assert len(read_rows(out / "pairs.jsonl")) == solved == 2
+    for name in ("frame_0.png", "frame_1.png", "K.txt"):
+        shutil.copy(root / "0_orbit" / name, root / "2_bad" / name)
+    shutil.copy(root / "1_street" / "frame_0.png", root / "1_street" / "frame_1.png")
+    main(words)
+    new = [row["key"] for row in read_rows(out / "pairs.jsonl")[solved:]]
+    assert sorted(new) == ["1_street", "2_bad"]
+    assert rows_of(out)["0_orbit"] == rows["0_orbit"]
+
+
+def command(pairs: Path, out: Path) -> list[str]:
+    words = [sys.executable, "-m", "soup_nlp", "batch", str(pairs), "-o", str(out), "-q"]
+    return words + [word for key in TINY for word in ("--set", key)]
+
+
+@pytest.fixture(scope="module")
+def four(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("four")
+    for k in range(4):
+        write_folder(root / f"orbit_{k}", "orbit", k)
+    return root
+
+
+@pytest.mark.slow
+def test_two_runs_in_one_folder_solve_no_pair_twice(four, tmp_path):
+    runs = [subprocess.Popen(command(four, tmp_path / "out")) for _ in range(2)]
+    assert [run.wait() for run in runs] == [0, 0]
+    rows = read_rows(tmp_path / "out" / "pairs.jsonl")
+    assert sorted(row["key"] for row in rows) == [f"orbit_{k}" for k in range(4)]
+    assert not list((tmp_path / "out" / "pairs").glob("*.claim"))
+    assert len(rows_of(tmp_path / "out")) == 4
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on(four, tmp_path):
+    out = tmp_path / "out"
+    run = subprocess.Popen(command(four, out))
+    while len(read_rows(out / "pairs.jsonl")) < 1:
+        time.sleep(0.05)
+    run.kill()
+    run.wait()
+    kept = read_rows(out / "pairs.jsonl")
+    done = batch(four, out, overrides=TINY)
+    assert done.good
+    assert len(done.rows) == 4
+    rows = read_rows(out / "pairs.jsonl")
+    assert rows[: len(kept)] == kept
+    assert sorted(row["key"] for row in rows) == [f"orbit_{k}" for k in range(4)]
+
+
+def test_a_pair_of_a_run_that_lives_is_not_taken(tmp_path):
+    mark = tmp_path / "pairs" / "a.claim"
+    assert _claimed(mark, f"elsewhere {os.getpid()} 1")
+    assert not _claimed(mark, "here 1 2")
+    # without a sign of life, or if its process ended on this machine, it is free
+    os.utime(mark, (0, 0))
+    assert _claimed(mark, "here 1 2")
+    mark.write_text(f"{os.uname().nodename} 4194305 1")
+    assert _claimed(mark, "here 1 2")
+
+
+def test_a_table_and_a_page_of_rows():
+    good = {"pair": "a", "exit_code": 0, "reason": "solved", "mre": 0.1, "peak_bytes": 2**21}
+    bad = {"pair": "<b>", "ok": False, "error": "DataError: damaged\n  where: x.png"}
+    assert "a,0,solved,0.1," in table([good, bad])
+    assert '<b>,2,"DataError: damaged, where: x.png"' in table([good, bad])
+    text = page([good, bad], 3)
+    assert "2 of 3 pairs, 1 failed; MRE mean 0.1000 (0.1000 to 0.1000)" in text
+    assert "&lt;b&gt;" in text
+    assert "<b>" not in text
+    mean, low, high = interval(np.arange(100.0), np.mean)
+    assert low < mean == 49.5 < high
+    # 1.96 standard errors
+    assert (high - low) / 2 == pytest.approx(1.96 * np.arange(100).std() / 10, rel=0.1)
+
+
+# --- a cluster -----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_cluster_of_two_workers_survives_the_loss_of_one(four, tmp_path):
+    pytest.importorskip("distributed")
+    place = tmp_path / "scheduler.json"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    cli = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1"]
+    cli += ["--port", "0", "--no-dashboard", "--scheduler-file", str(place)]
+    started = [subprocess.Popen(cli, cwd=tmp_path, **quiet)]
+    try:
+        while not place.is_file() or not place.stat().st_size:
+            time.sleep(0.1)
+        address = json.loads(place.read_text())["address"]
+        for k in range(2):
+            worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--no-nanny"]
+            worker += [
+                "--nthreads",
+                "1",
+                "--no-dashboard",
+                "--local-directory",
+                str(tmp_path / f"{k}"),
+            ]
+            started.append(subprocess.Popen(worker, cwd=tmp_path, **quiet))
+        killed = []
+
+        def kill_one(done: int, total: int, row: dict) -> None:
+            if not killed:
+                killed.append(started[1].pid)
+                os.kill(started[1].pid, signal.SIGKILL)
+
+        done = batch(four, tmp_path / "out", overrides=TINY, cluster=address, say=kill_one)
+        assert done.good
+        assert len(killed) == 1
+        assert len(rows_of(tmp_path / "out")) == 4
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
