@@ -3,7 +3,7 @@
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import pandas as pd
 import typer
@@ -118,8 +118,6 @@ def speed(
     superpixels: Annotated[str, typer.Option(help="N.")] = "250,500,1000,2000",
     neighbours: Annotated[str, typer.Option(help="K of the K-NN graph.")] = "15",
     seeds: str = "0",
-    pairs: Annotated[str, typer.Option(help="Words of names of pairs of suite shared.")] = "",
-    data: Data = None,
     widths: Annotated[str, typer.Option(help="Columns of rendered scenes.")] = "1024",
     overrides: Set = None,
     out: Out = Path("out/bench/speed"),
@@ -129,10 +127,9 @@ def speed(
 
     The refinement is left out; --set refine.enabled=true measures whole solves.
     """
-    chosen = listed(scenes), numbers(seeds), numbers(widths), listed(pairs), data
-    items = speeds.timed_pairs(*chosen)
-    n, k = numbers(superpixels), numbers(neighbours)
-    cells, page = speeds.speed_cells(items, n, k, overrides or []), out / f"{name}.md"
+    items = speeds.timed_pairs(listed(scenes), numbers(seeds), numbers(widths))
+    sizes = numbers(superpixels), numbers(neighbours)
+    cells, page = speeds.speed_cells(items, *sizes, overrides or []), out / f"{name}.md"
     frame = measure(cells, speeds.measure_speed, page.with_suffix(".jsonl"), fresh=True)
     return finish(page, frame, speeds.speed_page(frame))
 
@@ -154,19 +151,15 @@ def chain(
 # --- problems for solvers -------------------------------------------------------------------------
 
 
-def _joined(values: tuple[Any, ...]) -> str:
-    return ",".join(map(str, values))
-
-
 @app.command()
 def family(
     out: Annotated[Path, typer.Argument(help="Folder of the set, new or of an earlier one.")],
-    sizes: Annotated[str, typer.Option(help=f"Superpixels, of {_joined(SIZES)}.")] = "100,250",
-    scenes: str = _joined(SCENES),
+    sizes: Annotated[str, typer.Option(help=f"Superpixels, of {SIZES}.")] = "100,250",
+    scenes: str = ",".join(SCENES),
     formulation: Annotated[Words, typer.Option(help="gauge/norm or tangent/norm.")] = None,
     starts: Annotated[
         str, typer.Option(help="easy (presolved), hard (initialisation), cold (constant depth).")
-    ] = _joined(STARTS),
+    ] = ",".join(STARTS),
 ) -> int:
     """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
     chosen = select(numbers(sizes), listed(scenes), formulation or [""], listed(starts))

@@ -4,13 +4,14 @@ import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from itertools import product
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from benchmarks.scores import has_depth
-from benchmarks.suites import MOTORCYCLE, RENDERED, Options, list_suite, spread
+from benchmarks.suites import MOTORCYCLE, Options, list_suite, spread
 from benchmarks.table import (
     Cell,
     Item,
@@ -21,8 +22,8 @@ from benchmarks.table import (
     page_text,
     provenance,
 )
-from soup_nlp import SoupError
-from soup_nlp.config.presets import overrides_of
+from soup_nlp import SoupError, make_problem
+from soup_nlp.config.presets import as_override, overrides_of
 
 SOURCE = "Superpixel Soup (Kumar, Dai, Li, TPAMI), table of the performance comparison"
 METHODS: Mapping[str, Overrides] = {"preset: paper": ("preset=paper",), "defaults": ()}
@@ -35,7 +36,7 @@ DATASETS: Mapping[str, tuple[str, ...]] = {
 }
 """Suites of the paper's datasets. Without data of a suite, the families of these names in the suite
 `shared` are taken."""
-STUDIED = ("street", "room", MOTORCYCLE.name, "KITTI", "kinect_paper")
+STUDIED = ("street", "room", MOTORCYCLE.name, "kitti2012", "kinect_paper")
 """Families whose first pairs all studies have."""
 FURTHER = ("banner", "tum_fr1", "kitti_tracking", "rgbd")
 """Families whose first pairs the departures have as well."""
@@ -105,49 +106,43 @@ STUDIES: Mapping[str, tuple[str, Mapping[str, Overrides]]] = {
         "SLIC against a regular grid (published for one frame: slic 0.0912, grid 0.1442)",
         over("segmentation.method", ("slic", "grid")),
     ),
-    "flow": (
-        "Flow: the truth, the truth with noise of 0.1 to 2 pixels, DIS (rendered scenes)",
-        over("flow.source", ["truth", *(f"truth+noise:{p}" for p in (0.1, 0.5, 1, 2)), "dis"]),
-    ),
     "stages": (
         "NLP and refinement, alone and together",
         {"NLP": ("refine.enabled=false",), "refinement": ("refine.from_start=true",), "both": ()},
     ),
 }
 """Title and overrides by variant of the studies, which are measured on the same pairs."""
-
-DEPARTURES: Mapping[str, tuple[str, ...]] = {
-    "start: shared motions, scales by contact": (
-        *("start.method", "start.samples", "start.threshold_px", "start.ground"),
-    ),
-    "pixel units and their weights, truncation of E_arap": (
+LENGTHS = ("energy.weights.arap", "energy.weights.cont")
+"""Weights of the preset that are proportional to 1 / N, since `sum lam = 1`."""
+JOINT = (
+    ("start.method", "start.samples", "start.threshold_px", "start.ground"),
+    (
         *("energy.units", "energy.weights.arap", "energy.weights.proj", "energy.weights.cont"),
         *("energy.weights.orient", "energy.weights.sigma_cont", "energy.weights.sigma_arap"),
-        *("energy.weights.leak_arap",),
+        "energy.weights.leak_arap",
     ),
-    "E_arap and E_prior weak across components": ("energy.arap_across",),
-    "E_arap joins the scene": ("energy.arap_scene",),
-    "E_cont weak at occlusions": ("energy.cont_occluded",),
-    "another energy where surfaces bend": ("start.bending",),
-    "prior on relief": ("energy.weights.prior",),
-    "order by occlusion": ("energy.weights.order",),
-    "borders that follow the flow": ("segmentation.follow_flow_px",),
-    "confidence of the flow": ("flow.consistency",),
-    "flow seen through reflections": ("flow.see_through",),
-    "gauge: d constant": ("formulation.gauge",),
-    "visibility": ("formulation.min_facing", "formulation.depth_ratio"),
-    "proposals beyond walks, depths within reach": ("refine.proposals",),
-    "rounds end early": ("refine.rounds", "refine.stagnation"),
-    "images in the refinement": ("refine.photo",),
-}
-"""Options in which the defaults depart from the paper, by departure. A departure is undone by the
-preset's values of its options; what no longer is an option is passed over."""
+    ("formulation.min_facing", "formulation.depth_ratio"),
+    ("refine.rounds", "refine.stagnation"),
+)
+"""Options that are undone together."""
+NO_EFFECT = {"max_size", "energy.weights.depth"}
+"""Options without a departure here: for images of other sizes, for a depth prior."""
 
 
-def undone(departure: str) -> Overrides:
-    """Overrides of the defaults that undo a departure."""
-    keys = DEPARTURES[departure]
-    return tuple(o for o in overrides_of("paper") if o.partition("=")[0] in keys)
+def departures() -> dict[str, Overrides]:
+    """Overrides of the defaults that undo each departure from the paper, by its first option.
+
+    A departure is an option, or several of `JOINT`, in which defaults and preset differ.
+    """
+    defaults = make_problem({"input": {"kind": "motorcycle"}})
+    out: dict[str, Overrides] = {}
+    for override in overrides_of("paper"):
+        key, _, value = override.partition("=")
+        own = attrgetter(key)(defaults)
+        if as_override(key, own).partition("=")[2] != value and key not in NO_EFFECT:
+            group = next((keys[0] for keys in JOINT if key in keys), key)
+            out[group] = (*out.get(group, ()), override)
+    return out
 
 
 # --- cells ----------------------------------------------------------------------------------------
@@ -173,117 +168,90 @@ def make_plan(
         A line for each cell of each section: section ("comparison", a study, or "departures"),
         method, change (variant), dataset (of the comparison), name of the pair, cell and its key.
     """
-    datasets = {name: _dataset(name, data, limit) for name in DATASETS}
-    studied = _families(STUDIED, datasets, data)
-    rendered = [item for item in studied if item.suite == "rendered"]
-    compared = [(name, item) for name, items in datasets.items() for item in items]
-    known = {item.key for _, item in compared}
-    compared += [("", item) for item in studied if item.key not in known]
+    pairs = _with_truth(data)
     lines = []
 
-    def add(section: str, item: Item, method: str, n: int, change: str, *more: str) -> None:
-        changes = (*METHODS[method], *_scaled(method, n), f"segmentation.superpixels={n}")
-        all_overrides = (*changes, *overrides, *more)
-        cell = Cell(item, all_overrides, ", ".join(all_overrides))
-        lines.append((section, method, change, "", item.name, cell, cell.identity()["key"]))
-
-    for (dataset, item), method in product(compared, METHODS):
-        add("comparison", item, method, superpixels, "")
-        lines[-1] = (*lines[-1][:3], dataset, *lines[-1][4:])
-    for name, (_, variants) in STUDIES.items():
-        for item, method in product(rendered if name == "flow" else studied, METHODS):
-            for change, more in variants.items():
+    def add(section: str, item: Item, n: int, variants: Mapping[str, Overrides], *methods: str,
+            dataset: str = "") -> None:  # fmt: skip
+        for method, (change, more) in product(methods or METHODS, variants.items()):
+            if method != "defaults" and change == "+ prior":
                 # the paper has no prior
-                if not (method != "defaults" and change == "+ prior"):
-                    n = int(change) if name == "superpixels" else analysis
-                    add(name, item, method, n, change, *more)
-    for item in studied + _families(FURTHER, datasets, data):
-        for change in (BASE, *DEPARTURES):
-            more = undone(change) if change in DEPARTURES else ()
-            add("departures", item, "defaults", analysis, change, *more)
+                continue
+            size = int(change) if section == "superpixels" else n
+            head = (*METHODS[method], *_scaled(method, size), f"segmentation.superpixels={size}")
+            cell = Cell(item, (*head, *overrides, *more), ", ".join((*head, *overrides, *more)))
+            key = cell.identity()["key"]
+            lines.append((section, method, change, dataset, item.name, cell, key))
+
+    for dataset, suites in DATASETS.items():
+        listed = [i for i in pairs if i.suite in suites] or [i for i in pairs if i.family in suites]
+        count = len(listed) if limit is None else min(limit, len(listed))
+        for k in spread(len(listed), count) if listed else ():
+            add("comparison", listed[k], superpixels, {"": ()}, dataset=dataset)
+    firsts = {item.family: item for item in reversed(pairs)}
+    for family in (*STUDIED, *FURTHER):
+        if family in firsts:
+            item, changes = firsts[family], {BASE: (), **departures()}
+            add("departures", item, analysis, changes, "defaults")
+            for name, (_, variants) in STUDIES.items() if family in STUDIED else ():
+                add(name, item, analysis, variants)
     columns = ["section", "method", "change", "dataset", "name", "cell", "key"]
     return pd.DataFrame(lines, columns=columns)
 
 
 def _scaled(method: str, n: int) -> Overrides:
-    """The preset's weights of lengths, which are given for 1,000 superpixels, scaled to n.
-
-    Since `sum lam = 1`, every length is proportional to 1 / n.
-    """
-    lengths = [o.partition("=") for o in overrides_of("paper") if o.partition("=")[0] in LENGTHS]
-    return tuple(f"{k}={float(v) * n / 1000:g}" for k, _, v in lengths if method != "defaults")
+    """The preset's weights of `LENGTHS`, which are given for 1,000 superpixels, for n."""
+    pairs = [o.partition("=") for o in overrides_of("paper") if method != "defaults"]
+    return tuple(f"{k}={float(v) * n / 1000:g}" for k, _, v in pairs if k in LENGTHS)
 
 
-LENGTHS = ("energy.weights.arap", "energy.weights.cont")
-
-
-def _families(
-    names: tuple[str, ...], datasets: Mapping[str, list[Item]], data: Path | None
-) -> list[Item]:
-    """The first pair of each family that has one; rendered ones and motorcycle need no data."""
-    out: list[Item] = []
-    for name in names:
-        if name in RENDERED:
-            out += list_suite("rendered", None, Options(("dis",), only=(name,)))
-        elif name == MOTORCYCLE.name:
-            out.append(MOTORCYCLE)
-        elif name in datasets:
-            out += datasets[name][:1]
-        else:
-            out += _with_truth("shared", data, (name,))[:1]
-    return out
-
-
-def _dataset(name: str, data: Path | None, limit: int | None) -> list[Item]:
-    """At most `limit` pairs of a dataset that have a truth, evenly spaced."""
-    suites = DATASETS[name]
-    listed = [i for suite in suites for i in _with_truth(suite, data)]
-    listed = listed or _with_truth("shared", data, suites)
-    if limit is not None and listed:
-        listed = [listed[k] for k in spread(len(listed), limit)]
-    return listed
-
-
-def _with_truth(suite: str, data: Path | None, families: tuple[str, ...] = ()) -> list[Item]:
-    """The pairs of a suite, or of some of its families, that have a depth to compare with."""
-    try:
-        items = [] if data is None else list_suite(suite, data, Options(("dis",)))
-    except SoupError:
-        return []
-    out = []
-    for item in items:
+def _with_truth(data: Path | None) -> list[Item]:
+    """Rendered pairs, the motorcycle, and pairs of the folder with a depth to compare with."""
+    out = [*list_suite("rendered", None, Options(("dis",))), MOTORCYCLE]
+    for suite in (*(name for suites in DATASETS.values() for name in suites), "shared"):
         with suppress(SoupError):
-            wanted = not families or item.family in families
-            if wanted and has_depth(item.problem().load_pair().truth):
-                out.append(item)
-    return out
+            out += [] if data is None else list_suite(suite, data, Options(("dis",)))
+    kept = []
+    for item in out:
+        with suppress(SoupError):
+            if item.suite == "rendered" or has_depth(item.problem().load_pair().truth):
+                kept.append(item)
+    return kept
 
 
 # --- the page -------------------------------------------------------------------------------------
 
 
 def write_paper(page: Path, frame: pd.DataFrame, plan: pd.DataFrame, note: str) -> None:
-    """Write the page and its figures beside it; `note` gives the sizes of the rows."""
+    """Write the page; `note` gives the sizes of the rows."""
     rows = plan.join(frame.set_index("key").drop(columns="variant"), on="key")
     rows["mre"] = metric(rows)
-    of_section = dict(list(rows.groupby("section", sort=False)))
-    tables = {name: _tables(of_section[name]) for name in STUDIES if name in of_section}
-    studies = [f"## {STUDIES[name][0]}" for name in tables]
-    texts = [_study(head, tables[name]) for head, name in zip(studies, tables, strict=True)]
-    ablation = ["Published ablation, MRE:", markdown(ABLATION.rename_axis("sequence"))]
+    sections = dict(list(rows.groupby("section", sort=False)))
     measured = f"{int(frame['ok'].eq(True).sum())} of the {len(frame)} rows were measured."
-    blocks = [
-        *("# The paper, row by row", f"{provenance(frame)}; {os.cpu_count()} cores.", ABOUT),
-        *(f"{note} {measured}", *_comparison(of_section["comparison"]), *ablation),
-        *(block for text in texts for block in text),
-        *_departures(of_section["departures"]),
-    ]
-    page.write_text(page_text(blocks, frame), encoding="utf-8")
+    blocks = ["# The paper, row by row", f"{provenance(frame)}; {os.cpu_count()} cores."]
+    blocks += [ABOUT, f"{note} {measured}"]
+    if "comparison" in sections:
+        blocks += _comparison(sections["comparison"])
+    blocks += ["Published ablation, MRE:", markdown(ABLATION.rename_axis("sequence"))]
+    for name, (title, _) in STUDIES.items():
+        blocks.append(f"## {title}")
+        for method, group in sections[name].groupby("method", sort=False):
+            table = _pivot(group, "name", "change")
+            whole = table.dropna()
+            table.loc[f"mean of {len(whole)}"] = whole.mean()
+            blocks += [f"{method}, MRE:", markdown(table.rename_axis("pair"))]
+    page.write_text(page_text([*blocks, *_departures(sections["departures"])], frame), "utf-8")
+
+
+def _pivot(rows: pd.DataFrame, index: str, columns: str) -> pd.DataFrame:
+    """MRE by two columns, in the order of the rows."""
+    table = rows.pivot(index=index, columns=columns, values="mre").astype(float)
+    return table.reindex(index=rows[index].unique(), columns=rows[columns].unique())
 
 
 def _comparison(rows: pd.DataFrame) -> list[str]:
     """Tables by dataset and by pair."""
-    groups = rows[rows["dataset"] != ""].groupby(["dataset", "method"])["mre"].mean()
+    groups = rows.groupby(["dataset", "method"])["mre"].mean()
     table = PUBLISHED.add_suffix(" (published)").join(groups.unstack())
     constant = metric(rows, "constant").groupby(rows["dataset"]).mean()
     table["constant depth"] = constant.reindex(table.index)
@@ -301,28 +269,9 @@ def _comparison(rows: pd.DataFrame) -> list[str]:
     ]
 
 
-def _tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """MRE by pair and variant, for each method; the last line is the mean of complete lines."""
-    out = {}
-    for method, group in rows.groupby("method", sort=False):
-        table = group.pivot(index="name", columns="change", values="mre").astype(float)
-        table = table.reindex(group["name"].unique())[list(group["change"].unique())]
-        whole = table.dropna()
-        table.loc[f"mean of {len(whole)}"] = whole.mean()
-        out[str(method)] = table.rename_axis("pair")
-    return out
-
-
-def _study(head: str, tables: Mapping[str, pd.DataFrame]) -> list[str]:
-    texts = ((f"{method}, MRE:", markdown(table)) for method, table in tables.items())
-    return [head, *(block for text in texts for block in text)]
-
-
 def _departures(rows: pd.DataFrame) -> list[str]:
     """Table of the departures, each undone alone."""
-    table = rows.pivot(index="change", columns="name", values="mre").astype(float)
-    table = table.reindex(index=rows["change"].unique(), columns=rows["name"].unique())
-    table = table.dropna(axis=1, how="all")
+    table = _pivot(rows, "change", "name").dropna(axis=1, how="all")
     ratios = table / table.loc[BASE]
     table.insert(0, "mean", ratios.apply(geometric, axis=1))
     counts = zip((ratios > 1.01).sum(axis=1), (ratios < 0.99).sum(axis=1), strict=True)

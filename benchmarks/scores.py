@@ -1,6 +1,4 @@
-"""The row of a pair: errors of the solution and of baselines, of what is seen and what is not, of
-sigma, of what moves, of flow and scene flow.
-"""
+"""The row of a pair: errors of the solution and of baselines, of what is seen, moves, of sigma."""
 
 import math
 from collections.abc import Mapping
@@ -14,12 +12,10 @@ from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.evaluate.metrics import (
-    ERRORS,
     MEDIAN,
     UNSCALED,
     DepthMetrics,
     depth_metrics,
-    scene_flow_epe,
     skill,
 )
 from soup_nlp.evaluate.scoring import at_truth, coverage, fill_nearest, score_depths, sparsification
@@ -33,7 +29,7 @@ METHODS = (
 """Depth maps in the order of the tables: what is delivered, the NLP alone, the start, independent
 superpixels (each with a translation of length 1), the solution where one rigid motion has a depth,
 that motion triangulated, the same with holes filled from the nearest pixel, a constant depth."""
-KEPT_METRICS = (*ERRORS, "scale", "coverage", "n_pixels")
+KEPT_METRICS = ("mre", "median_relative", "delta1", "scale", "coverage")
 """Depth metrics that a row has beside the skill."""
 SEEN = 0.5
 """Mean confidence of the flow of a superpixel up to which its pixels count as not seen."""
@@ -84,9 +80,7 @@ def scores(result: Run) -> Row:
         "good": result.solved,
         "stages": dict(result.seconds),
         "iterations": sum(stage.iterations for stage in solution.stages),
-        "bending_share": float(result.start.bends.mean()),
         "guess": result.confidence.guessed,
-        "flow_error": flow_error(result.pair),
     }
     if truth is None or not has_depth(truth):
         return {**row, "metrics": {}}
@@ -103,7 +97,6 @@ def scores(result: Run) -> Row:
         "metrics": metrics,
         "seen": split(truth, maps["solution"], seen(result), scale),
         "moving": moving(result.pair, maps["solution"]),
-        "scene_flow": _scene_flow(result, scale),
     }
 
 
@@ -217,26 +210,6 @@ def moving(pair: Pair, depth: Float) -> Row | None:
     scale = depth_metrics(depth, truth.depth_ref).scale
     errors = split(known, depth, part, scale) if has_depth(known) else {"mre": None, "rest": None}
     return None if errors["mre"] is None or errors["rest"] is None else errors
-
-
-def _scene_flow(result: Run, scale: float) -> dict[str, float | int] | None:
-    """3D end-point error with the depth's own scale; None without truth."""
-    truth = result.pair.truth
-    if truth is None or truth.scene_flow is None or not math.isfinite(scale):
-        return None
-    rec = result.reconstruction
-    return scene_flow_epe(rec.points_next - rec.points_ref, truth.scene_flow, scale=scale)
-
-
-def flow_error(pair: Pair) -> dict[str, float] | None:
-    """Mean and median end-point error of the flow, pixels; None without a true flow."""
-    if pair.flow is None or pair.truth is None or pair.truth.flow is None:
-        return None
-    used = np.isfinite(pair.truth.flow).all(axis=2) & (pair.flow.confidence > 0)
-    if not used.any():
-        return None
-    gap = np.linalg.norm(pair.flow.uv[used] - pair.truth.flow[used], axis=1)
-    return {"mean": float(gap.mean()), "median": float(np.median(gap))}
 
 
 def unorganised(soup: Soup) -> Soup:

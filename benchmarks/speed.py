@@ -52,16 +52,12 @@ def timed_pairs(
     scenes: Sequence[str],
     seeds: Sequence[int],
     widths: Sequence[int] = (1024,),
-    pairs: Sequence[str] = (),
-    data: Path | None = None,
 ) -> list[Item]:
-    """Rendered scenes and the motorcycle, then named pairs of the suite shared, with DIS flow."""
+    """Rendered scenes and the motorcycle, with DIS flow."""
     sizes = [Options(("dis",), width, tuple(seeds)) for width in widths]
     rendered = [i for size in sizes for i in list_suite("rendered", None, size)]
     items = [i for i in rendered if i.family in scenes]
-    items += [MOTORCYCLE] * (MOTORCYCLE.name in scenes)
-    named = list_suite("shared", data, Options(("dis",), only=tuple(pairs))) if pairs else []
-    return items + named
+    return items + [MOTORCYCLE] * (MOTORCYCLE.name in scenes)
 
 
 def speed_cells(
@@ -84,15 +80,7 @@ def speed_cells(
 
 
 def measure_speed(cell: Cell) -> Row:
-    """The scores of a run, and the cost of every stage.
-
-    Returns:
-        Entries of `scores.scores`; "cpu" has seconds by stage, "stages" the wall seconds; further
-        numbers by the names of the solution.
-
-    Raises:
-        SoupError: the input cannot be used.
-    """
+    """The scores of a run, and CPU and wall seconds of its stages."""
     cpu = {"": time.process_time()}
 
     def lap(stage: str) -> None:
@@ -133,20 +121,15 @@ def speed_page(frame: pd.DataFrame) -> str:
         runs.index = pd.MultiIndex.from_frame(good[list(RUN)].rename(columns=RUN))
         stages = {column: (column.removeprefix("cpu."), ".2f") for column in cpu}
         blocks += [titled(runs, COLUMNS), NOTE, "## CPU seconds by stage", titled(runs, stages)]
-    return page_text([*blocks, "## Machine", machine()], frame)
-
-
-def machine() -> str:
-    """Processor, memory, system and versions, as a list."""
-    lines = [f"- {os.cpu_count()} cores of {processor()}"]
-    lines.append(f"- {psutil.virtual_memory().total / 2**30:.0f} GB, {platform.platform()}")
-    return "\n".join([*lines, "- " + ", ".join(f"{k} {v}" for k, v in versions().items())])
+    memory = f"{psutil.virtual_memory().total / 2**30:.0f} GB"
+    facts = ", ".join(f"{k} {v}" for k, v in versions().items())
+    machine = f"{os.cpu_count()} cores of {processor()}, {memory}, {platform.platform()}; {facts}."
+    return page_text([*blocks, "## Machine", machine], frame)
 
 
 def processor() -> str:
     """Name of the processor."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(x.partition(":")[2].strip() for x in lines if x.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
+    names = (x.partition(":")[2].strip() for x in lines if x.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())

@@ -52,8 +52,6 @@ def spread(count: int, wanted: int, first: int = 0) -> list[int]:
     return [first + (2 * k + 1) * count // (2 * wanted) for k in range(wanted)]
 
 
-# --- pairs ----------------------------------------------------------------------------------------
-
 Items = Iterator[Item]
 
 
@@ -171,8 +169,6 @@ class Suite:
         name: Name on the command line.
         text: Description.
         pairs: Makes the pairs of a root folder.
-        flows: Default flow sources.
-        folders: Candidates for the root below --data; the first one with a pair is used.
         layout: Contents that the root must have; empty if no data is needed.
         source: Where to get the data.
     """
@@ -180,10 +176,13 @@ class Suite:
     name: str
     text: str
     pairs: Callable[[Path, Options], Iterable[Item]]
-    flows: tuple[str, ...] = ("dis",)
-    folders: tuple[str, ...] = (".",)
     layout: str = ""
     source: str = ""
+
+    @property
+    def flows(self) -> tuple[str, ...]:
+        """Default flow sources."""
+        return ("truth", "dis") if self.name in ("rendered", "shared") else ("dis",)
 
     def items(self, root: Path, o: Options) -> Items:
         """Every wanted pair with every flow, whether its files exist or not."""
@@ -196,89 +195,47 @@ class Suite:
                     yield replace(member, flow=flow)
 
 
+_SINTEL = (
+    "training/clean/SCENE/frame_NNNN.png, training/depth/SCENE/frame_NNNN.dpt,"
+    " training/camdata_left/SCENE/frame_NNNN.cam"
+)
+_VKITTI = (
+    "vkitti_1.3.1_rgb/WORLD/morning and _depthgt, _flowgt (version 1), or"
+    " SceneNN/morning/frames/rgb, depth, forwardFlow (version 2)"
+)
+_KINECT = (
+    "pair_NNN/ with frame_0.png, frame_1.png, K.txt and points.npz (uv_0 in pixels, xyz_mm_0) or"
+    " depth.png (16 bit, millimetres)"
+)
+_KITTI = "https://www.cvlibs.net/datasets/kitti/eval_{}.php".format
+_EPFL = "https://www.epfl.ch/labs/cvlab/data/data-dsr/"
+_SHARED = (
+    "kitti2012/, driving_synthetic/, kinect_paper/, sintel/, tum_fr1/, kitti2015/,"
+    f" kitti_tracking/, rgbd/, deepdeform/, {', '.join(SINGLE)}"
+)
+_OWN = "a folder with these pairs; the motorcycle pair comes with scikit-image"
+_2012 = "training/image_0, training/calib, training/disp_occ, training/flow_occ"
+_2015 = "training/image_2, training/calib_cam_to_cam, training/disp_occ_0"
+_MPI = "http://sintel.is.tue.mpg.de/downloads and its depth training data /depth"
+_NAVER = "https://europe.naverlabs.com/proxy-virtual-worlds/"
+_kitti12, _kitti15 = (
+    partial(_kitti, "kitti2012", "image_0", 194),
+    partial(_kitti, "kitti2015", "image_2", 200),
+)
+_rendered, _everyday = (
+    partial(_scenes, RENDERED, 1, 436 / 1024),
+    partial(_scenes, tuple(LAYOUTS), 5 / 8, 15 / 32),
+)
 _ALL = (
-    Suite(
-        "rendered",
-        f"{len(RENDERED)} rendered dynamic scenes",
-        partial(_scenes, RENDERED, 1, 436 / 1024),
-        ("truth", "dis"),
-    ),
-    Suite(
-        "everyday",
-        f"{len(LAYOUTS)} rendered scenes of everyday kinds, most with little or no parallax",
-        partial(_scenes, tuple(LAYOUTS), 5 / 8, 15 / 32),
-    ),
-    Suite(
-        "shared",
-        "the real pairs that development was done with",
-        _shared,
-        ("truth", "dis"),
-        folders=(".", "../shared/data"),
-        layout=(
-            "kitti2012/, driving_synthetic/, kinect_paper/, sintel/, tum_fr1/, kitti2015/,"
-            f" kitti_tracking/, rgbd/, deepdeform/, {', '.join(SINGLE)}"
-        ),
-        source="a folder with these pairs; the motorcycle pair comes with scikit-image",
-    ),
-    Suite(
-        "sintel",
-        "MPI Sintel, the paper's five sequences, 24 pairs each",
-        _sintel,
-        folders=(".", "sintel", "MPI-Sintel-complete"),
-        layout=(
-            "training/clean/SCENE/frame_NNNN.png, training/depth/SCENE/frame_NNNN.dpt,"
-            " training/camdata_left/SCENE/frame_NNNN.cam"
-        ),
-        source="http://sintel.is.tue.mpg.de/downloads and its depth training data /depth",
-    ),
-    Suite(
-        "kitti2012",
-        "KITTI stereo and flow 2012, 194 training pairs",
-        partial(_kitti, "kitti2012", "image_0", 194),
-        folders=(".", "kitti2012", "data_stereo_flow"),
-        layout="training/image_0, training/calib, training/disp_occ, training/flow_occ",
-        source="https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php (data_stereo_flow.zip)",
-    ),
-    Suite(
-        "kitti2015",
-        "KITTI scene flow 2015, 200 training pairs",
-        partial(_kitti, "kitti2015", "image_2", 200),
-        folders=(".", "kitti2015", "data_scene_flow"),
-        layout="training/image_2, training/calib_cam_to_cam, training/disp_occ_0",
-        source=(
-            "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php (data_scene_flow.zip and"
-            " data_scene_flow_calib.zip)"
-        ),
-    ),
-    Suite(
-        "vkitti",
-        "Virtual KITTI 1 or 2, the paper's four worlds, 30 morning pairs each",
-        _vkitti,
-        folders=(".", "vkitti", "vkitti1", "vkitti2"),
-        layout=(
-            "vkitti_1.3.1_rgb/WORLD/morning and _depthgt, _flowgt (version 1), or"
-            " SceneNN/morning/frames/rgb, depth, forwardFlow (version 2)"
-        ),
-        source="https://europe.naverlabs.com/proxy-virtual-worlds/",
-    ),
-    *(
-        Suite(
-            f"kinect_{thing}",
-            f"bending {text} of EPFL",
-            _kinect,
-            folders=(f"kinect_{thing}", "."),
-            layout=(
-                "pair_NNN/ with frame_0.png, frame_1.png, K.txt and points.npz (uv_0 in pixels,"
-                " xyz_mm_0) or depth.png (16 bit, millimetres), one folder a pair of frames of the"
-                " sequence"
-            ),
-            source=(
-                "EPFL CVLab, deformable surface reconstruction,"
-                " https://www.epfl.ch/labs/cvlab/data/data-dsr/"
-            ),
-        )
-        for thing, text in (("paper", "paper"), ("tshirt", "T-shirt"))
-    ),
+    Suite("rendered", "rendered dynamic scenes", _rendered),
+    Suite("everyday", "rendered scenes of everyday kinds, most without parallax", _everyday),
+    Suite("shared", "the real pairs that development was done with", _shared, _SHARED, _OWN),
+    Suite("sintel", "MPI Sintel, the paper's five sequences", _sintel, _SINTEL, _MPI),
+    Suite("kitti2012", "KITTI stereo and flow 2012", _kitti12, _2012, _KITTI("stereo_flow")),
+    Suite("kitti2015", "KITTI scene flow 2015", _kitti15, _2015, _KITTI("scene_flow")),
+    Suite("vkitti", "Virtual KITTI 1 or 2, the paper's four worlds", _vkitti, _VKITTI, _NAVER),
+    Suite("kinect_paper", "bending paper of EPFL", _kinect, _KINECT, _EPFL),
+    Suite("kinect_tshirt", "bending T-shirt of EPFL", _kinect, _KINECT, _EPFL),
 )
 SUITES: Mapping[str, Suite] = {s.name: s for s in _ALL}
 """Suites by name."""
@@ -304,7 +261,7 @@ def list_suite(
     suite, o = SUITES[name], options or Options()
     root = Path(os.path.realpath(as_path(data or Path(), "data folder", home=True)))
     listed: list[Item] = []
-    for folder in suite.folders:
+    for folder in (".", name):
         listed = list(suite.items(Path(os.path.realpath(root / folder)), o))
         here = [i for i in listed if all(is_file(f) for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):

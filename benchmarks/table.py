@@ -60,11 +60,7 @@ class Item:
         return f"{self.suite}/{self.name}/{self.flow}"
 
     def problem(self, overrides: Sequence[str] = ()) -> Problem:
-        """The problem of the pair with default options and overrides.
-
-        Raises:
-            ConfigError: an override is wrong.
-        """
+        """The problem of the pair with default options and overrides."""
         raw = {"name": self.name, "input": dict(self.input), "flow": {"source": self.flow}}
         return make_problem(raw, overrides, where=self.key)
 
@@ -78,11 +74,7 @@ class Cell:
     variant: str = ""
 
     def identity(self) -> Row:
-        """Entries that identify the row together with the code version.
-
-        Raises:
-            ConfigError: an override is wrong.
-        """
+        """Entries that identify the row together with the code version."""
         item, problem = self.item, self.item.problem(self.overrides)
         return {
             "key": f"{item.key} {self.variant}".strip(),
