@@ -110,7 +110,12 @@ def batch(
     workers = max(1, min(workers, int(free / max(needs, 1.0))))
     token = f"{socket.gethostname()} {os.getpid()} {time.time_ns()}"
 
-    def tell(tries: int = 20) -> None:
+    told = [0.0]
+
+    def tell(last: bool = False, tries: int = 20) -> None:
+        begin = time.monotonic()
+        if begin < told[0] and not last:
+            return
         known = [rows[name] for name in problems if name in rows]
         try:
             with staged(folder, overwrite=overwrite) as new:
@@ -121,7 +126,9 @@ def batch(
             if not tries:
                 raise
             time.sleep(PAUSE / 10)
-            tell(tries - 1)
+            tell(last, tries - 1)
+        # tables of many pairs are not written all the time
+        told[0] = time.monotonic() + 10 * (time.monotonic() - begin)
 
     with _alive(folder / "pairs", left, token):
         while left:
@@ -145,7 +152,7 @@ def batch(
             # a failed pair is not tried again by the same call
             retry_failed = False
             time.sleep(PAUSE * bool(left))
-    tell()
+    tell(last=True)
     return Batch([rows[name] for name in problems], folder)
 
 

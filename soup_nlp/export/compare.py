@@ -212,7 +212,7 @@ def one_line(row: Row) -> str:
 
 def _ended(row: Row) -> str:
     status = str(row.get("status") or reason(row))
-    return " ".join(status[:60].replace("|", "/").split())
+    return " ".join(status[:100].replace("|", "/").split())
 
 
 def _text(value: Any, form: str) -> str:
