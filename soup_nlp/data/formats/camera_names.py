@@ -129,33 +129,28 @@ def cameras_of(named: Sequence[Leaf], where: PathLike) -> list[tuple[str, Float]
         elif re.fullmatch(_MATRIX, last, re.IGNORECASE) and len(words) in (4, 9, 12, 16):
             values = [number(word, name, where) for word in words]
             K = intrinsics(*values) if len(values) == 4 else matrix_of(values)
-            rows = np.reshape(values[:9], (3, 3)) if K is None else K
-            out.append((name, rows))
+            out.append((name, np.reshape(values[:9], (3, 3)) if K is None else K))
         elif len(words) == 9 or (len(words) == 12 and re.fullmatch(r"[pP]\d+", last)):
-            numbers = [number(word, name, where) for word in words if _NUMBER.fullmatch(word)]
-            K = matrix_of(numbers)
+            K = matrix_of([number(word, name, where) for word in words if _NUMBER.fullmatch(word)])
             # a rotation has no element above 1
             if K is not None and K.diagonal().min() > 0 and K[0, 0] > 1:
                 out.append((name, K))
     for group, found in groups.items():
-        point = {"cx", "cy", "c"} & found.keys()
-        if {"fx", "fy"} & found.keys() or ("f" in found and point):
+        if {"fx", "fy"} & found.keys() or ("f" in found and {"cx", "cy", "c"} & found.keys()):
             out.append((group, _grouped(group, found, where)))
     return out
 
 
 def _grouped(group: str, values: dict[str, list[float]], where: PathLike) -> Float:
     """Intrinsics of parameters with the same names before them."""
-    # fx and fy, or one focal length for both
-    parts = {k: v for k, v in values.items() if k in ("fx", "fy", "cx", "cy")}
-    for pair, names in (("f", ("fx", "fy")), ("c", ("cx", "cy"))):
-        for k, name in enumerate(names if pair in values else ()):
-            parts.setdefault(name, values[pair][k:] or values[pair])
-    missing = [name for name in ("fx", "fy", "cx", "cy") if name not in parts]
+    four = ("fx", "fy", "cx", "cy")
+    # both may have one name, f or c
+    parts = {name: values.get(name) or values.get(name[0], []) for name in four}
+    missing = [name for name, found in parts.items() if not found]
     if missing:
         what = f"camera {group}".strip() + f" lacks {' and '.join(missing)}"
         raise refused(what, where, ", ".join(values))
-    K = intrinsics(*(parts[name][0] for name in ("fx", "fy", "cx", "cy")))
+    K = intrinsics(*(found[-1 if name[1] == "y" else 0] for name, found in parts.items()))
     K[0, 1] = values.get("skew", [0.0])[0]
     return K
 

@@ -214,8 +214,8 @@ def read_images(
     8 and 16 bit, grey, RGB and RGBA are accepted. Grey is repeated in the three channels, and alpha
     is dropped. 16-bit values v become 255 v / white; without `white`, the range of the values of
     all pictures between the percentiles `OUTER` becomes 0 to 255, 8-bit ones beside them (times
-    257) included. An image with an EXIF rotation is
-    rejected unless `turn` is set, since its camera may be that of either orientation.
+    257) included. An image with an EXIF rotation is rejected unless `turn` is set, since its camera
+    may be that of either orientation.
 
     Args:
         paths: Image files (PNG, JPEG, TIFF, PPM ...).
