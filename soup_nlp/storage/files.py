@@ -40,7 +40,7 @@ def as_path(
     `~` stands for the home folder if `home` is set.
 
     Raises:
-        SoupError: it is neither text nor path, has a NUL, or names the home of an unknown user.
+        SoupError: it is no path, no name of a file, or names the home of an unknown user.
     """
     if not isinstance(name, str | os.PathLike) or isinstance(os.fspath(name), bytes):
         raise error(
@@ -48,8 +48,16 @@ def as_path(
             found=f"{type(name).__name__} {printable(name, 60)}",
             expected="text or a pathlib.Path",
         )
-    if "\0" in os.fspath(name):
-        raise error(f"name of {what} holds a NUL character", where=name)
+    try:
+        bad = b"\0" in os.fsencode(name)
+    except UnicodeEncodeError:  # half a surrogate pair
+        bad = True
+    if bad:
+        raise error(
+            f"name of {what} is no name of a file",
+            where=name,
+            expected="characters that file systems have, without NUL",
+        )
     path = Path(name)
     if not home:
         return path

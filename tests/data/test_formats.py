@@ -14,6 +14,7 @@ from PIL import Image
 from soup_nlp.data.formats import camera_files
 from soup_nlp.data.formats import map_files as fmt
 from soup_nlp.data.formats.images import DataWarning, read_image, read_mask
+from soup_nlp.data.pair import Pair
 
 K = np.array([[688.0, 0.0, 511.5], [0.0, 688.5, 217.5], [0.0, 0.0, 1.0]])
 
@@ -142,6 +143,11 @@ def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
             fmt.read_flow(tmp_path / name)
     with raises("image is missing"):
         read_image(tmp_path / "none.png")
+    for name in ("\ud800.png", "a\0b.png"):
+        with raises(r"no name of a file[\s\S]*expected: "):
+            read_image(name)
+        with raises("no name of a file"):
+            Pair(name, name, fov=60)
 
 
 @pytest.mark.parametrize("scale", [0, -1, np.nan, np.inf])
