@@ -1,6 +1,6 @@
 """Make the pictures of gallery.md and the verdicts below them, and that of depth_prior.md.
 
-`python docs/gallery.py` makes all, `python docs/gallery.py prior` the latter alone.
+`PYTHONPATH=. python docs/gallery.py` makes all, `python docs/gallery.py prior` the latter alone.
 """
 
 import re
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+import benchmarks.everyday  # noqa: F401, makes its scenes known
 import soup_nlp
 from soup_nlp.arrays import Float
 from soup_nlp.evaluate.metrics import depth_metrics

@@ -8,7 +8,8 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
+from pydantic_core import PydanticKnownError
 
 from soup_nlp.arrays import Float
 from soup_nlp.data.accept import prior_of
@@ -20,7 +21,7 @@ from soup_nlp.data.flow.sources import is_network
 from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Pair, Truth
-from soup_nlp.data.scenes.catalogue import SCENES, render_scene
+from soup_nlp.data.scenes.catalogue import LAYOUTS, render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.limits import MAX_SIDE
@@ -171,12 +172,18 @@ class FilesInput(FramesInput):
         return [x for x in (*named, self.depth, self.depth_next) if isinstance(x, str)]
 
 
+def _is_scene(name: str) -> str:
+    if name not in LAYOUTS:
+        raise PydanticKnownError("literal_error", {"expected": ", ".join(map(repr, LAYOUTS))})
+    return name
+
+
 class SceneInput(PairInput):
     """A rendered dynamic scene with exact truth."""
 
     kind: Literal["scene"]
     """Kind of input."""
-    scene: Literal[tuple(SCENES)]  # type: ignore[valid-type]
+    scene: Annotated[str, AfterValidator(_is_scene)]
     """Which scene."""
     seed: Seed = 0
     """Changes layout, textures and motions."""

@@ -8,11 +8,12 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from benchmarks.everyday import LAYOUTS
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.inputs import SceneInput
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.scenes.catalogue import SCENES, render_scene
-from soup_nlp.data.scenes.everyday import LAYOUTS
+from soup_nlp.data.scenes import catalogue
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, render
 from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Plane, Sheet
 from soup_nlp.data.scenes.texture import Texture, fractal_noise, pulse_coverage, value_noise
@@ -20,6 +21,7 @@ from soup_nlp.data.scenes.things import SceneBuilder, placed
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera
 
+SCENES = catalogue.LAYOUTS
 FIRST = [name for name in SCENES if name not in LAYOUTS]
 """Scenes of the catalogue itself; `LAYOUTS` are the everyday ones."""
 RIGID = {"sheet": (0.01, 0.5), "banner": (0.5, 0.9), "handheld": (0.8, 1), "standing": (0.7, 1)}

@@ -4,11 +4,12 @@ Scenes are laid out in level coordinates: x right, y down, z forward, the ground
 truth of the rendered pair is in the usual coordinates, those of the reference camera, in metres.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.scenes import everyday
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
 from soup_nlp.data.scenes.shapes import Sheet
 from soup_nlp.data.scenes.texture import Panels
@@ -37,7 +38,7 @@ def render_scene(
     """Render a named scene.
 
     Args:
-        name: One of `SCENES`.
+        name: One of `LAYOUTS`.
         seed: Changes layout, textures and motions within sensible ranges; same seed, same bytes.
         width: Columns of both images, at least 64; the focal length grows with it.
         height: Rows of both images, at least 48.
@@ -48,11 +49,11 @@ def render_scene(
         Motions are `next_from_ref` with the camera's motion included; NaN for bending bodies.
     """
     check_image_size(width, height, "scene", name)
-    layout, focal, contrast = _LAYOUTS[name]
+    layout, focal, contrast = LAYOUTS[name]
     # tall images keep the field of view of a 4:3 image, else the ground would be behind the camera
     f = focal * max(width, 4 / 3 * height)
     K = camera.intrinsics(f, f, (width - 1) / 2, (height - 1) / 2)
-    rng = np.random.default_rng([seed, list(_LAYOUTS).index(name)])
+    rng = np.random.default_rng([seed, list(LAYOUTS).index(name)])
     scene = layout(SceneBuilder(rng, width / (2 * f), height / (2 * f), contrast, seed))
     title = f"{name}-{seed}" + (f"-{frame}" if frame else "")
     return render(scene.advanced(frame), K, height, width, name=title)
@@ -176,16 +177,19 @@ def _banner(b: SceneBuilder) -> Scene:
     return Scene(bodies, *_sideways(b))
 
 
-_LAYOUTS: everyday.Layouts = {
+Layouts = dict[str, tuple[Callable[[SceneBuilder], Scene], float, float]]
+"""Layout, focal length (in image widths) and contrast of each scene."""
+LAYOUTS: Layouts = {
     "street": (_street, 0.9, 1.0),
     "room": (_room, 0.8, 1.0),
     "sheet": (_sheet, 0.9, 1.0),
     "orbit": (_orbit, 0.8, 1.0),
     "still": (_still, 0.8, 1.0),
     "banner": (_banner, 0.8, 1.0),
-    **everyday.LAYOUTS,
 }
 """The index of a scene in this table is part of its seed, so that new scenes are appended."""
 
-SCENES = {name: str(layout.__doc__) for name, (layout, *_) in _LAYOUTS.items()}
-"""Description of every scene by name."""
+
+def add_scenes(layouts: Layouts) -> None:
+    """Make further scenes known to `render_scene` and to the input of kind scene."""
+    LAYOUTS.update(layouts)

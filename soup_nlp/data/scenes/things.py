@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from soup_nlp.data.scenes.raycast import Body, Part, inverse
+from soup_nlp.data.scenes.raycast import Part, inverse
 from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Float, Plane, Shape
 from soup_nlp.data.scenes.texture import Colour, Panels, Texture
 from soup_nlp.geometry import rotation
@@ -68,9 +68,6 @@ WALLS: tuple[tuple[Colour, Colour], ...] = (
 ASPHALT: tuple[Colour, Colour] = ((0.42, 0.42, 0.43), (0.32, 0.32, 0.34))
 SKY: tuple[Colour, Colour] = ((0.52, 0.68, 0.88), (0.84, 0.88, 0.92))
 GLASS: Colour = (0.16, 0.20, 0.26)
-SKIN: tuple[Colour, Colour] = ((0.80, 0.60, 0.48), (0.66, 0.46, 0.36))
-LEAVES: tuple[Colour, Colour] = ((0.30, 0.44, 0.16), (0.14, 0.24, 0.08))
-BARK: tuple[Colour, Colour] = ((0.36, 0.28, 0.20), (0.24, 0.18, 0.14))
 DARK: tuple[Colour, Colour] = ((0.12, 0.12, 0.13), (0.20, 0.20, 0.21))
 
 FRONT = ((-0.62, 3.5), (0.0, 3.4), (0.62, 3.6))
@@ -117,11 +114,6 @@ class SceneBuilder:
         """1 or -1, either with probability 1/2."""
         return float(self.rng.choice([-1.0, 1.0]))
 
-    def drift(self, size: float, spread: ArrayLike) -> Float:
-        """(3,) shift of length `size` (m) in a random direction, scaled by axis with `spread`."""
-        way = self.rng.standard_normal(3) * np.asarray(spread)
-        return np.asarray(size * way / np.linalg.norm(way))
-
     # --- textures, each with another seed ---------------------------------------------------------
 
     def plain(
@@ -145,10 +137,6 @@ class SceneBuilder:
         return self.plain(WALLS[self.rng.integers(len(WALLS))], cell, panels)
 
     # --- surroundings -----------------------------------------------------------------------------
-
-    def sky(self, z: float) -> Part:
-        """The sky at a distance."""
-        return backdrop(z, self.plain(SKY, 0.12 * z, contrast=0.08), glow=1.0)
 
     def interior(self) -> list[Part]:
         """Floor with tiles, papered back wall with a picture, and two side walls."""
@@ -182,18 +170,6 @@ class SceneBuilder:
             out.append(Part(shape, placed(x, -up, z, yaw=yaw), self.paint(0.8 * size)))
         return out
 
-    def tree(self, x: float, z: float, tall: float) -> list[Part]:
-        """A trunk under three clumps of leaves."""
-        wide = 0.04 * tall
-        parts = [block((wide, 0.25 * tall, wide), x, z, self.plain(BARK, 0.2))]
-        for k in range(3):
-            half = tall * self.uniform([0.16, 0.16, 0.16], [0.26, 0.22, 0.24])
-            at = np.array([x, -tall * (0.45 + 0.14 * k), z])
-            at += 0.06 * tall * self.uniform(-1, 1, 3)
-            leaves = self.plain(LEAVES, 0.06 * tall, contrast=0.7)
-            parts.append(Part(Ellipsoid(half), placed(*at), leaves))
-        return parts
-
     # --- vehicles and people ----------------------------------------------------------------------
 
     def car(self, x: float, z: float, yaw: float) -> list[Part]:
@@ -213,50 +189,3 @@ class SceneBuilder:
             Part(Box(half), at @ placed(0, -(bottom + half[1]), along), texture)
             for half, bottom, along, texture in sizes
         ]
-
-    def lorry(self, x: float, z: float, high: float, long: float) -> list[Part]:
-        """A van or lorry seen from behind: a box on wheels with a door, lamps and a bumper."""
-        half = 1.15, (high - 0.55) / 2, long / 2
-        doors = Panels((1.15, 9.0), (0.97, 0.98), (0.62, 0.64, 0.66), (0.02, -4.5), variation=0.2)
-        box = self.paint(0.8, doors if high > 2.6 else None)
-        parts = [
-            Part(Box(half), placed(x, -0.55 - half[1], z), box),
-            Part(Box((1.0, 0.2, half[2] - 0.1)), placed(x, -0.42, z), self.plain(DARK, 0.4)),
-        ]
-        back = z - half[2]
-        for side in (-1, 1):
-            lamp = self.plain(((0.7, 0.1, 0.08), (0.5, 0.06, 0.05)), 0.2)
-            wheel = (0.14, 0.28, 0.3)
-            parts.append(block(wheel, x + 0.8 * side, back + 0.6, self.plain(DARK, 0.3)))
-            parts.append(Part(Box((0.1, 0.16, 0.02)), placed(x + side, -0.8, back - 0.02), lamp))
-        if high <= 2.6:
-            glass = self.plain((GLASS,) * 2, 0.5)
-            parts.append(Part(Box((0.9, 0.3, 0.02)), placed(x, -high + 0.5, back - 0.02), glass))
-        return parts
-
-    def person(self, x: float, z: float, tall: float, yaw: float) -> Body:
-        """A walking person of ellipsoids, towards +z at yaw 0; every limb has its own motion."""
-        at, turn = placed(x, 0, z, yaw=yaw), self.sign() * self.uniform(10, 22)
-        ahead, aside = at[:3, 2] * tall * self.uniform(0.02, 0.06), at[:3, 0]
-        swing = -self.sign() * self.uniform(4, 10)
-        chosen = self.rng.permutation(len(PAINTS))[:2]
-        trousers, shirt = (self.plain(PAINTS[k], 0.1, contrast=0.3) for k in chosen)
-        skin, hair = self.plain(SKIN, 0.15, contrast=0.15), self.plain(BARK, 0.05)
-        limbs = [
-            # half size, joint (across, up), hangs or stands, angle, change of angle (degrees)
-            ((0.058, 0.26, 0.065), (-0.06, 0.49), 1, turn, swing, trousers),
-            ((0.058, 0.26, 0.065), (0.06, 0.49), 1, -turn, -swing, trousers),
-            ((0.12, 0.20, 0.075), (0, 0.45), -1, 4, 0.15 * swing, shirt),
-            ((0.036, 0.20, 0.042), (-0.145, 0.80), 1, -turn, -1.3 * swing, shirt),
-            ((0.036, 0.20, 0.042), (0.145, 0.80), 1, turn, 1.3 * swing, shirt),
-            ((0.055, 0.075, 0.065), (0, 0.83), -1, 0, 0.3 * swing, skin),
-            ((0.06, 0.05, 0.07), (0, 0.90), -1, 0, 0.3 * swing, hair),
-        ]
-        parts = []
-        for share, (across, up), hangs, angle, change, texture in limbs:
-            half = tall * np.array(share)
-            joint = at @ placed(tall * across, -tall * up, 0, pitch=angle)
-            pose = joint @ placed(0, hangs * 0.95 * half[1], 0)
-            move = about(joint[:3, 3], change * aside, ahead)
-            parts.append(Part(Ellipsoid(half), pose, texture, motion=move))
-        return Body(parts)

@@ -1,21 +1,25 @@
 """Rendered scenes of the kinds that people photograph, most with little or no parallax.
 
-Layouts are those of `soup_nlp.data.scenes.catalogue`; some read the seed as a choice.
+Importing this module makes them known to `render_scene` and to problem files. Some layouts read the
+seed as a choice.
 """
 
-from collections.abc import Callable
-
 import numpy as np
+from numpy.typing import ArrayLike
 
+from soup_nlp.arrays import Float
+from soup_nlp.data.scenes.catalogue import Layouts, add_scenes
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse
-from soup_nlp.data.scenes.shapes import Box, Plane
+from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Plane
 from soup_nlp.data.scenes.texture import Colour, Panels
 from soup_nlp.data.scenes.things import (
     ASPHALT,
     BACK,
+    DARK,
     FRONT,
     GLASS,
     PAINTS,
+    SKY,
     WALLS,
     SceneBuilder,
     about,
@@ -28,11 +32,87 @@ from soup_nlp.data.scenes.things import (
 )
 
 GRASS: tuple[Colour, Colour] = ((0.34, 0.46, 0.20), (0.24, 0.36, 0.14))
+SKIN: tuple[Colour, Colour] = ((0.80, 0.60, 0.48), (0.66, 0.46, 0.36))
+LEAVES: tuple[Colour, Colour] = ((0.30, 0.44, 0.16), (0.14, 0.24, 0.08))
+BARK: tuple[Colour, Colour] = ((0.36, 0.28, 0.20), (0.24, 0.18, 0.14))
+
+
+def drift(b: SceneBuilder, size: float, spread: ArrayLike) -> Float:
+    """(3,) shift of length `size` (m) in a random direction, scaled by axis with `spread`."""
+    way = b.rng.standard_normal(3) * np.asarray(spread)
+    return np.asarray(size * way / np.linalg.norm(way))
+
+
+def sky(b: SceneBuilder, z: float) -> Part:
+    """The sky at a distance."""
+    return backdrop(z, b.plain(SKY, 0.12 * z, contrast=0.08), glow=1.0)
+
+
+def tree(b: SceneBuilder, x: float, z: float, tall: float) -> list[Part]:
+    """A trunk under three clumps of leaves."""
+    wide = 0.04 * tall
+    parts = [block((wide, 0.25 * tall, wide), x, z, b.plain(BARK, 0.2))]
+    for k in range(3):
+        half = tall * b.uniform([0.16, 0.16, 0.16], [0.26, 0.22, 0.24])
+        at = np.array([x, -tall * (0.45 + 0.14 * k), z])
+        at += 0.06 * tall * b.uniform(-1, 1, 3)
+        leaves = b.plain(LEAVES, 0.06 * tall, contrast=0.7)
+        parts.append(Part(Ellipsoid(half), placed(*at), leaves))
+    return parts
+
+
+def lorry(b: SceneBuilder, x: float, z: float, high: float, long: float) -> list[Part]:
+    """A van or lorry seen from behind: a box on wheels with a door, lamps and a bumper."""
+    half = 1.15, (high - 0.55) / 2, long / 2
+    doors = Panels((1.15, 9.0), (0.97, 0.98), (0.62, 0.64, 0.66), (0.02, -4.5), variation=0.2)
+    box = b.paint(0.8, doors if high > 2.6 else None)
+    parts = [
+        Part(Box(half), placed(x, -0.55 - half[1], z), box),
+        Part(Box((1.0, 0.2, half[2] - 0.1)), placed(x, -0.42, z), b.plain(DARK, 0.4)),
+    ]
+    back = z - half[2]
+    for side in (-1, 1):
+        lamp = b.plain(((0.7, 0.1, 0.08), (0.5, 0.06, 0.05)), 0.2)
+        wheel = (0.14, 0.28, 0.3)
+        parts.append(block(wheel, x + 0.8 * side, back + 0.6, b.plain(DARK, 0.3)))
+        parts.append(Part(Box((0.1, 0.16, 0.02)), placed(x + side, -0.8, back - 0.02), lamp))
+    if high <= 2.6:
+        glass = b.plain((GLASS,) * 2, 0.5)
+        parts.append(Part(Box((0.9, 0.3, 0.02)), placed(x, -high + 0.5, back - 0.02), glass))
+    return parts
+
+
+def person(b: SceneBuilder, x: float, z: float, tall: float, yaw: float) -> Body:
+    """A walking person of ellipsoids, towards +z at yaw 0; every limb has its own motion."""
+    at, turn = placed(x, 0, z, yaw=yaw), b.sign() * b.uniform(10, 22)
+    ahead, aside = at[:3, 2] * tall * b.uniform(0.02, 0.06), at[:3, 0]
+    swing = -b.sign() * b.uniform(4, 10)
+    chosen = b.rng.permutation(len(PAINTS))[:2]
+    trousers, shirt = (b.plain(PAINTS[k], 0.1, contrast=0.3) for k in chosen)
+    skin, hair = b.plain(SKIN, 0.15, contrast=0.15), b.plain(BARK, 0.05)
+    limbs = [
+        # half size, joint (across, up), hangs or stands, angle, change of angle (degrees)
+        ((0.058, 0.26, 0.065), (-0.06, 0.49), 1, turn, swing, trousers),
+        ((0.058, 0.26, 0.065), (0.06, 0.49), 1, -turn, -swing, trousers),
+        ((0.12, 0.20, 0.075), (0, 0.45), -1, 4, 0.15 * swing, shirt),
+        ((0.036, 0.20, 0.042), (-0.145, 0.80), 1, -turn, -1.3 * swing, shirt),
+        ((0.036, 0.20, 0.042), (0.145, 0.80), 1, turn, 1.3 * swing, shirt),
+        ((0.055, 0.075, 0.065), (0, 0.83), -1, 0, 0.3 * swing, skin),
+        ((0.06, 0.05, 0.07), (0, 0.90), -1, 0, 0.3 * swing, hair),
+    ]
+    parts = []
+    for share, (across, up), hangs, angle, change, texture in limbs:
+        half = tall * np.array(share)
+        joint = at @ placed(tall * across, -tall * up, 0, pitch=angle)
+        pose = joint @ placed(0, hangs * 0.95 * half[1], 0)
+        move = about(joint[:3, 3], change * aside, ahead)
+        parts.append(Part(Ellipsoid(half), pose, texture, motion=move))
+    return Body(parts)
 
 
 def _landscape(b: SceneBuilder) -> list[Part]:
     """A lawn with trees before houses and the sky."""
-    parts = [floor(b.plain(GRASS, 0.8)), b.sky(76)]
+    parts = [floor(b.plain(GRASS, 0.8)), sky(b, 76)]
     x = -42.0
     while x < 42:
         wide = b.uniform(6, 12)
@@ -42,7 +122,7 @@ def _landscape(b: SceneBuilder) -> list[Part]:
         x += wide + b.uniform(0, 5)
     for slot in np.linspace(-0.8, 0.8, 7):
         z = b.uniform(8, 28)
-        parts += b.tree(z * slot + b.uniform(-1, 1), z, b.uniform(3, 7))
+        parts += tree(b, z * slot + b.uniform(-1, 1), z, b.uniform(3, 7))
     return parts
 
 
@@ -76,7 +156,7 @@ def _small_people(b: SceneBuilder, count: int, far: float) -> list[Body]:
         # a person fills about 0.16 of the square of its height
         seen = np.sqrt(b.uniform(0.012, 0.03) * 4 * b.half_width * b.half_height / 0.16)
         z = min(b.uniform(1.0, 1.8) / seen, 0.8 * far)
-        bodies.append(b.person(z * b.half_width * across, z, z * seen, b.uniform(0, 360)))
+        bodies.append(person(b, z * b.half_width * across, z, z * seen, b.uniform(0, 360)))
     return bodies
 
 
@@ -91,13 +171,13 @@ def _handheld(b: SceneBuilder) -> Scene:
             half = b.uniform([0.4, 0.5, 0.3], [0.9, 1.1, 0.5])
             static.append(block(half, x, far - half[2], b.paint(0.4)))
     else:
-        static = [floor(b.plain(GRASS, 0.5)), b.sky(60)]
+        static = [floor(b.plain(GRASS, 0.5)), sky(b, 60)]
         static.append(Part(Box((30, b.uniform(0.5, 1.0), 0.6)), placed(0, -0.5, far), b.wall(0.6)))
         for slot in (-0.9, -0.3, 0.4, 0.9):
             z = far + b.uniform(1, 8)
-            static += b.tree(z * b.half_width * slot, z, b.uniform(3, 6))
+            static += tree(b, z * b.half_width * slot, z, b.uniform(3, 6))
     people = _small_people(b, int(b.rng.integers(3, 6)), far)
-    shift = b.drift(0.7 * far * b.uniform(0.01, 0.03), [1, 0.4, 0.7])
+    shift = drift(b, 0.7 * far * b.uniform(0.01, 0.03), [1, 0.4, 0.7])
     pose = placed(0, -b.uniform(1.3, 1.7), 0, yaw=b.uniform(-8, 8), pitch=-b.uniform(5, 11))
     return Scene([Body(static), *people], *views(pose, shift, b.uniform(-0.8, 0.8, 3)))
 
@@ -119,7 +199,7 @@ def _swing(b: SceneBuilder) -> Scene:
     tower = block((0.22, high, 0.22), across, away, b.paint(0.3), yaw=30)
     slides = about(shift=[b.sign() * b.uniform(0.04, 0.08), 0, 0.03])
     static = Body([*b.interior(), *things])
-    shift = b.drift(b.uniform(0.025, 0.05), [1, 0.5, 0.6])
+    shift = drift(b, b.uniform(0.025, 0.05), [1, 0.5, 0.6])
     view = views(placed(0, -1.4, 0, pitch=-b.uniform(4, 9)), shift, b.uniform(-0.4, 0.4, 3))
     return Scene([static, Body([box], swings), Body([tower], slides)], *view)
 
@@ -127,7 +207,7 @@ def _swing(b: SceneBuilder) -> Scene:
 def _jam(b: SceneBuilder) -> Scene:
     """camera that creeps in a traffic jam; vehicles over half of the image move differently"""
     lanes = Panels((3.4, 5.0), (0.035, 0.5), (0.78, 0.78, 0.74), (-1.75, b.uniform(0, 5)))
-    static = [floor(b.plain(ASPHALT, 2.0, lanes, contrast=0.3)), b.sky(76)]
+    static = [floor(b.plain(ASPHALT, 2.0, lanes, contrast=0.3)), sky(b, 76)]
     panes = windows((2.6, 2.9), (0.4, 0.5))
     for side in (-1, 1):
         z = 2.0
@@ -146,7 +226,7 @@ def _jam(b: SceneBuilder) -> Scene:
             parts = b.car(x, z + 2, 0.0)
         else:
             long = b.uniform(3.6, 5.0)
-            parts = b.lorry(x, z + long / 2, b.uniform(2.3, 3.4), long)
+            parts = lorry(b, x, z + long / 2, b.uniform(2.3, 3.4), long)
         bodies.append(Body(parts, about(shift=[0, 0, b.uniform(0.0, 0.5)])))
     pose = placed(b.uniform(-0.3, 0.3), -b.uniform(1.4, 1.9), 0, pitch=b.uniform(-2, 1))
     forward = [0.01 * b.uniform(-1, 1), 0, b.uniform(0.03, 0.07)]
@@ -172,7 +252,7 @@ def _facade(b: SceneBuilder) -> Scene:
         parts.append(Part(Box((0.36 * wide, 0.5, 2 * deep)), at, rail))
     parts.append(floor(b.plain(ASPHALT, 0.6, contrast=0.3)))
     pose = placed(0, -1.6, 0, yaw=b.sign() * b.uniform(8, 22), pitch=b.uniform(8, 16))
-    shift = b.drift(away * b.uniform(0.005, 0.01), [1, 0.5, 0.4])
+    shift = drift(b, away * b.uniform(0.005, 0.01), [1, 0.5, 0.4])
     return Scene([Body(parts)], *views(pose, shift, b.uniform(-0.5, 0.5, 3)))
 
 
@@ -215,13 +295,11 @@ def _standing(b: SceneBuilder) -> Scene:
     for side in b.rng.permutation([-1.0, 1.0]):
         z = b.uniform(2.1, 3.4)
         x = side * b.uniform(0.2, 0.55) * z * b.half_width
-        bodies.append(b.person(x, z, b.uniform(1.55, 1.85), b.uniform(0, 360)))
+        bodies.append(person(b, x, z, b.uniform(1.55, 1.85), b.uniform(0, 360)))
     pose = inverse(placed(0, -b.uniform(1.2, 1.6), 0, yaw=b.uniform(-8, 8), pitch=-6))
     return Scene(bodies, pose, pose)
 
 
-Layouts = dict[str, tuple[Callable[[SceneBuilder], Scene], float, float]]
-"""Layout, focal length (in image widths) and contrast of each scene."""
 LAYOUTS: Layouts = {
     "pan": (_pan, 0.85, 0.6),
     "handheld": (_handheld, 0.75, 0.6),
@@ -231,3 +309,5 @@ LAYOUTS: Layouts = {
     "corridor": (_corridor, 0.7, 1.0),
     "standing": (_standing, 0.8, 0.6),
 }
+
+add_scenes(LAYOUTS)
