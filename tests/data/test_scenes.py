@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from benchmarks.everyday import LAYOUTS
+from benchmarks.everyday import LAYOUTS, person
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.inputs import SceneInput
 from soup_nlp.data.pair import Pair
@@ -181,7 +181,7 @@ def test_seeds_differ_in_depth_and_camera_motion(name):
 
 
 def test_limbs_of_a_person_move_differently():
-    body = SceneBuilder(np.random.default_rng(0)).person(0, 3, 1.7, 40)
+    body = person(SceneBuilder(np.random.default_rng(0)), 0, 3, 1.7, 40)
     assert body.bends
     shifts = [p.motion @ p.scene_from_part @ [0, 0, 0, 1] for p in body.parts]
     shifts = np.array(shifts) - [p.scene_from_part @ [0, 0, 0, 1] for p in body.parts]

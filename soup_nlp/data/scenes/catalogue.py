@@ -55,8 +55,7 @@ def render_scene(
     K = camera.intrinsics(f, f, (width - 1) / 2, (height - 1) / 2)
     rng = np.random.default_rng([seed, list(LAYOUTS).index(name)])
     scene = layout(SceneBuilder(rng, width / (2 * f), height / (2 * f), contrast, seed))
-    title = f"{name}-{seed}" + (f"-{frame}" if frame else "")
-    return render(scene.advanced(frame), K, height, width, name=title)
+    return render(scene.advanced(frame), K, height, width)
 
 
 def _street(b: SceneBuilder) -> Scene:

@@ -249,7 +249,7 @@ def _split(pose: Float) -> tuple[Float, Float]:
     return pose[:3, :3], pose[:3, 3]
 
 
-def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene") -> Pair:
+def render(scene: Scene, K: Float, height: int, width: int) -> Pair:
     """Both images of a scene and its exact truth.
 
     Args:
@@ -257,7 +257,6 @@ def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene")
         K: (3, 3) intrinsics of both frames, pixels.
         height: Rows of the images.
         width: Columns of the images.
-        name: Name of the pair.
 
     Returns:
         A `Pair` without a flow but with full truth in the unit of the scene. A reference pixel is
@@ -300,4 +299,4 @@ def render(scene: Scene, K: Float, height: int, width: int, name: str = "scene")
         unit="m",
     )
     images = ref.image(depth, part, size), following.image(depth_next, part_next, size)
-    return Pair(*images, K.copy(), K.copy(), truth=truth, name=name)
+    return Pair(*images, K.copy(), K.copy(), truth=truth)
