@@ -1,4 +1,7 @@
-"""Print rows of the tables of depth_prior.md: `PYTHONPATH=. python docs/prior_table.py DATA nlp [NAME...]`.
+"""Print rows of the tables of depth_prior.md.
+
+    PYTHONPATH=. python docs/prior_table.py DATA nlp [NAME...]
+
 
 DATA is the folder of the real pairs. `nlp` has 300 superpixels, the NLP alone and all depth priors,
 `refined` the defaults and the smooth warp of 20 %. Depth priors are made from the true depth. Every

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+import benchmarks.everyday  # noqa: F401, makes its scenes known
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
 from soup_nlp.data.flow import sources

@@ -35,18 +35,16 @@ from soup_nlp.schema.limits import check_image_size
 def render_scene(
     name: str, seed: int = 0, width: int = 1024, height: int = 436, frame: int = 0
 ) -> Pair:
-    """Render a named scene.
+    """Render a scene of `LAYOUTS`, with full truth in metres and no flow.
+
+    Component 0 is the static background. Motions include that of the camera; NaN for what bends.
 
     Args:
-        name: One of `LAYOUTS`.
+        name: The scene.
         seed: Changes layout, textures and motions within sensible ranges; same seed, same bytes.
         width: Columns of both images, at least 64; the focal length grows with it.
         height: Rows of both images, at least 48.
         frame: First frame of the pair; camera and bodies repeat their motion from frame 0 to 1.
-
-    Returns:
-        A `Pair` with full `Truth` in metres and no flow. Component 0 is the static background.
-        Motions are `next_from_ref` with the camera's motion included; NaN for bending bodies.
     """
     check_image_size(width, height, "scene", name)
     layout, focal, contrast = LAYOUTS[name]

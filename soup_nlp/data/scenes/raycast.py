@@ -21,13 +21,10 @@ from soup_nlp.geometry import camera
 
 SAME_DEPTH = 1e-6
 """Largest relative difference of depth of two hits of the same point."""
-
 TAPS = 3
 """Colour samples of a pixel along the direction of foreshortening."""
-
 TILTED = 0.75
 """Cosine between normal and ray below which a surface gets `TAPS` colour samples."""
-
 LIGHT = np.array([0.75, -0.85, -0.35]) / np.linalg.norm([0.75, -0.85, -0.35])
 """Direction towards the light in scene coordinates at the reference time."""
 
@@ -61,10 +58,7 @@ class Part:
     bent: Shape | None = None
 
     def colour(self, shape: Shape, points: Float, footprint: Float) -> FloatMap:
-        """Colours (N, 3) of points (N, 3) of the part's shape at a time.
-
-        Shading moves with the surface.
-        """
+        """Colours (N, 3) of points (N, 3) of its shape at a time; shading moves with them."""
         material = shape.material(points)
         normals = self.shape.normals(self.shape.place(material))
         light = self.scene_from_part[:3, :3].T @ LIGHT
@@ -75,12 +69,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Body:
-    """Parts that move together.
-
-    Attributes:
-        parts: Parts of the body.
-        motion: (4, 4) motion in scene coordinates from the reference to the next time.
-    """
+    """Parts that move together, by `motion` (4, 4) in scene coordinates to the next time."""
 
     parts: Sequence[Part]
     motion: Float = field(default_factory=lambda: np.eye(4))
@@ -93,12 +82,9 @@ class Body:
 
 @dataclass(frozen=True)
 class Scene:
-    """Bodies and a camera at two times, in any right-handed scene coordinates.
+    """Bodies and a camera (4, 4) at two times, in any right-handed scene coordinates.
 
-    Attributes:
-        bodies: The bodies; the component label of a body is its index.
-        ref_from_scene: (4, 4) camera pose at the reference time.
-        next_from_scene: (4, 4) camera pose at the next time.
+    The component label of a body is its index.
     """
 
     bodies: Sequence[Body]
@@ -134,11 +120,8 @@ class Scene:
 class Frame:
     """A scene in the camera of a frame, 0 for the reference and 1 for the next.
 
-    Attributes:
-        parts: All parts, body by body.
-        shapes: Their shapes in the frame.
-        poses: (P, 4, 4) camera_from_part.
-        body: (P,) int32 component label of each part.
+    Parts are listed body by body, with shapes and poses (P, 4, 4) camera_from_part in the frame and
+    the component label `body` (P,).
     """
 
     def __init__(self, scene: Scene, K: Float, frame: int) -> None:
@@ -156,11 +139,7 @@ class Frame:
         self.poses = np.array(poses)
 
     def trace(self, uv: Float) -> tuple[Float, Int]:
-        """First hits of the rays through pixels (N, 2), which may be any real numbers.
-
-        Returns:
-            Depth z (N,), inf where nothing is hit, and part index (N,), -1 there.
-        """
+        """Depth z (N,) and part (N,) of the first hits of pixels (N, 2); inf and -1 without."""
         rays = camera.rays(self.K, uv)
         depth = np.full(len(uv), np.inf)
         index = np.full(len(uv), -1, dtype=np.int64)
@@ -186,11 +165,7 @@ class Frame:
         return np.arange(len(uv))
 
     def image(self, depth: Float, part: Int, size: tuple[int, int]) -> Image:
-        """The image (H, W, 3) of the hits of all pixels.
-
-        Pixels whose 4-neighbours show another part or another face are averages of TAPS x TAPS
-        traced samples.
-        """
+        """The image (H, W, 3) of the hits of all pixels, with TAPS x TAPS samples at edges."""
         uv = camera.pixel_grid(*size).reshape(-1, 2)
         colour, normals = self._shade(uv, depth, part, TAPS)
         parts, faces, edge = part.reshape(size), normals.reshape(*size, 3), np.zeros(size, bool)
@@ -209,9 +184,8 @@ class Frame:
     def _shade(self, uv: Float, depth: Float, part: Int, taps: int) -> tuple[FloatMap, Float]:
         """Colours (N, 3) and unit normals (N, 3), in camera coordinates, of hits.
 
-        A tilted surface is foreshortened in one image direction only. Its texture has the finer
-        resolution of the other direction, and `taps` samples are averaged along the first; 1 if the
-        caller averages samples.
+        A tilted surface has the finer resolution of the direction that is not foreshortened, and
+        `taps` samples are averaged along the other one.
         """
         colour, normals = np.zeros((len(uv), 3), np.float32), np.zeros((len(uv), 3))
         rays = camera.rays(self.K, uv)
@@ -250,19 +224,11 @@ def _split(pose: Float) -> tuple[Float, Float]:
 
 
 def render(scene: Scene, K: Float, height: int, width: int) -> Pair:
-    """Both images of a scene and its exact truth.
+    """Both images of a scene, with intrinsics K (3, 3), and its exact truth; no flow.
 
-    Args:
-        scene: The scene.
-        K: (3, 3) intrinsics of both frames, pixels.
-        height: Rows of the images.
-        width: Columns of the images.
-
-    Returns:
-        A `Pair` without a flow but with full truth in the unit of the scene. A reference pixel is
-        occluded if its point is hidden in the next frame, projects outside the rectangle of the
-        pixel centres, or is behind the camera (with a flow of NaN). Every ray must hit a surface,
-        such as an infinite plane behind the bodies.
+    A reference pixel is occluded if its point is hidden in the next frame, projects outside the
+    rectangle of the pixel centres, or is behind the camera (with a flow of NaN). Every ray must hit
+    a surface, such as an infinite plane behind the bodies.
     """
     size = height, width
     uv = camera.pixel_grid(*size).reshape(-1, 2)

@@ -16,13 +16,10 @@ Colour = tuple[float, float, float]
 
 PERIOD = 32
 """Cells after which the noise of one octave repeats; a power of two."""
-
 FINEST_CELLS = (1.25, 2.5)
 """Cell size in footprints of pixels at which an octave begins to appear, and is complete."""
-
 LACUNARITY = 1.93
 """Ratio of the cell sizes of consecutive octaves."""
-
 GOLDEN = 0.6180339887498949
 
 
@@ -42,14 +39,9 @@ def _turn(seed: int) -> Float:
 
 
 def value_noise(points: Float, seed: int) -> FloatMap:
-    """Smooth solid noise: quintic interpolation of random values on the integer lattice.
+    """Smooth solid noise (N,) in [-1, 1] at positions (N, 3) in cells, of period `PERIOD`.
 
-    Args:
-        points: (N, 3) positions in lattice cells.
-        seed: Seed of the noise.
-
-    Returns:
-        (N,) values in [-1, 1], twice continuously differentiable, period `PERIOD` in each axis.
+    Quintic interpolation of random values on the integer lattice.
     """
     cell = np.floor(points)
     f = (points - cell).T.astype(np.float32, order="C")
@@ -92,10 +84,7 @@ def fractal_noise(
         cell: Cell size of the coarsest octave, same unit.
         seed: Seed of the noise.
         persistence: Amplitude of an octave relative to the next coarser one.
-        octaves: Largest number of octaves.
-
-    Returns:
-        (N,) noise of zero mean and, with five octaves, standard deviation of about 0.4.
+        octaves: Largest number of octaves; with five the standard deviation is about 0.4.
     """
     turned = points @ _turn(seed).T
     total = np.zeros(len(points), np.float32)
@@ -178,16 +167,7 @@ class Texture:
     panels: Panels | None = None
 
     def colour(self, points: Float, chart: Float, footprint: Float) -> FloatMap:
-        """RGB of surface points.
-
-        Args:
-            points: (N, 3) material coordinates, unit of length.
-            chart: (N, 2) coordinates on the surface, for `panels`.
-            footprint: (N,) size of a pixel on the surface.
-
-        Returns:
-            (N, 3) float32 in [0, 1).
-        """
+        """RGB (N, 3) in [0, 1) of material coordinates (N, 3) and charts (N, 2) of points."""
         slow = fractal_noise(
             points, footprint, cell=1.7 * self.cell, seed=self.seed + 1, persistence=0.6, octaves=3
         )
