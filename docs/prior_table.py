@@ -2,7 +2,6 @@
 
     PYTHONPATH=. python docs/prior_table.py DATA nlp [NAME...]
 
-
 DATA is the folder of the real pairs. `nlp` has 300 superpixels, the NLP alone and all depth priors,
 `refined` the defaults and the smooth warp of 20 %. Depth priors are made from the true depth. Every
 cell has the MRE of the prior and that of the answer, then the share of its wrong pixels that have a
