@@ -42,7 +42,7 @@ def list_(
     folder: Annotated[Path | None, typer.Argument(help="Folder of other problem files.")] = None,
 ) -> None:
     """Print the problems, scenes and formats of the package, or the problems of a folder."""
-    from soup_nlp.data.scenes.catalogue import SCENES
+    from soup_nlp.data.scenes.catalogue import LAYOUTS
     from soup_nlp.report.formats import FORMATS
 
     if folder is not None and not is_folder(folder):
@@ -52,7 +52,7 @@ def list_(
         print(f"{printable(name):<14} {description(path)}")
     if folder is None:
         print("\nsoup-nlp solve NAME; templates take --set input.root=DIR, folder input.path=DIR")
-        print(f"soup-nlp chain scene:NAME, of {', '.join(SCENES)}")
+        print(f"soup-nlp chain scene:NAME, of {', '.join(LAYOUTS)}")
         print(f"soup-nlp convert RESULT --to {','.join(FORMATS)}")
     elif not files:
         print(f"no problem files (*.yaml) in {printable(str(folder))}")

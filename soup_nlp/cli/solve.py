@@ -14,7 +14,7 @@ from soup_nlp.cli import options
 from soup_nlp.cli.options import Text, in_input, in_method, in_output, option
 from soup_nlp.config.problem import Problem, load_problem, make_problem, shipped_problems, title
 from soup_nlp.data.flow.sources import is_path
-from soup_nlp.data.scenes.catalogue import SCENES
+from soup_nlp.data.scenes.catalogue import LAYOUTS
 from soup_nlp.errors import ConfigError, DataError, SoupError
 from soup_nlp.pipeline.run import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
@@ -223,7 +223,7 @@ def chain(
         list[str],
         typer.Argument(
             help="Folder, images, 'pattern/*.jpg', video, or scene:NAME.",
-            autocompletion=options.starting(lambda: [f"scene:{name}" for name in SCENES]),
+            autocompletion=options.starting(lambda: [f"scene:{name}" for name in LAYOUTS]),
         ),
     ],
     out: Annotated[Path | None, options.out_option("out/chain-SOURCE")] = None,
