@@ -5,3 +5,5 @@
 
 Install with `pip install -e '.[bench]'`; every command has `--help`.
 """
+
+import benchmarks.everyday  # noqa: F401, makes its scenes known

@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.everyday import LAYOUTS
 from benchmarks.table import Item
 from soup_nlp.data.datasets.benchmarks import DEFAULT_SCENE
-from soup_nlp.data.scenes.everyday import LAYOUTS
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import as_path, is_file, is_folder
 
