@@ -23,7 +23,7 @@ from soup_nlp.data.accept import (
 from soup_nlp.data.formats.cameras import estimated_cameras
 from soup_nlp.data.formats.images import read_images
 from soup_nlp.data.formats.map_files import UNKNOWN_FLOW, flow_layout, read_flow
-from soup_nlp.errors import DataError, expect, one_line, repr_of
+from soup_nlp.errors import DataError, expect, one_line, printable, repr_of
 
 SHORTEST = 0.05
 """Smallest focal length relative to the side of the image (168 degrees of view)."""
@@ -85,6 +85,8 @@ class Flow:
         if is_path(flow):
             put("source", str(flow) if self.source == "unknown" else self.source)
             flow = read_flow(flow)
+        # the name of a file may hold anything
+        put("source", printable(self.source))
         expected = "numbers (H, W, 2) or (2, H, W) in pixels, or a path"
         uv = flow_layout(array_of(flow, "flow", self.source, expected), self.source)
         put("uv", uv if uv.dtype.kind == "f" and uv.dtype.itemsize >= 4 else uv.astype(np.float32))

@@ -10,7 +10,7 @@ import pytest
 
 from soup_nlp.cli.main import print_warning
 from soup_nlp.data.formats.images import DataWarning
-from soup_nlp.data.pair import Pair, Truth
+from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.clouds import write_ply
@@ -30,6 +30,11 @@ def test_a_name_or_unit_is_one_line_of_text(text: object) -> None:
         Truth(unit=text)
     with pytest.raises(DataError, match=r"name of the pair[\s\S]*expected: 1 to 100 printable"):
         Pair(IMAGE, IMAGE, (8, 8, 3.5, 3.5), name=text)
+
+
+def test_the_source_of_a_flow_is_one_line() -> None:
+    flow = Flow(np.zeros((2, 2, 2)), source=HOSTILE)
+    assert str(flow).isprintable()
 
 
 def test_text_of_a_stored_file_is_one_line(tmp_path: Path) -> None:
