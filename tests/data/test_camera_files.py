@@ -260,6 +260,10 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "no camera": ("width: 320\nheight: 240", r"no camera[\s\S]*width, height"),
     "damaged JSON": ('{"fx": 256, "fy": 257, "cx": 159.5, "cy"', "damaged JSON"),
     "nested deeply": ("[" * 100_000, "kind"),
+    "nested in names": (
+        '{"a":' * 300 + "[" * 300 + "]" * 300 + "}" * 300,
+        "nested too deeply|no camera",
+    ),
     "XML": ("<?xml version='1.0'?><opencv_storage></opencv_storage>", "XML"),
     "binary": (b"\x80\x04\x95\x00\x00", "not text"),
     "odd UTF-16": (FOUR.encode("utf-16")[:-1], "not text"),

@@ -54,8 +54,11 @@ def leaves(path: PathLike) -> list[Leaf]:
     if text.lstrip().startswith("<"):
         raise ValueError("XML")
     brackets = text.lstrip().startswith(("{", "[")) and not _SECTION.match(text)
-    tree = _json(text) if brackets else _yaml(text)
-    return list(_flat(tree) if isinstance(tree, list) else _lines(text))
+    try:
+        tree = _json(text) if brackets else _yaml(text)
+        return list(_flat(tree) if isinstance(tree, list) else _lines(text))
+    except RecursionError:
+        raise ValueError("brackets are nested too deeply") from None
 
 
 def _arrays(path: PathLike, content: bytes) -> Any:
@@ -76,8 +79,6 @@ def _json(text: str) -> Any:
         return json.loads(
             text, object_pairs_hook=_Pairs, parse_float=str, parse_int=str, parse_constant=str
         )
-    except RecursionError:
-        raise ValueError("brackets are nested too deeply") from None
     except ValueError as error:
         tree = _yaml(text)
         if not isinstance(tree, list):
