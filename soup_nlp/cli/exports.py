@@ -26,13 +26,18 @@ def export(
     coordinates: options.Coordinates = "matrix",
     superpixels: options.Superpixels = None,
     format_: Annotated[Words, option(f"{', '.join(FORMATS)}; may be repeated.", "--format")] = None,
-    presolve: options.Presolve = True,
+    presolve: Annotated[
+        bool, option("Start at the presolve's answer, with its multipliers.", "--presolve")
+    ] = False,
     suffixes: Annotated[bool, option("Write suffixes; CasADi reads none.", "--suffixes")] = False,
     overrides: options.Set = None,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Write the NLP for other solvers; several sizes or formulations make a folder each."""
+    """Write the NLP for other solvers, started at the initialisation.
+
+    Several sizes or formulations make a folder each.
+    """
     forms = [parse_formulation(text, coordinates) for text in formulation or [""]]
     # without repetitions
     sizes: list[int | None] = [*dict.fromkeys(superpixels or ())] or [None]

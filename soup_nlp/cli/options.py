@@ -81,7 +81,6 @@ Overwrite = Annotated[bool, in_output(OTHERS, "--overwrite")]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
 Problem = Annotated[Path, typer.Argument(help=PROBLEM, autocompletion=starting(shipped_problems))]
 Folder = Annotated[Path, typer.Argument(help="Folder of a result or a chain.")]
-Presolve = Annotated[bool, option("Start at the presolve's answer, not at the initialisation.")]
 FORMULATIONS = "gauge/norm, e.g. unit-translation/epigraph; may be repeated."
 Formulations = Annotated[Words, option(FORMULATIONS, "--formulation")]
 COORDINATES = "tangent: nine per superpixel about the initialisation, without gauge."

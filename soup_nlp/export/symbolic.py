@@ -15,7 +15,6 @@ from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.symbolic import Graph
-from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
@@ -90,7 +89,8 @@ def nlp(
         superpixels: N.
         overrides: `a.b=value`, as after `--set`.
         coordinates: "matrix": the constrained NLP (SO(3), unit normals, simplex, visibility);
-            "tangent": nine coordinates per superpixel, in which the first two hold by construction.
+            "tangent": nine coordinates per superpixel about the initialisation, in which the first
+            two hold by construction; the program that `export --coordinates tangent` writes.
         hessian: Of `derivatives`; "gauss-newton" is a majorant where its theta is 0.
         presolve: Start at the presolve's answer instead of the initialisation.
 
@@ -101,12 +101,7 @@ def nlp(
         more = () if superpixels is None else (f"segmentation.superpixels={superpixels}",)
         problem = load_problem(problem, [*overrides, *more])
     case = prepare(problem, presolve)
-    form = case.formulation(hessian=hessian)
-    if coordinates == "matrix":
-        made = case.nlp(form)
-    else:
-        made = build_tangent_nlp(case.soup, case.data, case.weights, form)
-    record, layout = made
+    record, layout = case.nlp(case.formulation(hessian=hessian, coordinates=coordinates))
     x, p = ca.MX.sym("x", record.nx), ca.MX.sym("p", len(record.theta))
     graph = Graph(record)
     f, g = graph.oracle(x, ca.vertcat(p, graph.p[len(record.theta) :]))

@@ -39,7 +39,7 @@ TINY = sets(
 
 
 def write(out: Path, *words: str, scene: str = "orbit") -> int:
-    return main(["export", scene, "-o", str(out), "--no-presolve", *TINY, *words])
+    return main(["export", scene, "-o", str(out), *TINY, *words])
 
 
 @pytest.fixture(scope="module")
@@ -262,7 +262,10 @@ def test_options_are_checked(tmp_path, capsys):
 
 
 def test_a_presolved_start_has_multipliers(tmp_path, capsys):
-    assert main(["export", "orbit", "-o", str(tmp_path), *TINY, "--superpixels", "16"]) == 0
+    assert (
+        main(["export", "orbit", "--presolve", "-o", str(tmp_path), *TINY, "--superpixels", "16"])
+        == 0
+    )
     _, nlp, _, (v, r), manifest = problem_of(tmp_path)
     assert manifest["initial_duals"]
     builder = ca.NlpBuilder()
@@ -320,7 +323,7 @@ def test_pounce_takes_the_multipliers(tmp_path):
     if command is None:
         pytest.skip("pounce is not installed")
     words = ["-o", str(tmp_path), *TINY, "--superpixels", "16", "--suffixes"]
-    assert main(["export", "orbit", *words]) == 0
+    assert main(["export", "orbit", "--presolve", *words]) == 0
     options = {**WARM, "nlp_scaling_method": "none", "tol": 1e-6}
     words = [f"{k}={v}" for k, v in options.items()]
     run = subprocess.run(

@@ -100,9 +100,7 @@ class World:
     def exported(self) -> Path:
         """An exported folder with a solver's answer, soup.sol, that is not optimal."""
         out = self.root / "exported"
-        assert (
-            main(["export", str(self.good("p.yaml")), "--no-presolve", "-o", str(out), "-q"]) == 0
-        )
+        assert main(["export", str(self.good("p.yaml")), "-o", str(out), "-q"]) == 0
         rows, columns = (len((out / f"soup.{s}").read_text().split()) for s in ("row", "col"))
         # the .row file names the objective as well
         sizes = [rows - 1, 0, columns, columns]

@@ -61,7 +61,7 @@ class Command:
 def commands(root: Path, names: Sequence[str]) -> list[Command]:
     """The commands of the table."""
     overrides = [word for text in TINY for word in ("--set", text)]
-    export = ["export", "orbit", "--no-presolve", "-q", *overrides]
+    export = ["export", "orbit", "-q", *overrides]
     out = {name: root / name for name in NAMES}
     words = {
         "solve": ["solve", "orbit", "-q", *overrides, "--out", str(out["solve"])],
