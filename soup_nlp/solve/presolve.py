@@ -24,7 +24,8 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Hessian
-from soup_nlp.model.layout import Chart, TangentLayout
+from soup_nlp.model.layout import Chart, Layout, MatrixLayout
+from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart, majorant
 from soup_nlp.solve.ipopt import Ipopt, Stage
@@ -50,6 +51,13 @@ KEEP: Mapping[str, Any] = {
     "theta_max_fact": 1e8,
 }
 """Ipopt options of all these stages: MUMPS, and the start from a point and its multipliers."""
+KEEP_IN_MATRICES: Mapping[str, Any] = {
+    **{k: v for k, v in KEEP.items() if k.startswith(("warm", "mumps_pivot", "mumps_mem"))},
+    # R'R = I and |n| = 1 have no diagonal entries; delayed pivots would double the time
+    "mumps_pivtol": 0.0,
+    "mumps_pivtolmax": 0.0,
+}
+"""The same on the constrained NLP, whose rows are curved: the filter has to take its course."""
 LAST: Mapping[str, Any] = {"mu_init": 1e-10}
 """Options of the last stage. A larger barrier would push at constraints that the constrained NLP
 does not have in the same variables, and that would then have to iterate."""
@@ -115,8 +123,11 @@ class Presolve:
     def _program(
         self, soup: Soup, weights: Weights | None = None, chart: Chart = "depth"
     ) -> _Program:
-        form = majorant(self.form)
-        nlp, layout = build_tangent_nlp(soup, self.data, weights or self.weights, form, chart)
+        form, energy = majorant(self.form), (self.data, weights or self.weights)
+        if self.o.coordinates == "matrix":
+            own, matrices = build_matrix_nlp(soup, *energy, form)
+            return _Program(own, matrices, own.x0, np.zeros(own.nx), np.zeros(own.ng))
+        nlp, layout = build_tangent_nlp(soup, *energy, form, chart)
         if chart == "inverse-depth":
             # visibility bounds inverse depths and slopes by itself
             free = np.full(nlp.nx, np.inf)
@@ -154,10 +165,12 @@ class Presolve:
         order, so that the multipliers of the program before serve both.
         """
         o = self.o
-        program = self._program(self.soup, chart=exact_chart(self.data))
-        program.lam_g = before.lam_g
-        if program.layout.chart == "depth":
-            program.lam_x = before.lam_x
+        program = before
+        if self.o.coordinates == "tangent":
+            program = self._program(self.soup, chart=exact_chart(self.data))
+            program.lam_g = before.lam_g
+            if not self.data.local_units:
+                program.lam_x = before.lam_x
         growing = [
             _Planned(f"Gauss-Newton {theta:g}", o.eps, share, {"theta": theta, "ridge": RIDGE})
             for theta, share in THETAS.items()
@@ -166,7 +179,7 @@ class Presolve:
         if not self._stopped():
             last, limit = [_Planned(EXACT, o.eps, 0.0)], o.exact_iterations
             self._run(program, last, hessian="exact", options=LAST, max_iter=limit)
-            self.rim = _rim(program)
+            self.rim = _rim(program, self.soup, self.data)
 
     def _run(
         self,
@@ -188,7 +201,8 @@ class Presolve:
         """
         o, nlp = self.o, program.nlp
         nlp = nlp if hessian is None else replace(nlp, hessian_kind=hessian)
-        solver = Ipopt(nlp, o.ipopt, {**KEEP, **(options or {})})
+        keep = KEEP if o.coordinates == "tangent" else KEEP_IN_MATRICES
+        solver = Ipopt(nlp, o.ipopt, {**keep, **(options or {})})
         for planned in stages:
             if self.stages and self._stopped():
                 break
@@ -228,25 +242,29 @@ class _Planned(NamedTuple):
 
 @dataclass
 class _Program:
-    """The energy in nine coordinates about a soup, and where its stages stand.
+    """A program of the presolve, and where its stages stand.
 
     Attributes:
         nlp: The program.
         layout: Turns x into soups.
-        x: (9 N,) where the last stage ended.
-        lam_x: (9 N,) multipliers of the bounds there.
+        x: (nx,) where the last stage ended.
+        lam_x: (nx,) multipliers of the bounds there.
         lam_g: (ng,) multipliers of the constraints there.
     """
 
     nlp: NLP
-    layout: TangentLayout
+    layout: Layout
     x: Float
     lam_x: Float
     lam_g: Float
 
 
-def _rim(program: _Program) -> Float:
+def _rim(program: _Program, soup: Soup, data: EnergyData) -> Float:
     """(N, V) multipliers of rim visibility, its rows divided by the facing of the anchor."""
-    rows = next(g for g in program.nlp.groups if g.kernel.name == "t_visible").rows
+    name = "visible" if isinstance(program.layout, MatrixLayout) else "t_visible"
+    rows = next(g for g in program.nlp.groups if g.kernel.name == name).rows
     multipliers = -program.lam_g[rows]
+    if isinstance(program.layout, MatrixLayout):
+        # the first row is the anchor's
+        return multipliers[:, 1:] * -np.einsum("nc,nc->n", soup.n, data.anchor_ray)[:, None]
     return multipliers if program.layout.chart == "depth" else multipliers * program.x[::9, None]

@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from soup_nlp.errors import ConfigError
+from soup_nlp.model.formulation import Coordinates
 from soup_nlp.schema.section import Count, NonNegative, Positive, Section, Tolerance, Whole
 
 
@@ -32,6 +33,9 @@ class SolverOptions(Section):
     multipliers.
     """
 
+    coordinates: Coordinates = "tangent"
+    """Variables of the presolve. matrix: those of the constrained NLP, on which Ipopt then iterates
+    from the initialisation, at 5 to 30 times the cost (docs/solving.md)."""
     presolve: bool = True
     """If false, Ipopt solves the constrained NLP at the final smoothing at once."""
     presolve_eps: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)] = (

@@ -391,3 +391,14 @@ def test_a_better_start_is_delivered_beside_the_presolves_kkt_point(room, solved
 def test_an_ipopt_without_iterations_is_not_near():
     assert not _near(SimpleNamespace(converged=False, history={}))
     assert _near(SimpleNamespace(converged=False, history={"inf_du": np.array([2.0, 0.5])}))
+
+
+def test_the_constrained_nlp_is_solved_from_the_start_without_tangent_stages(room, solved):
+    solution = room.solve(OPTIONS.replace(coordinates="matrix"))
+    assert solution.converged, solution.status
+    assert all(stage.x.size == 16 * len(room.data) for stage in solution.stages)
+    # each stage begins where the last one ended, with its multipliers
+    assert solution.stages[-1].iterations <= 5
+    assert_constraints(solution, room.data)
+    tangent = solved["unit-offset"].energy["total"]
+    assert solution.energy["total"] == pytest.approx(tangent, rel=5e-3)

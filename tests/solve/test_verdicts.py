@@ -81,20 +81,23 @@ def test_an_answer_that_violates_its_constraints_has_not_converged(monkeypatch):
 
 def test_multipliers_of_rim_visibility_push_planes_towards_the_camera():
     tiny = Tiny()
-    nlp, _ = build_matrix_nlp(tiny.soup, tiny.data, PAPER, FORM)
+    nlp, layout = build_matrix_nlp(tiny.soup, tiny.data, PAPER, FORM)
     rows = next(g for g in nlp.groups if g.kernel.name == "visible").rows
     rim = np.ones((len(tiny.data), tiny.data.rim_ray.shape[1] - 1))
     lam_g = warm_start(nlp, tiny.data, tiny.soup, rim)["lam_g0"]
     facing = -np.einsum("nc,nc->n", tiny.soup.n, tiny.data.anchor_ray)
     # the multiplier of a lower bound is negative in CasADi's sign
     np.testing.assert_allclose(lam_g[rows[:, 1:]], -rim / facing[:, None])
+    # and the way back, from the multipliers of a presolve in matrices
+    own = SimpleNamespace(nlp=nlp, lam_g=lam_g, layout=layout)
+    np.testing.assert_allclose(_rim(own, tiny.soup, tiny.data), rim)
     group = SimpleNamespace(kernel=SimpleNamespace(name="t_visible"), rows=np.array([[0, 1]]))
     held = SimpleNamespace(
         nlp=SimpleNamespace(groups=[group]),
         lam_g=np.array([-2.0, 0.0]),
         layout=SimpleNamespace(chart="depth"),
     )
-    np.testing.assert_array_equal(_rim(held), [[2.0, 0.0]])
+    np.testing.assert_array_equal(_rim(held, tiny.soup, tiny.data), [[2.0, 0.0]])
 
 
 @pytest.mark.parametrize(("kind", "limit"), [("so3", 1e-8), ("simplex", 1e-10), ("visible", 1e-6)])
