@@ -15,6 +15,8 @@ BETA_COLOUR = 1.0
 """Fall-off of w4 with the difference of colours in [0, 1]; the paper does not print its own."""
 RIM = 8
 """Directions in which a superpixel has an extreme pixel."""
+TIED = 12
+"""Neighbours beyond K that may be as near as the last one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,15 +131,17 @@ def build_segmentation(
 
 
 def _nearest(anchors: Float, k: int) -> Int:
+    """(N, k) nearest other anchors, nearest first, of equal distances the lower index first."""
     n = len(anchors)
     if n == 1:
         return np.zeros((1, 0), np.int64)
-    _, index = scipy.spatial.cKDTree(anchors).query(anchors, k=k + 1)
-    index = index.reshape(n, k + 1)
-    # coincident anchors can displace the point itself from the first place
-    is_self = index == np.arange(n)[:, None]
-    is_self[~is_self.any(1), -1] = True
-    return index[~is_self].reshape(n, k).astype(np.int64)
+    most = min(n, k + 1 + TIED)
+    _, index = scipy.spatial.cKDTree(anchors).query(anchors, k=most)
+    index = np.sort(index.reshape(n, most), axis=1)
+    far = np.round(((anchors[index] - anchors[:, None]) ** 2).sum(axis=2), 6)
+    far[index == np.arange(n)[:, None]] = np.inf
+    order = np.argsort(far, axis=1, kind="stable")[:, :k]
+    return np.take_along_axis(index, order, axis=1).astype(np.int64)
 
 
 def _fold(knn: Int) -> tuple[Int, Int]:

@@ -94,7 +94,7 @@ def refine_soup(
     before = energy if start is None else objective(start, data, weights, photo)
     o = options or RefineOptions()
     rounds = Rounds(best, energy, data, weights, o, photo, (rays, min_facing), seed)
-    status = rounds.run(watch or Watch(), begin + o.max_seconds)
+    status = rounds.run(watch or Watch(), time.process_time() + o.max_seconds)
     return Refined(
         rounds.best,
         before,
@@ -173,13 +173,13 @@ class Rounds:
         self.proposer = Proposer(self.data, near, self.seed)
 
     def run(self, watch: Watch, deadline: float) -> str:
-        """Run all rounds until a time of `time.perf_counter`; returns the status of `Refined`."""
+        """Run all rounds until a time of `time.process_time`; returns the status of `Refined`."""
         o, photo, slow, interrupted = self.options, self.photo, False, False
         agreed = photo is not None and photo.contradicted.mean() < CONTRADICTED
         most = min(1, o.rounds) if agreed else o.rounds
 
         def over() -> bool:
-            return watch.stop.is_set() or time.perf_counter() > deadline
+            return watch.stop.is_set() or time.process_time() > deadline
 
         def follow(mark: float, k: int, bound: float, energy: float, least: float) -> bool:
             """Report an iteration of TRW-S; returns whether to stop after it."""
@@ -192,7 +192,7 @@ class Rounds:
             before = self.energy["total"]
             self.done.append(self._round(sweep=not (agreed or self.done), follow=follow))
             # TRW-S answers Ctrl-C too with the best labels so far
-            interrupted = self.done[-1].status == "interrupted" and time.perf_counter() <= deadline
+            interrupted = self.done[-1].status == "interrupted" and time.process_time() <= deadline
             watch.say(f"refine {len(self.done)}: {self.done[-1]}")
             slow = before - self.energy["total"] < o.stagnation * abs(before)
         if interrupted or watch.stop.is_set():

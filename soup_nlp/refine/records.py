@@ -30,7 +30,7 @@ class RefineOptions(Section):
     """Factor of E_photo, which measures how far the images contradict a superpixel's homography;
     0 leaves the images out."""
     max_seconds: Tolerance = 300.0
-    """Time limit of the rounds together."""
+    """CPU time of this process that the rounds together may take."""
 
 
 @dataclass(frozen=True)

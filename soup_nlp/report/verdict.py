@@ -18,12 +18,13 @@ from soup_nlp.report.findings import (
 )
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.summary import certainty
+from soup_nlp.solve.stages import Solution
 
 STATUS = {
     "Solve_Succeeded": "converged to the tolerance",
     "Solved_To_Acceptable_Level": "converged to Ipopt's acceptable level",
     "Maximum_Iterations_Exceeded": "not converged: iteration limit, best iterate kept",
-    "Time_Limit": "not converged: time limit, best iterate kept",
+    "Time_Limit": "not converged: limit of CPU time, best iterate kept",
     "Constraints_Violated": "not converged: the answer breaks its constraints",
     "Skipped": "refined from the start, no NLP",
     "Interrupted": "interrupted, best iterate kept",
@@ -46,6 +47,8 @@ TITLES = {
 RULES = {"none": "no scale", "affine": "one scale and shift each, of least squares"}
 """Words for rules of the scale of scores."""
 PAD = " " * 12
+BUSY = 1.5
+"""Wall time over CPU time from which the verdict names the load of the machine."""
 
 
 def verdict(
@@ -103,9 +106,18 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
         "seconds": [
             f"{sum(whole.values()):.1f}: {_numbers(whole, '.1f')}",
             *[f"of nlp: {_numbers(inner, '.1f')}"] * (details and bool(inner)),
+            *_load(run.solution),
         ],
     }
     return sectioned(sections)
+
+
+def _load(solution: Solution) -> list[str]:
+    """The CPU time of the NLP, which its limit counts, where the machine was busy."""
+    wall = sum(v for k, v in solution.seconds.items() if k in solution.cpu_seconds)
+    used = sum(solution.cpu_seconds.values())
+    busy = wall > BUSY * used + 1.0
+    return [f"the NLP had {used:.1f} CPU s of them: other programs ran"] if busy else []
 
 
 def sectioned(sections: Mapping[str, Sequence[str]]) -> str:

@@ -86,7 +86,7 @@ class _Iterations:
         self.nlp, self.stage, self.watch = nlp, stage, watch
         self.signalled = threading.Event()
         self.begin = time.perf_counter()
-        self.deadline = self.begin + seconds
+        self.deadline = time.process_time() + seconds
         self.count = 0
         self.best = self.best_f = np.inf
         self.x0 = self.best_x = x0
@@ -128,7 +128,7 @@ class _Iterations:
             self.reason = "Stagnated"
         if self.watch.stop.is_set() or self.signalled.is_set():
             self.reason = "Interrupted"
-        elif now > self.deadline:
+        elif time.process_time() > self.deadline:
             self.reason = "Time_Limit"
 
     def ended(self, stats: Mapping[str, Any], out: Mapping[str, Float]) -> Stage:
@@ -234,7 +234,7 @@ class Ipopt:
             lam_g0: (ng,) start of the constraint multipliers.
             max_iter: Iteration limit.
             tol: Ipopt's tol and dual_inf_tol.
-            seconds: Time limit; the best iterate is kept.
+            seconds: Limit of CPU time; the best iterate is kept.
             stagnation: Relative change of f that ends the solve when it was smaller twice in a
                 row; 0 for none.
             stage: Name for progress.

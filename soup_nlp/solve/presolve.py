@@ -88,7 +88,7 @@ class Presolve:
         form: Visibility, and whether kernels are compiled.
         o: Widths, limits and stagnation.
         watch: Listeners, stop event and log.
-        deadline: `time.perf_counter` at which they end.
+        deadline: `time.process_time` at which they end.
         rim: (N, V) multipliers of rim visibility, rows divided by the facing of the anchor, after
             the last stage; None where the presolve ended before it.
         stages: Those that have ended.
@@ -212,7 +212,7 @@ class Presolve:
                 lam_g0=program.lam_g,
                 p=nlp.thetas(eps=planned.eps, eps_pixel=planned.eps, **planned.theta),
                 tol=o.presolve_tol,
-                seconds=max(LEAST_SECONDS, self.deadline - time.perf_counter()),
+                seconds=max(LEAST_SECONDS, self.deadline - time.process_time()),
                 watch=self.watch,
                 max_iter=o.presolve_iterations if max_iter is None else max_iter,
                 stagnation=o.stagnation * planned.share,

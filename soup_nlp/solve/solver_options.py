@@ -67,6 +67,6 @@ class SolverOptions(Section):
     tol: Tolerance = 1e-6
     """Tolerance of the constrained NLP."""
     max_seconds: Tolerance = 600.0
-    """Time limit of all stages together."""
+    """CPU time of this process that all stages together may take."""
     ipopt: dict[str, bool | int | float | str] = Field(default_factory=dict)
     """Further Ipopt options of the constrained NLP."""

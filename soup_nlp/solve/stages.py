@@ -111,8 +111,8 @@ class _Laps:
     def __init__(self) -> None:
         self.wall: dict[str, float] = {}
         self.cpu: dict[str, float] = {}
-        self.begin = self._wall = time.perf_counter()
-        self._cpu = time.process_time()
+        self._wall = time.perf_counter()
+        self.begin = self._cpu = time.process_time()
 
     def end(self, stage: str) -> None:
         """A stage ends here."""
@@ -232,7 +232,7 @@ class _Solve:
             **first,
             max_iter=limit,
             tol=o.tol,
-            seconds=max(LEAST_SECONDS, self.laps.begin + o.max_seconds - time.perf_counter()),
+            seconds=max(LEAST_SECONDS, self.laps.begin + o.max_seconds - time.process_time()),
             stage="constrained NLP",
             watch=self.watch,
         )

@@ -37,7 +37,7 @@ def iterations() -> tuple[str, ...]:
 
 def stopped(way: str, last: int, monkeypatch) -> tuple[WritableRun, list[str]]:
     """The run that is stopped at an iteration, and the stages of its iterations."""
-    clock, stop, late, seen = time.perf_counter, threading.Event(), 0.0, list[str]()
+    clock, stop, late, seen = time.process_time, threading.Event(), 0.0, list[str]()
 
     def listen(progress: Progress) -> None:
         nonlocal late
@@ -49,7 +49,7 @@ def stopped(way: str, last: int, monkeypatch) -> tuple[WritableRun, list[str]]:
             stop.set() if way == "stop" else os.kill(os.getpid(), getattr(signal, way))
 
     with interruptible() as event, monkeypatch.context() as patch:
-        patch.setattr(time, "perf_counter", lambda: clock() + late)
+        patch.setattr(time, "process_time", lambda: clock() + late)
         event = stop if way == "stop" else event
         return soup_nlp.run(problem(), listener=listen, stop=event), seen
 
