@@ -34,9 +34,9 @@ folder = Path(tempfile.mkdtemp())
 # %% [markdown]
 # ## Export
 #
-# This cell does the same as `soup-nlp export orbit.yaml -o orbit`. The starting point in the
-# file is the presolve's answer, as for Ipopt in `soup-nlp solve`. With `--no-presolve` it is the
-# initialisation.
+# This cell does the same as `soup-nlp export orbit.yaml -o orbit --presolve`. The starting point in
+# the file is the presolve's answer, as for Ipopt in `soup-nlp solve`, so that a solver confirms it
+# in a few iterations. Without `--presolve` it is the initialisation.
 
 # %%
 (folder / "orbit.yaml").write_text(
@@ -48,7 +48,7 @@ energy: {pixel_samples: 4}
 """
 )
 exported = folder / "orbit"
-code = main(["export", str(folder / "orbit.yaml"), "-o", str(exported)])
+code = main(["export", str(folder / "orbit.yaml"), "-o", str(exported), "--presolve"])
 assert code == 0
 print(sorted(path.name for path in exported.iterdir()))
 
