@@ -201,7 +201,7 @@ def plane_world(
     """Rendered pair of one infinite plane under one rigid camera motion, with true flow."""
     K = camera.intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
     scene = Scene((Body((Part(Plane(), pose, GREY),)),), np.eye(4), move)
-    return with_true_flow(render(scene, K, height, width, "plane"))
+    return with_true_flow(render(scene, K, height, width))
 
 
 def with_true_flow(pair: Pair) -> Pair:
