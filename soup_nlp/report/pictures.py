@@ -167,7 +167,7 @@ def _shares(
 
 def _normals(result: Result) -> Picture:
     n = result.reconstruction.normals
-    entries = {"faces the camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
+    entries = {"camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
                "up": (0, -1, 0), "down": (0, 1, 0)}  # fmt: skip
     row = colourise_normals(np.array([list(entries.values())], float))
     return Picture("normals", "surface normals", colourise_normals(n), Legend(row, tuple(entries)))

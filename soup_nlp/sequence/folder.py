@@ -52,16 +52,10 @@ def is_chain(folder: Path) -> bool:
     raise DataError(
         "chain is not finished",
         where=folder,
-        found=f"pairs solved: {_some(solved)}; failed: {_some(broken)}",
+        found=f"pairs solved: {', '.join(solved) or 'none'}; failed: {', '.join(broken) or 'none'}",
         expected=f"{CHAIN}, written when every pair is solved",
         hint=hint,
     )
-
-
-def _some(names: Sequence[str]) -> str:
-    """The number of some names, and the first ones."""
-    more = " ..." if len(names) > 6 else ""
-    return f"{len(names)} ({', '.join(names[:6])}{more})" if names else "none"
 
 
 def load(folder: str | Path) -> Result | Chain:

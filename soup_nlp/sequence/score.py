@@ -21,8 +21,8 @@ from soup_nlp.storage.files import read_text
 AFFINE = Convention("affine")
 AVERAGED = ("mre_own_scale", "mre_one_scale", "mre_affine", "rmse", "delta1")
 """Scores of frames of which a chain has the mean."""
-WIDTHS = {"ratio of scales": 16, "spread (log)": 13, "true ratio": 11, "pixels": 9, "": 8}
-"""Columns of `link_table` after the first one, and their characters in the terminal."""
+LINKS = ("pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", "")
+"""Columns of `link_table`."""
 
 
 def score(
@@ -87,21 +87,18 @@ def score(
     }
 
 
-def link_table(contents: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """The links of a chain.json as heads and rows; without the true ratio if none is known."""
+def link_table(contents: Mapping[str, Any]) -> list[list[str]]:
+    """The links of a chain.json as rows below their heads; empty without links."""
     true = {tuple(k["pairs"]): k["true"] for k in (contents["score"] or {}).get("links", ())}
-    heads, rows = ["pairs", *WIDTHS], []
+    rows = []
     for k in contents["links"]:
         a, b = k["pairs"]
         true_ratio = f"{true[a, b]:.3f}" if (a, b) in true else ""
         note = "bridge" if k["bridge"] else "a guess" if k["flagged"] else ""
         numbers = [f"{k['ratio']:.3f}", f"{k['spread']:.3f}", true_ratio, str(k["pixels"])]
         rows.append([f"{a}, {b}", *numbers, note])
-    column = heads.index("true ratio")
-    if not any(row[column] for row in rows):
-        for row in (heads, *rows):
-            del row[column]
-    return heads, rows
+    # columns without a text are left out, and so is the table of a chain without links
+    return [[*row] for row in zip(*(c for c in zip(LINKS, *rows) if any(c[1:])))]
 
 
 def score_text(scores: Mapping[str, Any]) -> str:
@@ -121,11 +118,9 @@ def score_text(scores: Mapping[str, Any]) -> str:
 def chain_lines(chain: Chain) -> list[str]:
     """Scales, links and, with a truth, errors of a chain for the terminal."""
     lines, contents = [str(chain)], chain.summary
-    heads, rows = link_table(contents)
-    # two frames are one pair, which has no link
-    for pairs, *cells in (heads, *rows) if rows else ():
-        padded = [f"{cell:>{WIDTHS[head]}}" for head, cell in zip(heads[1:], cells, strict=True)]
-        lines.append(f"{pairs:<10}{''.join(padded)}".rstrip())
+    rows = link_table(contents)
+    widths = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
+    lines += ["".join(f"{c:<{w}}" for c, w in zip(row, widths)).rstrip() for row in rows]
     long = [track for track in contents["tracks"] if len(track["path"]) > 2]
     lines.append(f"tracks      {len(long)} components followed over two pairs or more")
     lines.append(sectioned({"certainty": certainty_lines(certainty(chain))}))
@@ -244,13 +239,13 @@ def similarity(points: Float, target: Float) -> tuple[float, Float, Float]:
 
 def chain_page(chain: Chain) -> str:
     """The page of a chain."""
-    heads, links = link_table(chain.summary)
+    links = link_table(chain.summary)
     scores = chain.summary["score"]
     words = [f"{len(chain)} frames", score_text(scores) if scores else f"in {chain.unit}"]
     parts = {
         "summary": headline(guess_line(certainty(chain), "all images"), words),
         "Paths": path_table(chain),
-        "Links between pairs": table(heads, links) if links else "",
+        "Links between pairs": table(links[0], links[1:]) if links else "",
         "Verdict": preformatted(chain_lines(chain)),
     }
     return page(chain, parts)

@@ -49,7 +49,7 @@ from soup_nlp.sequence.frames import (
 )
 from soup_nlp.sequence.links import make_chain, read_pair
 from soup_nlp.storage.each import Row
-from soup_nlp.storage.files import as_path, is_file, is_folder, plain
+from soup_nlp.storage.files import as_path, is_file, is_folder
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.rows import Job, Say, failed, measure_all, read_rows
 from soup_nlp.storage.versions import code_version
@@ -147,9 +147,9 @@ def solve_chain(
     if begin:
         begin(chosen, count - 1)
     chosen = one_camera(chosen, options)
-    named_pairs = _named_pairs(chosen, options)
+    problems = {pair_folder(Path(), k).name: options.problem(chosen, k) for k in range(count - 1)}
     # a pair that is solved otherwise ends the chain that it was part of
-    others = named_pairs.keys() - _kept(named_pairs, folder)
+    others = problems.keys() - kept_pairs(problems, folder)
     stale = any((folder / PAIRS / key).exists() for key in others)
     if stale and is_file(folder / CHAIN) and not overwrite:
         raise DataError(
@@ -161,7 +161,7 @@ def solve_chain(
     with staged(folder, whole=stale, overwrite=overwrite, subject=subject):
         # from here on, the folder is this chain's
         pass
-    chain = make_chain(solve_pairs(chosen, folder, options, workers, say))
+    chain = make_chain(solve_pairs(problems, folder, workers, say))
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
         return write_chain(new, chain, name, chosen.names)
 
@@ -197,35 +197,28 @@ class Options:
 
     def problem(self, frames: Frames, k: int) -> Problem:
         """The problem of two frames that follow each other."""
-        return make_problem(frames.problem(k, self.keys), self.overrides, where="sequence")
+        raw = {"name": pair_folder(Path(), k).name, **frames.problem(k, self.keys)}
+        return make_problem(raw, self.overrides, where="sequence")
 
 
 def solve_pairs(
-    frames: Frames,
-    folder: Path,
-    options: Options,
-    workers: int = 1,
-    say: Say | None = None,
+    problems: Mapping[str, Problem], folder: Path, workers: int = 1, say: Say | None = None
 ) -> list[Result]:
-    """Solve consecutive frames in parallel processes; stored results are read.
+    """Solve pairs in parallel processes; stored results are read.
 
     Args:
-        frames: The sequence.
+        problems: Problems of the pairs, by the name of their folder.
         folder: Output folder for `pairs/000_001/` ... and `pairs.jsonl`.
-        options: Keys of the problems.
         workers: Number of processes.
         say: Called with (done, total, row) after every solve.
 
     Raises:
         SolverError: a pair cannot be solved.
     """
-    jobs, named_pairs = [], _named_pairs(frames, options)
-    kept = _kept(named_pairs, folder)
-    paths = [folder.resolve() / PAIRS / key for key in named_pairs]
-    for path, name in zip(paths, named_pairs.values(), strict=True):
-        raw = {**name["problem"], "base": str(Path.cwd())}
-        work = partial(_solve, raw, options.overrides, path)
-        jobs.append(Job(name, work, stale=path.name not in kept))
+    kept, place, jobs = kept_pairs(problems, folder), folder.resolve() / PAIRS, list[Job]()
+    for key, problem in problems.items():
+        name = {"key": key, "identity": identity(problem)}
+        jobs.append(Job(name, partial(_solve, problem, place / key), stale=key not in kept))
 
     def report(done: int, total: int, row: Row) -> None:
         # those of a worker process would be printed as Python prints them
@@ -243,45 +236,28 @@ def solve_pairs(
             found=failures[0]["error"],
             hint="the others are kept: the same command goes on",
         )
-    return [read_pair(path) for path in paths]
+    return [read_pair(place / key) for key in problems]
 
 
-def _named_pairs(frames: Frames, options: Options) -> dict[str, Raw]:
-    """What identifies each pair, by the name of its folder: options, contents of its files."""
-    out = {}
-    for k in range(len(frames) - 1):
-        raw = {"name": pair_folder(Path(), k).name, **frames.problem(k, options.keys)}
-        problem = plain({key: value for key, value in raw.items() if key != "base"})
-        solved = {**raw, "base": str(Path.cwd())}
-        contents = identity(make_problem(solved, options.overrides, where="sequence"))
-        out[raw["name"]] = {
-            "key": raw["name"],
-            "problem": problem,
-            "overrides": [*options.overrides],
-            "identity": contents,
-        }
-    return out
-
-
-def _kept(named_pairs: Mapping[str, Raw], folder: Path) -> set[str]:
+def kept_pairs(problems: Mapping[str, Problem], folder: Path) -> set[str]:
     """Names of the pairs whose results are stored and need not be solved again."""
     # the last row of a pair describes its folder
     last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
-    return {
-        key
-        for key, name in named_pairs.items()
-        if is_file(folder / PAIRS / key / "result.h5")
-        and not failed(last.get(key, {}))
-        and last.get(key, {}).get("code") == code_version()
-        and all(last[key].get(k) == value for k, value in name.items())
+    same = {
+        key: last.get(key, {}).get("identity") == identity(problem)
+        and last[key].get("code") == code_version()
+        and not failed(last[key])
+        and is_file(folder / PAIRS / key / "result.h5")
+        for key, problem in problems.items()
     }
+    return {key for key, kept in same.items() if kept}
 
 
-def _solve(raw: Raw, overrides: tuple[str, ...], folder: Path) -> Row:
+def _solve(problem: Problem, folder: Path) -> Row:
     """Solve a pair into its folder."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        solved = run(make_problem(raw, overrides, where="sequence"))
+        solved = run(problem)
         solved.save(folder)
     texts = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, DataWarning))
     return {
