@@ -110,8 +110,8 @@ class FilesInput(FramesInput):
     next: str
     """Next image."""
     intrinsics: Camera | str | None = None
-    """[fx, fy, cx, cy] of the reference frame in pixels, or a file of 4 or 9 numbers; null for
-    `fov`, or else EXIF's focal length, or else 1.2 times the longer side."""
+    """[fx, fy, cx, cy] of the reference frame in pixels, or a file with one camera; null for `fov`,
+    or else EXIF's focal length, or else 1.2 times the longer side."""
     fov: Positive | None = None
     """Horizontal field of view of the reference frame as shown, degrees, where `intrinsics` is
     null; the next frame has the same lens unless EXIF names another."""
