@@ -29,7 +29,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
                 "follow_flow_px": None,
                 "neighbours": 15,
             },
-            "flow": {"see_through": False, "consistency": False},
+            "flow": {"consistency": False},
             "start": {
                 "method": "homography",
                 "samples": 100,

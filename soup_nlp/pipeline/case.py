@@ -9,7 +9,7 @@ from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_depth, follow_flow
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.working_size import working_size
+from soup_nlp.data.working_size import resized_flow, working_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import Labels, segment
@@ -32,7 +32,6 @@ from soup_nlp.model.reweighting import (
     with_prior,
     within_bending,
 )
-from soup_nlp.pipeline.flow import with_flow
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
@@ -83,7 +82,7 @@ def prepare(
         if on_stage:
             on_stage(stage)
 
-    full, pair, seen, labels, seg = _observed(problem, pair, log, done)
+    full, pair, labels, seg = _observed(problem, pair, log, done)
     begun, evidence, given_depth = _begun(problem, pair, seg), None, None
     if pair.depth_prior is not None and problem.energy.weights.depth > 0:
         begun, evidence = _judged(problem, labels, begun)
@@ -101,7 +100,7 @@ def prepare(
     stages = solver_options(problem, start)
     larger = None if pair.size == full.size else full
     parts = problem, pair, seg, start, data, weights, start.soup, stages
-    case = Case(*parts, seen or pair, larger, given_depth)
+    case = Case(*parts, larger, given_depth)
     if not presolve:
         return case
     # a solve has at least one iteration of the constrained NLP
@@ -125,9 +124,9 @@ def _observed(
     pair: Pair | None,
     log: Callable[[str], None] | None,
     done: Callable[..., None],
-) -> tuple[Pair, Pair, Pair | None, Labels, Segmentation]:
-    """Everything before the start: the pair in full size, the pair that is solved, that pair as the
-    images show it if it differs, labels and graphs of the superpixels; see `prepare`."""
+) -> tuple[Pair, Pair, Labels, Segmentation]:
+    """Everything before the start: the pair in full size, the pair that is solved, labels and
+    graphs of the superpixels; see `prepare`."""
     full = problem.depth_prior.load(pair or problem.load_pair(), problem.path)
     pair = working_size(full, problem.max_size)
     check_fits(problem, pair)
@@ -135,7 +134,11 @@ def _observed(
         (h, w), (rows, columns) = full.size, pair.size
         log(f"{w}x{h} is solved at {columns}x{rows} (max_size {problem.max_size:g} megapixels)")
     done("load")
-    pair, seen = with_flow(problem, full, pair, log)
+    flow = pair.flow
+    if flow is None and pair is not full and problem.flow.is_file():
+        # a flow file has the size of the original images
+        flow = resized_flow(problem.flow.load(full, problem.path), full, pair)
+    pair = pair.with_flow(flow or problem.flow.load(pair, problem.path))
     done("flow", pair)
     labels = superpixels(problem, pair)
     seg = _segmented(problem, pair, labels)
@@ -144,10 +147,9 @@ def _observed(
         matches = _flow_fit(problem, pair, seg).views.matches()
         better = focal_length(matches, pair.focal_sigma, problem.seed)
         full, pair = full.with_focal(*better), pair.with_focal(*better)
-        seen = None if seen is None else seen.with_focal(*better)
         if log:
             log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
-    return full, pair, seen, labels, seg
+    return full, pair, labels, seg
 
 
 Begun = tuple[Start, Pair, FlowFit]

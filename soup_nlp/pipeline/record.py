@@ -46,8 +46,6 @@ class Case:
         weights: Constants of the energy.
         soup: The best soup so far, where solvers start: the start, or the presolve's answer.
         options: Stages and limits of the problem.
-        seen: The pair as the photometric term sees it: without a layer that stands still before
-            the scene, where there is one.
         original: The pair at its own size, where it was larger than `max_size`; else None.
         given: Depth prior as judged against the flow; None without a prior.
     """
@@ -60,7 +58,6 @@ class Case:
     weights: Weights
     soup: Soup
     options: SolverOptions
-    seen: Pair
     original: Pair | None = None
     given: Given | None = None
 

@@ -129,7 +129,7 @@ def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
     exact = np.median(start.parallax) > EXACT_PARALLAX and np.median(start.error) < EXACT
     if not exact:
         photo = photometric_term(
-            case.seen, case.segmentation.labels, soup, case.data, problem.refine
+            case.pair, case.segmentation.labels, soup, case.data, problem.refine
         )
     return refine_soup(
         soup,

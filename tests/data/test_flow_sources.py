@@ -11,7 +11,6 @@ from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.sources import (
     FlowOptions,
-    content,
     flow_from_truth,
     is_named,
     resolve_flow,
@@ -44,53 +43,6 @@ def test_noise_has_its_size_and_correlation_length(pair):
         resolve_flow(pair, "truth+noise:much")
     assert is_named("dis")
     assert not is_named("flow.flo")
-
-
-@pytest.mark.parametrize(
-    ("bars", "quality"),
-    [((16, 8, 0, 0), 25), ((0, 0, 40, 40), 25), ((16, 16, 16, 24), 25), ((16, 16, 16, 24), 100)],
-)
-def test_black_bars_do_not_change_the_flow_between_them(pair, bars, quality):
-    above, below, left, right = bars
-
-    def coded(image):
-        frame = cv2.copyMakeBorder(image, above, below, left, right, cv2.BORDER_CONSTANT)
-        data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-        return cv2.imdecode(data, cv2.IMREAD_COLOR)
-
-    inside = slice(above, 96 + above), slice(left, 160 + left)
-    first, second = coded(pair.image_ref), coded(pair.image_next)
-    flow = resolve_flow(Pair(first, second, pair.K_ref, pair.K_next), "dis")
-    alone = dis_flow(first[inside], second[inside])
-    assert np.median(np.abs(flow.uv[inside] - alone.uv)) < 0.02
-    assert flow.confidence[inside].mean() == pytest.approx(alone.confidence.mean(), abs=0.03)
-    bar = np.ones(flow.confidence.shape, bool)
-    bar[inside] = False
-    assert flow.confidence[bar].max() == 0.0
-
-
-def test_pictures_without_black_bars_are_whole(pair):
-    def whole(first, second) -> bool:
-        inside = content(first, second)
-        return all(image[inside].shape == image.shape for image in (first, second))
-
-    dark = np.zeros_like(pair.image_ref)
-    for first, second in ((pair.image_ref, pair.image_next), (dark, dark), (pair.image_ref, dark)):
-        assert whole(first, second)
-    night = pair.image_ref.copy()
-    night[:30] = 0
-    # dark in one of the frames only
-    assert whole(night, pair.image_next)
-    assert content(night, night) == (slice(30, 96), slice(0, 160))
-    night[:32] = 0
-    assert content(night, night) == (slice(32, 96), slice(0, 160))
-    lamps = pair.image_ref // 16
-    lamps[8:80:8, 20:140:8] = 200
-    assert whole(lamps, lamps)
-    # too little would be left; frames of two sizes
-    night[:33] = 0
-    assert whole(night, night)
-    assert whole(night[1:], night)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ entry point of the group `soup_nlp.flow`; the name of the entry point is the nam
 
 import warnings
 from collections.abc import Callable
-from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
@@ -41,13 +40,6 @@ CORRELATION = 5.0
 
 FEW = 0.2
 """Share of usable pixels below which the focal lengths are doubted."""
-
-BLACK = 24
-"""Largest grey level of a black bar: black of limited range is 16, and its coding has errors."""
-LEAST_CONTENT = 64
-"""Least side of the picture between black bars, pixels."""
-LEAST_LIGHT = 0.5
-"""Least share of that picture that is lighter than a bar: at night its dark parts are no bars."""
 
 
 def load_flow(path: PathLike) -> Flow:
@@ -115,9 +107,6 @@ class FlowOptions(Section):
     confidence: str | None = None
     """File of the confidence of a `source` that is a file: .npy in [0, 1], or a grey picture,
     black for unusable."""
-    see_through: bool = True
-    """Where flow that was computed follows a layer that stands still before a moving scene (a
-    reflection in a windscreen), search for the flow of the scene along its epipolar lines."""
     consistency: bool = True
     """Weight a vector of DIS, or of a file with a backward flow, by how well its round trip closes;
     if false, all vectors that stay in the image have the same weight, as in the paper."""
@@ -220,38 +209,6 @@ def is_network(source: str) -> bool:
     return Path(source).suffix == ".onnx"
 
 
-def content(image_ref: Image, image_next: Image) -> tuple[slice, slice]:
-    """Rows and columns between the black bars that both images have along their borders.
-
-    All rows and columns if what is left is too small (`LEAST_CONTENT`) or itself mostly black
-    (`LEAST_LIGHT`), or if the images differ in size.
-    """
-    whole = np.s_[:, :]
-    if image_ref.shape != image_next.shape:
-        return whole
-    light = np.maximum(image_ref, image_next).max(axis=2) > BLACK
-    lines = (np.flatnonzero(light.any(axis=1 - axis)) for axis in (0, 1))
-    inside = [slice(line[0], line[-1] + 1) if len(line) else slice(0, 0) for line in lines]
-    rows, columns = inside
-    if min(side.stop - side.start for side in inside) < LEAST_CONTENT:
-        return whole
-    return (rows, columns) if light[rows, columns].mean() >= LEAST_LIGHT else whole
-
-
-def flow_between_bars(match: FlowSource, image_ref: Image, image_next: Image) -> Flow:
-    """Flow of the picture between black bars, with confidence 0 on the bars.
-
-    A bar stands still whatever the camera does, and a method that smooths the flow would spread
-    that into the picture.
-    """
-    inside = content(image_ref, image_next)
-    first, second = (np.ascontiguousarray(image[inside]) for image in (image_ref, image_next))
-    flow, size = match(first, second), image_ref.shape[:2]
-    uv, confidence = np.zeros((*size, 2), np.float32), np.zeros(size, np.float32)
-    uv[inside], confidence[inside] = flow.uv, flow.confidence
-    return Flow(uv, confidence, flow.source)
-
-
 def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
     """The flow of a pair from a named source.
 
@@ -265,12 +222,11 @@ def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
         DataError: the source is unknown or fails, or its flow has another size.
     """
     if source == "dis":
-        method = partial(dis_flow, consistency=consistency)
-        return flow_between_bars(method, pair.image_ref, pair.image_next)
+        return dis_flow(pair.image_ref, pair.image_next, consistency)
     if source == "truth" or source.startswith(NOISE):
         return flow_from_truth(pair, source)
     if is_network(source):
-        return flow_between_bars(partial(learned_flow, source), pair.image_ref, pair.image_next)
+        return learned_flow(source, pair.image_ref, pair.image_next)
     plugins = flow_sources()
     if source in plugins:
         return _run_plugin(plugins[source], pair)
