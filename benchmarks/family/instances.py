@@ -185,7 +185,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     reals: dict[str, Any] = {k: rounded(v) for k, v in values.items() if v.dtype == np.float64}
     data = replace(data, **reals)
     weights = record.weights(weights)
-    return Case(problem, pair, seg, start, data, weights, start.soup, options, seen=pair)
+    return Case(problem, pair, seg, start, data, weights, start.soup, options)
 
 
 def build_instance(

@@ -9,7 +9,7 @@ from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.components import connected_pieces
-from soup_nlp.start.epipolar import SIDEWAYS, Motion, estimate, fit_translation, repeated
+from soup_nlp.start.epipolar import SIDEWAYS, Motion, estimate, repeated
 from soup_nlp.start.views import FlowFit, Views
 
 CLIP = 3.0
@@ -54,15 +54,13 @@ def limited_noise(error: Float) -> float:
     return float(np.clip(np.median(error), LEAST_NOISE, MOST_NOISE))
 
 
-def of_pieces(flow: FlowFit, motions: list[Motion], cost: Float, noise: float) -> list[Motion]:
+def of_pieces(flow: FlowFit, cost: Float, noise: float) -> list[Motion]:
     """Motions of the connected pieces whose flow the present motions do not explain.
 
-    A piece gets two candidates: the motion of its own essential matrix, and a translation with the
-    main rotation, because a small patch determines a translation better than a whole motion.
+    A piece gets the motion of its own essential matrix.
 
     Args:
         flow: The flow of every superpixel.
-        motions: The present M motions; the first has the main rotation.
         cost: (N, M) penalised error under them, pixels.
         noise: Flow noise, pixels.
     """
@@ -77,7 +75,6 @@ def of_pieces(flow: FlowFit, motions: list[Motion], cost: Float, noise: float) -
         matches = flow.views.subset(piece == c).matches()
         motion = estimate(matches, max(3 * noise, 0.3), flow.options.seed)
         out += [] if motion is None else [motion]
-        out.append(fit_translation(motions[0].R, matches, max(noise, 0.1)))
     return out
 
 
@@ -192,7 +189,7 @@ def rigid_choice(flow: FlowFit, motions: list[Motion]) -> Choice:
         motions, cost = [motions[c] for c in kept], cost[:, kept]
         noise = limited_noise(cost.min(axis=1)[with_flow])
         # motions of the pieces that no motion explains yet
-        extra = of_pieces(flow, motions, cost, noise) if extend < ROUNDS else []
+        extra = of_pieces(flow, cost, noise) if extend < ROUNDS else []
         if not extra:
             break
         motions = motions + extra

@@ -1,28 +1,21 @@
-"""Ground plane: what stands on it, lies below it or floats above it.
+"""Ground plane: what stands on it, lies below it or is off it.
 
 A superpixel without usable flow (it leaves the image, is dark or moves too fast) borrows its depth
 from its neighbours, and a component without a known support is scaled by its outline. Both may come
 out far below the road. In an upright image, a level plane on which much of the scene lies and below
 which almost nothing lies bounds the depth of everything seen below the horizon.
 
-The camera's motion also explains an object that moves along the epipolar lines, such as an oncoming
-car, but at a depth that is too small. Such an object floats: the ground that is visible along its
-lower border is far behind it.
-
 In a traffic jam a group of vehicles may be larger than the road. The static scene is then known by
 what stands on it, and by its level ground.
 """
-
-from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import (
+    CONTACT,
     FIXED,
-    GROUND,
     SCENE,
     TIES,
     connected_pieces,
@@ -39,28 +32,18 @@ ON, BELOW = 0.05, 0.2
 second on it lies below."""
 LEAST_ON, MOST_BELOW = 0.05, 0.05
 """Of the area with known depth, the least share on the ground and the largest share below it."""
-RISES = 1.35
-"""Ratio to the inverse depth of the ground from which on a superpixel is part of what may float;
-superpixels on an outline contain pixels of both sides."""
 STANDS = 0.1
 """Log ratio to the depth of the ground up to which a superpixel lies on it, and up to which a
 region stands on it. Regions with the right depth have at most 0.16."""
-STEP, FLOATS = 0.15, 0.2
-"""Least log ratios to the depth of a region on its outline: of another surface, and of the plane of
-the ground along its lower border."""
+STEP = 0.15
+"""Least log ratio of depths along the outline of a region."""
 FEWEST = 3
 """Least number of superpixels of a region that may be off the ground."""
 MOST_AREA = 0.25
 """Largest share of the image of a region of the scene whose contact with the ground tells its
 depth: a larger one may be a table, which does not stand on the floor below its edge."""
-MOST_CLIMB = 0.1
-"""Largest share of its displacement that is across the ground, of what moves along it. Vehicles
-have up to 0.07, boxes that swing and limbs 0.22 to 0.44."""
 VISIBLE = 0.6
 """Least share of ground along the lower border of a region."""
-FACES_DOWN = 0.7
-"""Cosine between the normal of a superpixel and the vertical downwards from which it fills the gap
-between a region and the ground below: it contains pixels of both."""
 TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
@@ -143,93 +126,6 @@ def above_ground(
     return Soup(lam, soup.n, soup.d, soup.R, t), lifted
 
 
-class Region(NamedTuple):
-    """A region off the ground that is continuous in depth, and the ground along its lower border.
-
-    Attributes:
-        members: (N,) True in the region.
-        ground: Log ratio of the depth of the plane of the ground to that of the region, along the
-            lower border.
-        step: The same ratio with the depth of the superpixels on the ground there.
-        climb: Share of its displacement in the scene that is across the ground, at the depth of the
-            ground.
-    """
-
-    members: Mask
-    ground: float
-    step: float
-    climb: float
-
-
-def regions(
-    flow: FlowFit, soup: Soup, floor: Float, component: Int, ratios: tuple[float, float]
-) -> list[Region]:
-    """Regions off the ground, with the ground visible along most of their lower borders.
-
-    Regions of fewer than `FEWEST` superpixels are left out, and those of the scene with more than
-    `MOST_AREA` of the image.
-
-    Args:
-        flow: The flow of every superpixel.
-        soup: Start, its components scaled.
-        floor: (N,) inverse depth of the ground (`ground`).
-        component: (N,) group that moves as one.
-        ratios: Between these ratios to its inverse depth a superpixel lies on the ground.
-    """
-    if not floor.any():
-        return []
-    seg, ray, middle = flow.seg, flow.views.anchor, flow.middle
-    mu = 1 / soup.depth_at(ray)
-    on_ground = (floor > 0) & (mu > ratios[0] * floor) & (mu <= ratios[1] * floor)
-    depth = soup.depth_across(seg.pairs, middle)
-    step = np.log(depth[1] / depth[0])
-    whole = (np.abs(step) < STEP) & ~seg.across(component)
-    region = 1 + connected_pieces(~on_ground, seg, whole)
-    around, across = outlines(region, seg), seg.across(region)
-    plane = np.linalg.lstsq(ray[floor > 0], floor[floor > 0])[0]
-    # by entry of the outlines: log ratios of the other side's and the ground's depth to its own
-    gap = np.concatenate([step[across], -step[across]])
-    level = np.tile(-np.log(np.maximum(middle @ plane, 1e-9))[across], 2)
-    rise = level - np.log(depth[:, across]).ravel()
-    scene, first = component == SCENE, int(np.argmax(component == SCENE))
-    down = soup.n[:, 1] > FACES_DOWN
-    fills = down[seg.pairs[across].T.ravel()]
-    out = []
-    for c in range(1, int(region.max()) + 1):
-        mine = region == c
-        low = (around.component == c) & around.below
-        on = low & on_ground[around.neighbour]
-        visible = on.any() and around.weight[on].sum() >= VISIBLE * around.weight[low].sum()
-        if mine.sum() < FEWEST or not visible:
-            continue
-        if seg.sizes[mine].sum() > MOST_AREA * seg.sizes.sum() and scene[mine].any():
-            continue
-        body = mine & ~down
-        # what fills a gap has the depth of the rest
-        own = level + np.log(np.median(mu[body])) if body.any() else rise
-        values = np.where(fills, own, rise), gap
-        above, off = (quantile(v[on], around.weight[on], GROUND) for v in values)
-        point, t = (np.exp(above) * v[mine] for v in (soup.points(ray), soup.translation))
-        moved = np.einsum("nij,nj->ni", soup.R[mine], point) + t - soup.translation[first]
-        way = np.median(moved @ soup.R[first] - point, axis=0)
-        climb = abs(way @ plane) / max(np.linalg.norm(way) * np.linalg.norm(plane), 1e-12)
-        out.append(Region(mine, above, off, float(climb)))
-    return out
-
-
-def floating(flow: FlowFit, soup: Soup, floor: Float, component: Int) -> list[Region]:
-    """The regions that float above the ground; the arguments are those of `regions`.
-
-    A region floats if the ground along its lower border is clearly farther, and it moves along the
-    ground there: what hangs in the air does not.
-    """
-    return [
-        r
-        for r in regions(flow, soup, floor, component, (1 - BELOW, RISES))
-        if r.climb < MOST_CLIMB and r.ground > FLOATS and r.step > STEP
-    ]
-
-
 def off_ground(flow: FlowFit, soup: Soup, component: Int, reliable: Mask) -> Float:
     """(N,) log ratio of the depth of the ground below a region to its own, 0 where none is known.
 
@@ -252,15 +148,34 @@ def off_ground(flow: FlowFit, soup: Soup, component: Int, reliable: Mask) -> Flo
         if on > most:
             floor, most = level, on
     out = np.zeros(len(mu))
-    for r in regions(flow, soup, floor, component, (np.exp(-STANDS), np.exp(STANDS))):
-        out[r.members] = r.ground
+    if not floor.any():
+        return out
+    seg, middle = flow.seg, flow.middle
+    on_ground = (floor > 0) & (np.abs(np.log(mu / np.maximum(floor, 1e-9))) < STANDS)
+    depth = soup.depth_across(seg.pairs, middle)
+    whole = (np.abs(np.log(depth[1] / depth[0])) < STEP) & ~seg.across(component)
+    region = 1 + connected_pieces(~on_ground, seg, whole)
+    around, across = outlines(region, seg), seg.across(region)
+    ray = flow.views.anchor[floor > 0]
+    plane = np.linalg.lstsq(ray, floor[floor > 0])[0]
+    level = -np.log(np.maximum(middle @ plane, 1e-9))
+    rise = (level - np.log(depth))[:, across].ravel()
+    scene = component == SCENE
+    for c in range(1, int(region.max()) + 1):
+        mine = region == c
+        low = (around.component == c) & around.below
+        on = low & on_ground[around.neighbour]
+        visible = on.any() and around.contact[on].sum() >= VISIBLE * around.contact[low].sum()
+        large = area[mine].sum() > MOST_AREA * area.sum() and scene[mine].any()
+        if mine.sum() >= FEWEST and visible and not large:
+            out[mine] = quantile(rise[on], around.contact[on], CONTACT)
     return out
 
 
 def on_ground(
     flow: FlowFit, soup: Soup, reliable: Mask, component: Int, tie: Int
-) -> tuple[Soup, Int, Int, Float]:
-    """Soup, components and ties (N,) with what is below the ground lifted and what floats lowered.
+) -> tuple[Soup, Int, Float]:
+    """Soup and ties (N,) with what is below the ground lifted.
 
     Args:
         flow: The flow of every superpixel.
@@ -270,19 +185,13 @@ def on_ground(
         tie: (N,) origin of its scale, an index of `TIES`.
 
     Returns:
-        Soup, components, ties and (N,) inverse depth of the ground, see `ground`.
+        Soup, ties and (N,) inverse depth of the ground, see `ground`.
     """
     reliable = reliable & (component == SCENE)
     floor = ground(flow, 1 / soup.depth_at(flow.views.anchor), reliable)
     soup, lifted = above_ground(flow, soup, reliable, component, floor)
     tie = np.where(lifted & (tie != FIXED), TIES.index("ground"), tie)
-    lam, component = soup.lam.copy(), component.copy()
-    for region in floating(flow, soup, floor, component):
-        # at the depth of the ground its flow shows a motion of its own
-        lam[region.members] *= np.exp(region.ground)
-        component[region.members] = component.max() + 1
-        tie[region.members] = TIES.index("contact below")
-    return replace(soup, lam=lam), numbered(component), tie, floor
+    return soup, tie, floor
 
 
 def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Mask) -> Int:

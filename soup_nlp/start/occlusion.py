@@ -20,12 +20,10 @@ from soup_nlp.start.bending import moving_pieces
 from soup_nlp.start.components import (
     FIXED,
     TIES,
-    depth_from_inside,
     numbered,
     outlines,
     quantile,
 )
-from soup_nlp.start.merge import SMALL
 from soup_nlp.start.propose import Start
 from soup_nlp.start.views import FlowFit
 
@@ -166,9 +164,6 @@ def in_order(start: Start, pair: Pair, flow: FlowFit) -> Start:
         flow: The flow of its superpixels.
     """
     seg, region, contrast = flow.seg, regions(start, flow), covering(pair, flow)
-    # the flow of a small piece may be a mixture of those around it, or wrong
-    small = np.bincount(region)[region] <= SMALL * len(seg)
-    contrast[small[seg.pairs].any(axis=1)] = 0.0
     whole = vote(contrast, region, seg)
     if not whole.any():
         return start
@@ -209,7 +204,7 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
     after the other, the one with the most votes against placed regions first. Where the median step
     of log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
     that step is `IN_FRONT`. A region that stands on one it covers stays if the step across its
-    upper outline is `STANDING`. A region without an order moves with the one that it touches most.
+    upper outline is `STANDING`.
 
     Args:
         flow: The flow of every superpixel.
@@ -227,16 +222,12 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
     around = outlines(region, seg)
     a, b, length = around.component, around.other, around.contact
     behind = np.concatenate([order[across], -order[across]])
-    step = np.log(depth_from_inside(flow, soup, region))
+    step = np.log(soup.depth_across(seg.pairs[across], flow.middle[across]))
     step = np.concatenate([step[0] - step[1], step[1] - step[0]])
     middle = np.array([np.median(seg.anchors[region == c, 1]) for c in range(count)])
     upper = np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) < middle[a]
     on_ground = tie == TIES.index("contact below")
     upper &= np.bincount(region[on_ground], minlength=count)[a] > 0
-    touch = np.zeros((count, count))
-    np.add.at(touch, (a, b), length)
-    free = np.ones(count, bool)
-    free[a[behind != 0]] = False
     while (use := ~done[a] & done[b] & (behind != 0)).any():
         c = int(np.argmax(np.bincount(a[use], np.abs(behind[use]), minlength=count)))
         # c recedes behind regions that cover it, and comes in front of those that it covers
@@ -248,6 +239,4 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
                 gap = IN_FRONT if quantile(now[high], length[high], 0.5) >= STANDING else gap
             shift[c] += sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0
         done[c] = True
-    follows = free & ~done & (touch.max(axis=1) > 0)
-    shift[follows] = shift[np.argmax(touch, axis=1)[follows]]
     return np.exp(shift)[region]

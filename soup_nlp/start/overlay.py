@@ -2,8 +2,7 @@
 
 They are fixed to the camera, or move as it does, so that their flow shows neither depth nor the
 camera's motion. A distant region stands still as well, but its depth under the camera's motion
-explains that. The flow of a fixed region contradicts every depth from the ground, where there is
-one, to infinity.
+explains that. The flow of a fixed region contradicts every depth.
 """
 
 import numpy as np
@@ -11,9 +10,7 @@ import numpy as np
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.start.choice import PIECE_SIZE, dominant
 from soup_nlp.start.components import connected_labels
-from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.ground import BELOW, ground
-from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
+from soup_nlp.start.views import FlowFit
 
 STILL_PX = 1.0
 """Mean displacement up to which a superpixel may stand still, pixels: it may reflect movers."""
@@ -40,7 +37,7 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     if may.sum() < PIECE_SIZE or not np.array_equal(flow.K_ref, flow.K_next):
         return none, shift
     camera = dominant(flow.without(may | ~usable))[0]
-    error = _error_under(flow, camera, usable & ~may)
+    error = views.fit([camera]).penalised()[:, 0]
     if (error[usable] < CONTRADICTED_PX).sum() < LEAST_SCENE * usable.sum():
         return none, shift
     may &= error - shift > CONTRADICTED_PX
@@ -50,18 +47,3 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     count, still_count = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
     mostly = (still_count >= PIECE_SIZE) & (still_count >= LEAST_SHARE * count)
     return may & mostly[piece], shift
-
-
-def _error_under(flow: FlowFit, camera: Motion, reliable: Mask) -> Float:
-    """(N,) mean error, pixels, of the best depth up to infinity, or up to that of the ground."""
-    views, o = flow.views, flow.options
-    fit = views.fit([camera])
-    mu, error = fit.inverse_depth[:, 0], fit.penalised()[:, 0]
-    if not (o.upright and o.ground):
-        return error
-    reliable = reliable & (error < CONTRADICTED_PX) & (mu > 0)
-    reliable &= fit.parallax[:, 0] * np.abs(mu) > LEAST_PARALLAX_PX
-    floor = ground(flow, mu, reliable)
-    least = (1 - BELOW) * floor
-    moved = views.ray @ camera.R.T + np.maximum(mu, least)[:, None, None] * camera.t
-    return np.where(mu < least, np.maximum(error, views.distance(moved)), error)

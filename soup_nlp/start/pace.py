@@ -7,18 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.geometry.graph import connected
+from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import FIXED, SCENE, TIES, TOO_FAST, outlines
+from soup_nlp.start.components import FIXED, SCENE, TOO_FAST
 from soup_nlp.start.views import FlowFit
 
 UNKNOWN = np.log(100.0)
 """If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
 PACE, UNCARRIED = 0.7, 0.2
 """Standard deviation of the log displacement of components that stand on what is below them,
-relative to the scene, and share of the components that do not: they hang in the air, or their
-lower end is hidden."""
+relative to the scene, and share of the components that do not: they hang in the air."""
 LEAST_DISPLACEMENT = 1e-12
 """Displacements count as at least this, so that their ratio is finite."""
 
@@ -26,15 +24,15 @@ LEAST_DISPLACEMENT = 1e-12
 def nearer_where_fast(flow: FlowFit, soup: Soup, label: Int, tie: Int) -> tuple[Soup, Int]:
     """The soup and ties (N,) with components nearer that their scales make too fast.
 
-    Contact places what hangs in the air, or has a hidden lower end, on the surface behind it, too
-    far, so that it moves too far as well. Its depth is then between that by contact and that at
+    Contact places what hangs in the air on the surface behind it, too far, so that it moves too far
+    as well. Its depth is then between that by contact and that at
     which it moves as far as the scene. The probability q that contact is wrong follows from the log
     pace x (`log_pace`), which is normal where contact is right and uniform up to `UNKNOWN` where it
     is wrong:
 
         q = UNCARRIED / UNKNOWN / (UNCARRIED / UNKNOWN + (1 - UNCARRIED) N(x; 0, PACE^2))
 
-    With a hidden lower end q is 1. The median of the log factor is 0 for q up to 1/2, and
+    The median of the log factor is 0 for q up to 1/2, and
     x (q - 1/2) / q beyond. Beyond `UNKNOWN` the camera is taken to be at rest.
 
     Args:
@@ -43,19 +41,14 @@ def nearer_where_fast(flow: FlowFit, soup: Soup, label: Int, tie: Int) -> tuple[
         label: (N,) index of the component.
         tie: (N,) origin of its scale, an index of `TIES`.
     """
-    far = displacement(soup, flow.views.anchor, label)
-    pace, hidden = log_pace(far, label)[label], np.zeros(len(label), bool)
-    if flow.options.upright:
-        group, hidden = without_support(flow, label, tie == FIXED)
-        pace = np.where(hidden, log_pace(far, group, group[label == SCENE][0])[group], pace)
+    pace = log_pace(displacement(soup, flow.views.anchor, label), label)[label]
     right = np.exp(-0.5 * (pace / PACE) ** 2) / (PACE * np.sqrt(2 * np.pi))
     wrong = UNCARRIED / UNKNOWN
     too_fast = wrong > (1 - UNCARRIED) * right
-    q = np.where(hidden, 1.0, wrong / (wrong + (1 - UNCARRIED) * right))
-    placed = np.isin(tie, (FIXED, TOO_FAST, TIES.index("cut off below"))) | (label == SCENE)
+    q = wrong / (wrong + (1 - UNCARRIED) * right)
+    placed = np.isin(tie, (FIXED, TOO_FAST)) | (label == SCENE)
     may = (pace > 0) & (pace < UNKNOWN) & ~placed
     nearer = np.where(may, np.maximum(q - 0.5, 0.0) / q * pace, 0.0)
-    tie = np.where(may & hidden, TIES.index("cut off below"), tie)
     tie = np.where(may & too_fast, TOO_FAST, tie)
     return replace(soup, lam=soup.lam * np.exp(-nearer)), tie
 
@@ -75,40 +68,16 @@ def order_in_front(flow: FlowFit, soup: Soup, label: Int, tie: Int) -> Float | N
     return np.where(flow.seg.across(label), second - first, 0.0)
 
 
-def without_support(flow: FlowFit, label: Int, fixed: Mask) -> tuple[Int, Mask]:
-    """(N,) groups of components that touch, and (N,) True in groups whose lower end is hidden.
-
-    The lower end is hidden if the lower image border cuts it off, or if the superpixels below it
-    have no flow, so that they may belong to the component. Components that touch are one group,
-    since a person may be cut into pieces; the scene, and those `fixed` (N,) in the image, are
-    alone.
-    """
-    seg, separate = flow.seg, fixed | (label == SCENE)
-    ends = label[seg.pairs]
-    group = connected(ends[~separate[seg.pairs].any(axis=1)], int(label.max()) + 1)[label]
-    # support of a group, visible and beyond the border, weighted by the squared height difference
-    around, groups = outlines(group, seg), int(group.max()) + 1
-    usable = flow.views.usable[around.neighbour]
-    seen, unknown = (
-        np.bincount(around.component[on], around.weight[on], minlength=groups)
-        for on in (around.below & usable, around.below & ~usable)
-    )
-    last = group[seg.labels[-1]]
-    cut_off = np.bincount(last, (len(seg.labels) - around.top[last]) ** 2, minlength=groups)
-    return group, (cut_off + unknown > seen)[group] & ~separate
-
-
-def log_pace(far: Float, label: Int, scene: int = SCENE) -> Float:
+def log_pace(far: Float, label: Int) -> Float:
     """(C,) log ratio of the median displacement of every component to that of the scene.
 
     Args:
         far: (N,) displacement relative to the camera (`displacement`).
         label: (N,) index of the component.
-        scene: Index of the component to which the others are compared.
     """
     median = np.array([np.median(far[label == c]) for c in range(int(label.max()) + 1)])
     median = np.maximum(median, LEAST_DISPLACEMENT)
-    return np.asarray(np.log(median / median[scene]))
+    return np.asarray(np.log(median / median[SCENE]))
 
 
 def displacement(soup: Soup, ray: Float, label: Int) -> Float:

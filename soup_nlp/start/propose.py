@@ -173,7 +173,7 @@ def propose(flow: FlowFit) -> Start:
     scale, tie = contact_scales(flow, soup, component, fixed)
     soup = replace(soup, lam=soup.lam * scale)
     soup, tie = nearer_where_fast(flow, soup, component, tie)
-    soup, component, tie, floor = on_ground(flow, soup, reliable, component, tie)
+    soup, tie, floor = on_ground(flow, soup, reliable, component, tie)
     noise = limited_noise(error[~bends])
     mixed = unmoved(flow, choice, component) & ~(fixed | bends)
     return Start(

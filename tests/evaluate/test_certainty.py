@@ -69,7 +69,6 @@ SAID = {
     "reference": "by flow and parallax",
     "contact below": "with the scale of a contact",
     "outline": "with the scale of an outline",
-    "cut off below": "with a lower end that is hidden",
     "nothing": "without contact to anything that has a scale",
     "ground": "with the scale of a contact",
     "fixed in the image": "with the scale of an outline",

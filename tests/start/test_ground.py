@@ -1,14 +1,12 @@
 """Nothing lies below the ground, and nothing floats above it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.ground import above_ground, floating, ground, off_ground, scene_first
+from soup_nlp.start.ground import above_ground, ground, off_ground, scene_first
 from soup_nlp.start.views import FlowFit
 
 HIGH, FAR = 1.5, 30.0
@@ -98,26 +96,6 @@ def test_reliable_depth_stays_below(flow):
     np.testing.assert_allclose(soup.depth_at(ray), depth, rtol=1e-12)
 
 
-@pytest.mark.parametrize("car", [0.5, 1.0])
-def test_a_floating_region_is_found_with_its_distance(flow, car):
-    Z = street(flow, car)
-    floor = ground(flow, 1 / Z, ~BODY)
-    assert floor.any()
-    regions = floating(flow, moving(Z), floor, SCENE)
-    if car == 1.0:
-        # the car stands on the ground, and so does the wall
-        assert regions == []
-        return
-    assert len(regions) == 1
-    np.testing.assert_array_equal(regions[0].members, BODY)
-    # up to the spacing of the sampled rows of the boundary
-    assert np.exp(regions[0].ground) == pytest.approx(1 / car, rel=0.1)
-    # relative to a camera that moves by (0, 0, 1), it would climb by a fifth of its way
-    soup = moving(Z)
-    hangs = replace(soup, t=soup.t + np.where(BODY, 0.1 / soup.lam, 0.0)[:, None] * [0.0, 1.0, 0.0])
-    assert floating(flow, hangs, floor, SCENE) == []
-
-
 @pytest.mark.parametrize("car", [0.8, 1.0, 2.0])
 @pytest.mark.parametrize("number", [0, 1])
 def test_the_distance_of_a_region_from_the_ground_is_told(flow, car, number):
@@ -129,21 +107,6 @@ def test_the_distance_of_a_region_from_the_ground_is_told(flow, car, number):
     # the wall is the scene, and the road no region
     np.testing.assert_allclose(off[~BODY], 0.0, atol=1e-12)
     assert (off_ground(flow, soup, component, BODY) == 0).all()
-
-
-def test_superpixels_that_join_region_and_ground_do_not_count(flow):
-    """They contain pixels of both, and their planes face down from one to the other."""
-    Z = street(flow, 0.8)
-    joins, near = BODY & (ROW == 13), Z[BODY][0]
-    top, bottom = (rays(K, np.array([[0.0, v]]))[0, 1] for v in (13 * 8 - 0.5, 14 * 8 - 0.5))
-    along = np.array([bottom * near / 0.8 - top * near, near / 0.8 - near])
-    normal = np.array([0.0, along[1], -along[0]]) / np.linalg.norm(along)
-    soup = moving(Z)
-    n, d = soup.n.copy(), soup.d.copy()
-    n[joins], d[joins] = normal, -(normal[1] * top + normal[2]) * near / soup.lam[joins]
-    soup = replace(soup, n=n, d=d)
-    off = off_ground(flow, soup, BODY.astype(int), ALL)
-    np.testing.assert_allclose(off[BODY], -np.log(0.8), atol=0.03)
 
 
 def test_a_quarter_of_the_image_may_be_a_resting_table(flow):

@@ -174,14 +174,6 @@ def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
     assert changed() > 10
 
 
-def test_small_pieces_have_no_order(monkeypatch):
-    (pair, seg), before = sliding(True), begun(True)
-    monkeypatch.setattr(occlusion, "SMALL", 5 / len(seg))
-    assert ordered(before, seg, pair) is not before
-    monkeypatch.setattr(occlusion, "SMALL", 6 / len(seg))
-    assert ordered(before, seg, pair) is before
-
-
 def test_an_image_without_discontinuities_keeps_its_start(swing):
     pair, seg = swing
     still = pair.with_flow(Flow(0 * pair.flow.uv, pair.flow.confidence, "zero"))

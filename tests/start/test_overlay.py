@@ -49,8 +49,6 @@ STILL = {
     "middle": (np.s_[40:70, 60:100], TURN),
     "bottom": (np.s_[90:, :], TURN),
     "corner": (np.s_[:30, 120:], TURN),
-    # without rotation infinity stands still as well, but not below the horizon
-    "bonnet, straight on": (np.s_[100:, :], np.zeros(3)),
 }
 
 
