@@ -15,7 +15,6 @@ from soup_nlp.data.flow.sources import (
     is_named,
     resolve_flow,
 )
-from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.working_size import at_common_focal, resized_flow, scaled_camera
@@ -148,14 +147,6 @@ def test_flow_of_reduced_frames_is_not_mixed_at_edges() -> None:
     np.testing.assert_allclose(shift[:, 10:], np.broadcast_to((3, -1), (16, 10, 2)), atol=1e-6)
 
 
-def test_focal_lengths_that_contradict_the_images_give_a_warning() -> None:
-    pair = render_scene("orbit", 0, 256, 108)
-    K = pair.K_next * [[3, 1, 1], [1, 3, 1], [1, 1, 1]]
-    with pytest.warns(DataWarning, match="not at their focal lengths.*probably wrong"):
-        flow = FlowOptions().load(Pair(pair.image_ref, pair.image_next, pair.K_ref, K), Path)
-    np.testing.assert_array_equal(flow.uv, FlowOptions().load(pair, Path).uv)
-
-
 # --- flow is plausible or refused ----------------------------------------------------------------
 
 
@@ -179,9 +170,6 @@ def test_flows_that_do_not_fit_name_their_cause(tmp_path: Path) -> None:
         write_flo(path, flow)
         with pytest.raises(DataError, match=words):
             resolve_flow(pair, str(path))
-    write_flo(path, 0 * true)
-    with pytest.warns(DataWarning, match="hardly better than no flow"):
-        resolve_flow(pair, str(path))
 
 
 def test_a_backward_flow_is_compared_with_the_images_too(tmp_path: Path) -> None:

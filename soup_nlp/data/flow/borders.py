@@ -17,10 +17,10 @@ from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
 
 SCALE_PX = 0.25
 """Smallest residual that a fit may treat as an outlier, pixels."""
-ROUNDS = 5
+ROUNDS = 4
 """Re-weighted fits of an affine flow."""
-SWEEPS, REFIT = 24, 8
-"""Number of sweeps (a border moves at most one pixel in each), and sweeps between fits."""
+SWEEPS = 8
+"""Number of sweeps, in each of which a border moves at most one pixel, after each of two fits."""
 LEAST_STEP = 0.05
 """Least reduction of the residual of log depth for which a pixel changes its superpixel."""
 
@@ -47,15 +47,10 @@ def follow_flow(
     """
     current = labels.astype(np.int64)
     count = int(current.max()) + 1
-    fit, _ = fit_affine(flow, current)
-    changed = np.zeros(count, bool)
-    near = np.ones(current.shape, bool)
-    for sweep in range(SWEEPS):
-        if changed.any() and sweep % REFIT == 0:
-            new, _ = fit_affine(flow, current, changed)
-            for old, values in zip(vars(fit).values(), vars(new).values()):
-                old[changed] = values[changed]
-            changed[:], near[:] = False, True
+    for sweep in range(2 * SWEEPS):
+        if sweep % SWEEPS == 0:
+            fit, _ = fit_affine(flow, current)
+            near = np.ones(current.shape, bool)
         framed = np.pad(current, 1, mode="edge")
         sides = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
         # only pixels near a change of the last sweep can change
@@ -69,9 +64,6 @@ def follow_flow(
             better = (residual < least) & (other != owner)
             best[better], least[better] = other[better], residual[better]
         moved = best != owner
-        if not moved.any():
-            break
-        changed[owner[moved]] = changed[best[moved]] = True
         current[v[moved], u[moved]] = best[moved]
         near[:] = False
         near[v[moved], u[moved]] = True
@@ -128,26 +120,22 @@ class AffineFlow:
         return np.where(self.fitted[which], np.linalg.norm(uv - predicted, axis=1), np.inf)
 
 
-def fit_affine(
-    flow: Flow, labels: NDArray[np.integer], only: NDArray[np.bool_] | None = None
-) -> tuple[AffineFlow, Float]:
+def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Float]:
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
-    s is the larger of `SCALE_PX` and the spread of the superpixel, 1.48 times the weighted mean
-    absolute residual. The first weights follow from the distance to the median flow of the
-    superpixel, since plain least squares would fit a slope across two motions without outliers.
+    s is the larger of `SCALE_PX` and 1.48 times the weighted mean absolute residual of the
+    superpixel. The first weights are those of the distance to its mean flow, since plain least
+    squares would fit a slope across two motions without outliers.
 
     Args:
         flow: Flow, whose confidence multiplies the weights.
         labels: (H, W) superpixel labels 0..N-1.
-        only: (N,) True for superpixels to fit; None for all.
 
     Returns:
         The fits, and the last weights (P,) of the pixels with positive confidence.
     """
-    use = flow.confidence > 0
-    v, u = np.nonzero(use if only is None else use & only[labels])
-    which, n = labels[v, u].astype(np.int64), int(labels.max()) + 1 if only is None else len(only)
+    v, u = np.nonzero(flow.confidence > 0)
+    which, n = labels[v, u].astype(np.int64), int(labels.max()) + 1
     base = flow.confidence[v, u].astype(np.float64)
     total = np.maximum(np.bincount(which, base, n), 1e-30)
     centre = np.stack([np.bincount(which, base * x, n) / total for x in (u, v)], axis=1)
@@ -155,32 +143,17 @@ def fit_affine(
     # coordinates are normalised by the size of the superpixel
     fit = AffineFlow(np.zeros((n, 3, 2)), centre, np.sqrt(np.maximum(pixels, 1)), pixels >= 6)
     X = fit.basis(which, u, v)
-    uv = flow.uv[v, u]
-    Y = uv.astype(np.float64)
-    r = np.linalg.norm(Y - np.stack([_medians(which, y, n) for y in uv.T], axis=1)[which], axis=1)
-    s = np.maximum(1.48 * _medians(which, r, n), SCALE_PX)
-    weight = 1.0 / (1.0 + (r / s[which]) ** 2)
-    C = fit.coefficients
-    for _ in range(ROUNDS):
-        C = _weighted(which, X, Y, base * weight, n)
+    Y = flow.uv[v, u].astype(np.float64)
+    C, weight = fit.coefficients, np.ones(len(which))
+    C[:, 0] = np.stack([np.bincount(which, base * y, n) / total for y in Y.T], axis=1)
+    for k in range(ROUNDS):
+        C = _weighted(which, X, Y, base * weight, n) if k else C
         r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, C[which]), axis=1)
         mass = np.maximum(np.bincount(which, base * weight, n), 1e-30)
         spread = 1.48 * np.bincount(which, base * weight * r, n) / mass
         s = np.maximum(spread, SCALE_PX)
         weight = 1.0 / (1.0 + (r / s[which]) ** 2)
     return AffineFlow(C, fit.centre, fit.size, fit.fitted), weight
-
-
-def _medians(which: Int, values: NDArray[np.floating], n: int) -> Float:
-    """(N,) lower median of the values (P,) of every superpixel; 0 without values."""
-    order = np.argsort(values)
-    # numpy uses radix sort for integers of up to 16 bits, which is much faster
-    order = order[np.argsort(which.astype(np.min_scalar_type(n))[order], kind="stable")]
-    count = np.bincount(which, minlength=n)
-    middle = np.cumsum(count) - count + np.maximum(count - 1, 0) // 2
-    if not len(order):
-        return np.zeros(n)
-    return np.where(count > 0, values[order][np.minimum(middle, len(order) - 1)], 0.0)
 
 
 def _weighted(which: Int, X: Float, Y: Float, w: Float, n: int) -> Float:

@@ -6,7 +6,6 @@ at most half as much as without a flow (16 pairs, rendered and real); with a wro
 more.
 """
 
-import warnings
 from typing import Any
 
 import cv2
@@ -14,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap, Image
-from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
 
@@ -24,8 +22,6 @@ consistent at a single pixel, but rarely in a whole window."""
 
 LIMIT = 3.0
 """Round-trip error, pixels, above which a flow is not used: its confidence would be 0.0001."""
-
-_NOISE_CAP = 5.0  # pixels; limits the effect of an outlier on its window
 
 
 def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
@@ -69,31 +65,25 @@ def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.boo
 def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:
     """(H, W) confidence in [0, 1] of a round-trip error.
 
-    With e the error and E the larger of e and the mean of min(e, 5) over a window, the confidence
-    is `exp(-E^2)`, E in pixels, and 0 where E > `LIMIT`.
+    With e the error and E the larger of e and the mean of min(e, `LIMIT`) over a window, the
+    confidence is `exp(-E^2)`, E in pixels, and 0 where e > `LIMIT`.
 
     Args:
         gap: (H, W) round-trip error, pixels; infinite where the flow leaves the next image.
         support: Side of the window for the mean error, odd, pixels.
     """
-    gap = np.maximum(gap, cv2.blur(np.minimum(gap, _NOISE_CAP), (support, support)))
-    confidence = np.exp(-np.square(np.minimum(gap, LIMIT)), dtype=np.float32)
-    confidence[~(gap <= LIMIT)] = 0.0
-    return np.asarray(confidence, dtype=np.float32)
+    known = np.minimum(gap, LIMIT)
+    mean = np.maximum(known, cv2.blur(known, (support, support)))
+    return np.where(gap <= LIMIT, np.exp(-np.square(mean)), 0.0).astype(np.float32)
 
 
 BETTER = 0.8
 """Ratio of two photometric errors below which the changed flow is clearly better."""
-WORSE = 0.02
-"""Least excess of the error of a rejected flow over that without a flow, standard deviations."""
-USELESS = 0.9
-"""A warning is given if the error of a flow exceeds this times the error without a flow."""
-
-_BLUR = 2.0  # pixels
-_CAP = 1.0  # standard deviations of grey
-_PIXELS = 250_000  # that are compared
-_LEAST = 0.2  # share of the known pixels that must stay in the image
-_FACTORS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 2, 2, 3, 4)
+FLAT = 0.02
+"""Photometric error, standard deviations of grey, below which images agree with every flow."""
+OTHER = "is it of these two images, in this order, in pixels?"
+MOST_PIXELS = 250_000
+"""Largest number of pixels that are compared."""
 
 
 def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
@@ -108,13 +98,10 @@ def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
     Raises:
         DataError: the flow is in another order, direction or unit, leads out of the image, or is
             worse than no flow.
-
-    Warns:
-        DataWarning: the flow is hardly better than no flow.
     """
     if backward:
         pair = Pair(pair.image_next, pair.image_ref, pair.K_next, pair.K_ref)
-    step = 1 + int(np.sqrt(flow.confidence.size / _PIXELS))
+    step = 1 + int(np.sqrt(flow.confidence.size / MOST_PIXELS))
     height, width = pair.size
     v, u = (x.astype(np.float32) for x in np.mgrid[0:height:step, 0:width:step])
     uv, usable = flow.uv[::step, ::step], flow.confidence[::step, ::step] > 0
@@ -124,54 +111,44 @@ def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
         """Difference of every pixel and its target; NaN where unknown or outside."""
         x, y = (np.asarray(p + uv[..., k], np.float32) for k, p in enumerate((u, v)))
         inside = (x >= 0) & (y >= 0) & (x < following.shape[1]) & (y < following.shape[0])
-        gap = np.minimum(np.abs(sampled(following, x, y) - ref), _CAP)
+        gap = np.minimum(np.abs(sampled(following, x, y) - ref), 1.0)
         return np.where(usable & inside, gap, np.nan)
 
     def mean(of: FloatMap, other: FloatMap) -> float:
         """Mean over the pixels that have both differences; infinite if these are few."""
         both = np.isfinite(of) & np.isfinite(other)
-        return float(of[both].mean()) if both.sum() > _LEAST * usable.sum() else np.inf
+        return float(of[both].mean()) if both.sum() > 0.2 * usable.sum() else np.inf
 
     along = differences(uv)
     # without motion a pixel keeps its ray
     A = (pair.K_next @ np.linalg.inv(pair.K_ref))[:2]
     at = np.stack([u, v], axis=-1)
     without = differences(at @ A[:, :2].T + A[:, 2] - at)
-    error_along, error_without = mean(along, along), mean(without, without)
     problem, hint, least = "", "", BETTER
-    if error_along > error_without + WORSE and not backward:
-        problem = "flow does not fit the images: it is worse than no flow"
-        hint = "is it of these two images, in this order, in pixels?"
+    if not backward and mean(without, without) < BETTER * mean(along, along):
+        problem, hint = "flow does not fit the images: it is worse than no flow", OTHER
     for cause, changed in _changes(uv, pair).items():
         new = differences(changed)
         # a pixel that leaves the image along either flow is not compared
         both = [(mean(new, old), mean(old, new)) for old in (along, without)]
-        # images without contrast agree with every flow
-        relative = max((a / b if b > WORSE else 1.0 for a, b in both if a < np.inf), default=np.inf)
+        relative = max((a / b if b > FLAT else 1.0 for a, b in both if a < np.inf), default=np.inf)
         if relative < least:
             problem, hint, least = "flow does not fit the images", f"it does {cause}", relative
     if problem:
         raise DataError(
             problem,
             where=flow.source,
-            found=f"difference of the images {error_along:.3f} along the flow,"
-            f" {error_without:.3f} without a flow",
+            found=f"difference of the images {mean(along, along):.3f} along the flow,"
+            f" {mean(without, without):.3f} without a flow",
             expected="displacements (u right, v down) in pixels, to the other image",
             hint=hint,
-        )
-    if not backward and error_without > WORSE and error_along > USELESS * error_without:
-        warnings.warn(
-            f"flow {flow.source} explains the images hardly better than no flow"
-            f" ({error_along:.3f} and {error_without:.3f}): is it of these images?",
-            DataWarning,
-            stacklevel=2,
         )
 
 
 def _grey(image: Image) -> FloatMap:
     """(H, W) blurred grey values in standard deviations from their mean."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    grey = cv2.GaussianBlur(grey, (0, 0), _BLUR)
+    grey = cv2.GaussianBlur(grey, (0, 0), 2.0)
     return np.asarray((grey - grey.mean()) / max(float(grey.std()), 1.0), np.float32)
 
 
@@ -184,5 +161,8 @@ def _changes(uv: FloatMap, pair: Pair) -> dict[str, FloatMap | Float]:
         "with the sign of v changed: its axis may point up": uv * [1.0, -1.0],
         "times the image's size: it may be relative to it": uv * size,
         "times half the image's size: it may be relative to it": uv * size / 2,
-        **{f"times {x:.3g}: it may be of another resolution": uv * x for x in _FACTORS},
+        **{
+            f"times {x:.3g}: it may be of another resolution": uv * x
+            for x in (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 2, 2, 3, 4)
+        },
     }

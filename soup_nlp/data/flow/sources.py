@@ -4,7 +4,6 @@ A plug-in is a function `(image_ref, image_next) -> Flow` that an installed pack
 entry point of the group `soup_nlp.flow`; the name of the entry point is the name of the source.
 """
 
-import warnings
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -16,7 +15,6 @@ from soup_nlp.arrays import Image
 from soup_nlp.data.flow.consistency import check_flow, confidence_of, round_trip_error
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.learned import learned_flow
-from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
 from soup_nlp.data.working_size import at_common_focal, resized_flow
@@ -37,9 +35,6 @@ NOISE = "truth+noise:"
 
 CORRELATION = 5.0
 """Standard deviation of the Gaussian that blurs the noise, pixels."""
-
-FEW = 0.2
-"""Share of usable pixels below which the focal lengths are doubted."""
 
 
 def load_flow(path: PathLike) -> Flow:
@@ -120,10 +115,6 @@ class FlowOptions(Section):
 
         Raises:
             DataError: the source is unknown, or its flow is damaged or has another size.
-
-        Warns:
-            DataWarning: hardly any flow is found at the given focal lengths, but the unchanged
-                images match; the flow of the unchanged images is returned.
         """
         source = str(path(self.source)) if is_path(self.source) else self.source
         if self.backward or self.confidence:
@@ -133,20 +124,7 @@ class FlowOptions(Section):
         flow = resolve_flow(near, source, self.consistency)
         if near is pair:
             return flow
-        flow = resized_flow(flow, near, pair)
-        if flow.usable >= FEW:
-            return flow
-        plain = resolve_flow(pair, source, self.consistency)
-        if plain.usable < 2 * FEW:
-            return flow
-        warnings.warn(
-            f"the images match as they are ({plain.usable:.0%} of the pixels), but not at their"
-            f" focal lengths, {pair.K_ref[0, 0]:g} and {pair.K_next[0, 0]:g} px"
-            f" ({flow.usable:.0%}): these are probably wrong",
-            DataWarning,
-            stacklevel=2,
-        )
-        return plain
+        return resized_flow(flow, near, pair)
 
     def _with_confidence(self, pair: Pair, source: str, path: Callable[[str], Path]) -> Flow:
         """The flow of a file, its confidence from a backward flow and a map."""
