@@ -78,8 +78,8 @@ start/part                1     N       what moves as one: its component, or the
 without usable flow
 start/surface             1     N       region without a flow discontinuity
 start/tie                 1     N       what gives its component a scale: 0 largest, \
-1 contact below, 2 outline, 3 nothing, 4 ground, 5 fixed in image, 6 given depth, \
-7 occlusion, 8 too fast
+1 contact below, 2 outline, 3 nothing, 4 fixed in image, 5 given depth, 6 occlusion, \
+7 too fast
 start/bends               1     N       in a region with the energy for surfaces that bend
 start/unexplained         1     N       no motion explains the flow, or it bends although it jumps
 start/bending             1     -       a region bends

@@ -4,10 +4,9 @@ A superpixel without usable flow (it leaves the image, is dark or moves too fast
 from its neighbours, and a component without a known support is scaled by its outline. Both may come
 out far below the road. In an upright image, a level plane on which much of the scene lies and below
 which almost nothing lies bounds the depth of everything seen below the horizon.
-
-In a traffic jam a group of vehicles may be larger than the road. The static scene is then known by
-what stands on it, and by its level ground.
 """
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,11 +14,8 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import (
     CONTACT,
-    FIXED,
     SCENE,
-    TIES,
     connected_pieces,
-    numbered,
     outlines,
     quantile,
 )
@@ -87,43 +83,26 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
     return np.maximum(plane_mu, 0.0)
 
 
-def above_ground(
-    flow: FlowFit, soup: Soup, reliable: Mask, component: Int, floor: Float
-) -> tuple[Soup, Mask]:
-    """The soup with unreliable or independently moving parts lifted to the ground.
+def on_ground(flow: FlowFit, soup: Soup, reliable: Mask, component: Int) -> tuple[Soup, Float]:
+    """The soup without unreliable or independently moving superpixels below the ground.
 
-    A component with most of its area below the ground comes nearer as a whole, and its translation
-    becomes shorter. Single superpixels of the scene keep the translation they share.
+    They are lifted to it. Those of the scene keep the translation they share.
 
     Args:
         flow: The flow of every superpixel.
         soup: Start, its components scaled.
-        reliable: (N,) True where the depth is reliable and belongs to the scene.
+        reliable: (N,) True where the depth is reliable.
         component: (N,) group that moves as one.
-        floor: (N,) inverse depth of the ground (`ground`).
 
     Returns:
-        The soup, and (N,) True in components that were lifted as a whole.
+        The soup, and (N,) inverse depth of the ground, see `ground`.
     """
-    mu, weight = 1 / soup.depth_at(flow.views.anchor), flow.seg.sizes
-    scene = component == SCENE
-    lam, t = soup.lam.copy(), soup.t.copy()
-    lifted = np.zeros(len(mu), bool)
-
-    def below() -> Mask:
-        return np.asarray(mu * soup.lam / lam < (1 - BELOW) * floor)
-
-    for c in np.unique(component[below() & ~scene]):
-        members = np.flatnonzero((component == c) & (floor > 0))
-        under = members[below()[members]]
-        if weight[under].sum() > 0.5 * weight[component == c].sum():
-            lam[component == c] *= np.median(mu[under] / floor[under])
-            lifted |= component == c
-    left = below() & ~reliable
-    factor = mu[left] * soup.lam[left] / lam[left] / floor[left]
-    lam[left] *= factor
-    t[left & scene] /= factor[scene[left], None]
-    return Soup(lam, soup.n, soup.d, soup.R, t), lifted
+    mu, scene = 1 / soup.depth_at(flow.views.anchor), component == SCENE
+    floor = ground(flow, mu, reliable & scene)
+    lifted = (mu < (1 - BELOW) * floor) & ~(reliable & scene)
+    factor = np.where(lifted, mu / np.maximum(floor, 1e-12), 1.0)
+    t = np.where((lifted & scene)[:, None], soup.t / factor[:, None], soup.t)
+    return replace(soup, lam=soup.lam * factor, t=t), floor
 
 
 def off_ground(flow: FlowFit, soup: Soup, component: Int, reliable: Mask) -> Float:
@@ -170,60 +149,3 @@ def off_ground(flow: FlowFit, soup: Soup, component: Int, reliable: Mask) -> Flo
         if mine.sum() >= FEWEST and visible and not large:
             out[mine] = quantile(rise[on], around.contact[on], CONTACT)
     return out
-
-
-def on_ground(
-    flow: FlowFit, soup: Soup, reliable: Mask, component: Int, tie: Int
-) -> tuple[Soup, Int, Float]:
-    """Soup and ties (N,) with what is below the ground lifted.
-
-    Args:
-        flow: The flow of every superpixel.
-        soup: Start, its components scaled.
-        reliable: (N,) True where the depth is reliable.
-        component: (N,) group that moves as one.
-        tie: (N,) origin of its scale, an index of `TIES`.
-
-    Returns:
-        Soup, ties and (N,) inverse depth of the ground, see `ground`.
-    """
-    reliable = reliable & (component == SCENE)
-    floor = ground(flow, 1 / soup.depth_at(flow.views.anchor), reliable)
-    soup, lifted = above_ground(flow, soup, reliable, component, floor)
-    tie = np.where(lifted & (tie != FIXED), TIES.index("ground"), tie)
-    return soup, tie, floor
-
-
-def scene_first(flow: FlowFit, soup: Soup, reliable: Mask, label: Int, fixed: Mask) -> Int:
-    """(N,) indices of the components (N,), that of the static scene first, see `SCENE`.
-
-    The scene is the largest component. In a traffic jam that may be a group of vehicles: if it
-    stands on a component with a level ground that stands on nothing, that one is the scene.
-
-    Args:
-        flow: The flow of every superpixel.
-        soup: Planes, every motion in its own scale.
-        reliable: (N,) True where the depth is reliable.
-        label: (N,) index of the component.
-        fixed: (N,) True in components that are fixed in the image.
-    """
-    scene, image = int(np.argmax(np.bincount(label, ~fixed))), label[flow.seg.labels]
-    below = stands_on(image, scene)
-    own = reliable & ~fixed & (label == below)
-    mu = 1 / soup.depth_at(flow.views.anchor)
-    if own.any() and stands_on(image, below) < 0 and ground(flow, mu, own).any():
-        scene = below
-    return numbered(np.where(label == scene, -1, label))
-
-
-def stands_on(image: Int, component: int) -> int:
-    """The component below the lower end of another one in an image (H, W) of components.
-
-    It is below on most of the width; -1 for the border.
-    """
-    mine = image == component
-    seen, under = mine.any(axis=0), len(image) - np.argmax(mine[::-1], axis=0)
-    border = seen & (under == len(image))
-    columns = np.flatnonzero(seen & ~border)
-    count = np.bincount(image[under[columns], columns], minlength=1)
-    return -1 if border.sum() >= count.max() else int(np.argmax(count))

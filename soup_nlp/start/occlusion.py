@@ -43,9 +43,6 @@ LEAST_STEP, IN_FRONT = 0.1, 0.35
 """Steps of log depth across the outline of a region, medians along it. A step below the first does
 not agree with the order; the region is then placed so that the step is the second, a guess. True
 steps along such outlines have medians of 0.2 to 1.9."""
-STANDING = 0.23
-"""A region that stands on another one has no step at their contact. From this median step along its
-upper outline it agrees with the order."""
 
 
 def covering(pair: Pair, flow: FlowFit) -> Float:
@@ -203,8 +200,7 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
     The largest region of the scene and those fixed in the image stay. The others are placed one
     after the other, the one with the most votes against placed regions first. Where the median step
     of log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
-    that step is `IN_FRONT`. A region that stands on one it covers stays if the step across its
-    upper outline is `STANDING`.
+    that step is `IN_FRONT`.
 
     Args:
         flow: The flow of every superpixel.
@@ -224,10 +220,6 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
     behind = np.concatenate([order[across], -order[across]])
     step = np.log(soup.depth_across(seg.pairs[across], flow.middle[across]))
     step = np.concatenate([step[0] - step[1], step[1] - step[0]])
-    middle = np.array([np.median(seg.anchors[region == c, 1]) for c in range(count)])
-    upper = np.tile(seg.boundary[across, :, 1].mean(axis=1), 2) < middle[a]
-    on_ground = tie == TIES.index("contact below")
-    upper &= np.bincount(region[on_ground], minlength=count)[a] > 0
     while (use := ~done[a] & done[b] & (behind != 0)).any():
         c = int(np.argmax(np.bincount(a[use], np.abs(behind[use]), minlength=count)))
         # c recedes behind regions that cover it, and comes in front of those that it covers
@@ -235,8 +227,6 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
             counted = use & (a == c) & (sign * behind > 0)
             now = sign * (step - shift[b])
             gap = quantile(now[counted], length[counted], 0.5) if counted.any() else IN_FRONT
-            if sign < 0 and (high := counted & upper).any():
-                gap = IN_FRONT if quantile(now[high], length[high], 0.5) >= STANDING else gap
             shift[c] += sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0
         done[c] = True
     return np.exp(shift)[region]

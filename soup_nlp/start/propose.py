@@ -25,7 +25,7 @@ from soup_nlp.start.components import (
     numbered,
 )
 from soup_nlp.start.epipolar import Motion, stacked
-from soup_nlp.start.ground import on_ground, scene_first
+from soup_nlp.start.ground import on_ground
 from soup_nlp.start.homographies import unorganised
 from soup_nlp.start.merge import SMALL, earned, gather, unexplained, unmoved
 from soup_nlp.start.overlay import fixed_to_camera
@@ -169,11 +169,13 @@ def propose(flow: FlowFit) -> Start:
             regions = component.max() + 1 + connected_pieces(mask, seg)
             component = numbered(np.where(mask, regions, component))
     reliable = ~weak & rigid.views.usable
-    component = scene_first(flow, soup, reliable, component, fixed)
+    # the scene is the largest component
+    scene = np.argmax(np.bincount(component, ~fixed))
+    component = numbered(np.where(component == scene, -1, component))
     scale, tie = contact_scales(flow, soup, component, fixed)
     soup = replace(soup, lam=soup.lam * scale)
     soup, tie = nearer_where_fast(flow, soup, component, tie)
-    soup, tie, floor = on_ground(flow, soup, reliable, component, tie)
+    soup, floor = on_ground(flow, soup, reliable, component)
     noise = limited_noise(error[~bends])
     mixed = unmoved(flow, choice, component) & ~(fixed | bends)
     return Start(
@@ -204,7 +206,6 @@ def _with_depth(flow: FlowFit, choice: Choice, wrong: Mask) -> tuple[Soup, Mask]
     fit, parallax, views = choice.fit, choice.parallax, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
     weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | (fit.cost[:, 0] > CLIP) | flow.poor | wrong
-    weak |= views.weight.sum(axis=1) < 2.0
     if weak.all():
         # no depth is known: all depths are one, with translations that move the image as before
         length = np.where(mu > 0, mu, 0.0)

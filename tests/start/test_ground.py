@@ -6,7 +6,7 @@ from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.ground import above_ground, ground, off_ground, scene_first
+from soup_nlp.start.ground import ground, off_ground, on_ground
 from soup_nlp.start.views import FlowFit
 
 HIGH, FAR = 1.5, 30.0
@@ -40,9 +40,7 @@ def moving(Z: np.ndarray) -> Soup:
 
 
 def lift(flow, Z, reliable, component):
-    reliable = reliable & (component == 0)
-    floor = ground(flow, 1 / Z, reliable)
-    return above_ground(flow, moving(Z), reliable, component, floor)
+    return on_ground(flow, moving(Z), reliable, component * ALL)[0]
 
 
 def test_unknown_depth_comes_up_to_the_road(flow):
@@ -50,27 +48,10 @@ def test_unknown_depth_comes_up_to_the_road(flow):
     lost = (ray[:, 1] > 0.2) & (ray[:, 0] > 0.5)
     assert 0.02 < lost.mean() < 0.2
     depth = np.where(lost, 40.0, Z)
-    soup, lifted = lift(flow, depth, ~lost, SCENE)
+    soup = lift(flow, depth, ~lost, SCENE)
     np.testing.assert_allclose(soup.depth_at(ray), Z, rtol=1e-9)
     # the scene keeps its motion
     np.testing.assert_allclose(soup.translation, moving(depth).translation, rtol=1e-12)
-    assert not lifted.any()
-
-
-def test_a_component_is_lifted_as_one(flow):
-    """Its shape stays, and its flow too: translation and depth change by the same factor."""
-    ray, Z = flow.views.anchor, street(flow)
-    car = (ray[:, 1] > 0.2) & (ray[:, 0] > 0.5)
-    depth = np.where(car, 40.0 + ray[:, 0], Z)
-    soup, lifted = lift(flow, depth, ~car, car.astype(int))
-    np.testing.assert_array_equal(lifted, car)
-    ratio = soup.depth_at(ray) / depth
-    translation = soup.translation[:, 2] / moving(depth).translation[:, 2]
-    np.testing.assert_allclose(ratio, translation, rtol=1e-9)
-    # one factor, except for parts that would still lie below
-    common = np.median(Z[car] / depth[car])
-    assert np.isclose(ratio[car], common).mean() > 0.5
-    assert (soup.depth_at(ray)[car] < Z[car] / 0.8 * (1 + 1e-9)).all()
 
 
 @pytest.mark.parametrize("why", ["below", "steep", "nothing level"])
@@ -92,7 +73,7 @@ def test_reliable_depth_stays_below(flow):
     ditch = (ray[:, 1] > 0.3) & (np.abs(ray[:, 0]) < 0.1)
     assert 0 < ditch.mean() < 0.05
     depth = np.where(ditch, 1.5 * Z, Z)
-    soup, _ = lift(flow, depth, ALL, SCENE)
+    soup = lift(flow, depth, ALL, SCENE)
     np.testing.assert_allclose(soup.depth_at(ray), depth, rtol=1e-12)
 
 
@@ -118,30 +99,3 @@ def test_a_quarter_of_the_image_may_be_a_resting_table(flow):
     # what moves is no table
     off = off_ground(flow, soup, table.astype(int), ALL)
     np.testing.assert_allclose(off[table], np.log(2), atol=0.1)
-
-
-@pytest.mark.parametrize(
-    ("sky", "road", "reference"),
-    # vehicles between these rows of 20 are larger than the road on which they stand; what the lower
-    # border cuts off stands on nothing, and a large sky, which stands on the vehicles, stays
-    [(3, 12, 2), (3, 20, 1), (11, 14, 0)],
-)
-def test_the_scene_is_the_ground_below_the_largest_component(flow, sky, road, reference):
-    Z, label = street(flow), np.digitize(ROW, [sky, road])
-
-    def first(soup, **options):
-        found = scene_first(flow_of(flow.seg, K=K, **options), soup, ALL, label, ~ALL)
-        # the others keep their order
-        left = found != 0
-        assert (np.diff(found[left][np.argsort(label[left], kind="stable")]) >= 0).all()
-        (mine,) = np.unique(label[~left])
-        return mine
-
-    largest = int(np.argmax(np.bincount(label)))
-    assert first(moving(Z)) == reference
-    # a wall is no ground, and the vertical has to be known
-    assert first(moving(np.full(len(Z), FAR))) == largest
-    assert first(moving(Z), upright=False) == largest
-    # nothing stands on what is fixed in the image
-    fixed = scene_first(flow, moving(Z), ALL, label, label == 2)
-    assert (label[fixed == 0] == np.argmax(np.bincount(label[label < 2]))).all()

@@ -15,7 +15,6 @@ from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
-from soup_nlp.start import occlusion
 from soup_nlp.start.components import TIES
 from soup_nlp.start.occlusion import IN_FRONT, SURE, covering, in_order, vote
 from soup_nlp.start.propose import Start, propose
@@ -156,22 +155,6 @@ def test_a_swinging_object_comes_before_the_wall(swing):
     ratio = start.soup.distance[main] / before.soup.distance[main]
     np.testing.assert_allclose(ratio, ratio[0])
     assert not (start.tie[main] == TIES.index("occlusion")).any()
-
-
-@pytest.mark.slow
-def test_what_stands_before_a_near_wall_keeps_its_contact(monkeypatch):
-    pair, seg = rendered("room", 1, 512, 218, 300)
-    one = fitted(pair, seg)
-    before = propose(one)
-
-    def changed() -> int:
-        start = in_order(before, pair, one)
-        return int((start.tie == TIES.index("occlusion")).sum())
-
-    assert changed() == 0
-    # without this rule the objects would be placed like hanging ones
-    monkeypatch.setattr(occlusion, "STANDING", np.inf)
-    assert changed() > 10
 
 
 def test_an_image_without_discontinuities_keeps_its_start(swing):

@@ -41,10 +41,9 @@ def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> l
         (3, 3) maps from reference to next pixels, the dominant one first.
     """
     # every fourth pixel of both directions
-    at = np.s_[::4, ::4]
-    sure = confidence[at] > 0.5
-    ref = np.stack(np.indices(confidence.shape)[::-1], axis=-1)[at][sure].astype(np.float64)
-    target = ref + flow[at][sure]
+    v, u = np.nonzero(confidence[::4, ::4] > 0.5)
+    ref = 4.0 * np.stack([u, v], axis=-1)
+    target = ref + flow[4 * v, 4 * u]
     least = max(20.0, LEAST_SHARE * len(ref))
     out: list[Float] = []
     while len(out) < count and len(ref) >= least:
