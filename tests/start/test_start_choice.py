@@ -9,7 +9,7 @@ from helpers_model import plane_pose, plane_world
 from helpers_start import CAMERA, fitted, flow_of, squares
 
 from soup_nlp.arrays import Mask
-from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.plane import PlaneFit
@@ -242,16 +242,6 @@ def plane() -> tuple[Pair, Segmentation]:
     pair = plane_world(plane_pose(3.0, yaw=20), CAMERA, 96, 72)
     labels = segment(pair.image_ref, 30, "grid")
     return pair, build_segmentation(labels, pair.image_ref, neighbours=8)
-
-
-def test_superpixels_of_hardly_any_confidence_borrow(plane):
-    """Their flow is right here, but its confidence is low."""
-    pair, seg = plane
-    faint = np.isin(np.arange(len(seg)), [8, 9, 20])
-    confidence = np.where(faint[seg.labels], 0.01, 1.0)
-    start = propose(fitted(pair.with_flow(Flow(pair.flow.uv, confidence, "test")), seg))
-    assert start.borrowed[faint].all()
-    assert start.borrowed[~faint].mean() < 0.2
 
 
 def test_motions_that_are_hardly_different_do_not_mix(plane, monkeypatch):
