@@ -35,8 +35,11 @@ class Frozen:
         pair_weight: (P,) colour weight w4 of every pair of neighbours. It is stored, since a few
             pixels of the rendered image lie between two grey levels, and the processor's rounding
             decides which one they take.
-        prior_weight: (E,) weight of E_prior of every edge. It is stored, so that the rules for it
-            can change without a new version of the family.
+        prior_weight: (E,) weight of E_prior of every edge. It and the shares are stored, so that
+            the rules for them can change without a new version of the family.
+        edge_share: (E,) factor of w1 and w2.
+        pair_share: (P,) factor of w4.
+        orient_share: (P,) factor of the weight of E_orient.
         proposal: (N, 10) the proposal.
         minimum: (N, 10) the best known point, an answer of Ipopt.
     """
@@ -49,6 +52,9 @@ class Frozen:
     bending: bool
     pair_weight: Float
     prior_weight: Float
+    edge_share: Float
+    pair_share: Float
+    orient_share: Float
     proposal: Float
     minimum: Float
 
@@ -114,6 +120,9 @@ STORED = {
     "bending": (np.bool_, np.bool_),
     "pair_weight": (np.float64, np.float64),
     "prior_weight": (np.float64, np.float64),
+    "edge_share": (np.float64, np.float64),
+    "pair_share": (np.float64, np.float64),
+    "orient_share": (np.float64, np.float64),
     "proposal": (np.float32, np.float64),
     "minimum": (np.float64, np.float64),
 }

@@ -20,13 +20,13 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import CHOICES, form_label, parse_formulation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.formulation import Coordinates, Formulation
 from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.reweighting import first_edges
+from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
-from soup_nlp.pipeline.case import build_energy, solver_options
+from soup_nlp.pipeline.case import solver_options
 from soup_nlp.pipeline.record import Case
 from soup_nlp.start.choice import limited_noise
 from soup_nlp.start.propose import Start
@@ -164,7 +164,6 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
         error=record.error,
         parallax=none.astype(float),
         borrowed=none.astype(bool),
-        grounded=none.astype(bool),
         motion=none,
         component=record.component,
         part=record.component,
@@ -177,14 +176,22 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
         # records of bending surfaces have their prior in pixels
         noise=1.0 if record.bending else limited_noise(record.error),
     )
-    data, weights = build_energy(problem, pair, seg, start)
-    options = solver_options(problem, start)
-    # records have the K-NN graph alone
-    data = replace(first_edges(data, len(seg.edges)), prior_weight=record.prior_weight)
+    options, energy = solver_options(problem, start), problem.energy
+    pixels = None if energy.pixel_samples == "all" else energy.pixel_samples
+    anchors = record.bending or energy.arap_at_anchors
+    assert pair.flow is not None
+    data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, anchors)
+    data = replace(
+        in_pixels(data, start.soup, seg, start.bends),
+        edge_weight=record.edge_share * data.edge_weight,
+        pair_weight=record.pair_share * data.pair_weight,
+        orient_weight=record.orient_share * data.orient_weight,
+        prior_weight=record.prior_weight,
+    )
     values = {f.name: np.asarray(getattr(data, f.name)) for f in fields(data)}
     reals: dict[str, Any] = {k: rounded(v) for k, v in values.items() if v.dtype == np.float64}
     data = replace(data, **reals)
-    weights = record.weights(weights)
+    weights = record.weights(energy.weights)
     return Case(problem, pair, seg, start, data, weights, start.soup, options)
 
 

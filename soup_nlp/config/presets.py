@@ -40,9 +40,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "energy": {
                 "units": "paper",
                 "arap_at_anchors": False,
-                "arap_across": 1.0,
+                "across": 1.0,
                 "arap_scene": 0.0,
-                "cont_occluded": 1.0,
                 "weights": {
                     "arap": 500.0,
                     "proj": 1.0,

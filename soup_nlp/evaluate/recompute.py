@@ -60,7 +60,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
     )
     leak = w["leak_arap"]
     cut = sum((1 - leak) * np.minimum(p, w["sigma_arap"]) + leak * p for p in parts)
-    relief = np.abs((rho[i] - rho[k]) / near(e["edges"]) - e["prior_relief"])
+    relief = np.abs((rho[i] - rho[k]) / near(e["edges"]))
     relief /= norm(e["anchor_ray"][i] - e["anchor_ray"][k], axis=-1)
     off = np.abs(np.log(A[i, 2]) - np.log(A[k, 2]) - e["depth_change"])
     image = lift(s, e["pixel_ray"], np.arange(len(A)))[1] @ e["K_next"].T

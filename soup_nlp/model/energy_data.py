@@ -32,14 +32,12 @@ class EnergyData:
         pixel_ray: (N, S, 3) sampled pixels of every superpixel.
         pixel_target: (N, S, 2) their flow targets, pixels.
         pixel_weight: (N, S) confidence / S: E_proj is the confidence-weighted mean of the sample.
-        edges: (E, 2) edges i < k: the K-NN graph, and those of `rigid_scene`.
+        edges: (E, 2) edges i < k: the K-NN graph, and those that join the scene.
         edge_weight: (E,) w1 = w2, both directions folded.
         edge_unit: (E,) length unit of the edge (1: the mean plane distance).
         prior_weight: (E,) weight of E_prior: 1 / K for each direction of the edge, so that it is
             the mean over the neighbours of a superpixel, times the flow's noise in pixels where
             that is known.
-        prior_relief: (E,) relative difference of inverse depth along each edge that costs nothing
-            in E_prior: the initialisation's where both ends borrow their depth, else 0.
         depth_weight: (E,) weight of E_depth; 0 without a depth prior, and where it is not reliable.
         depth_change: (E,) difference of log depth along each edge by the depth prior.
         order_weight: (P,) weight of E_order: positive where the second superpixel of a pair covers
@@ -73,7 +71,6 @@ class EnergyData:
     edge_weight: Float
     edge_unit: Float
     prior_weight: Float
-    prior_relief: Float
     depth_weight: Float
     depth_change: Float
     order_weight: Float
@@ -192,7 +189,6 @@ def build_energy_data(
         edge_weight=seg.edge_weight,
         edge_unit=np.ones(len(seg.edges)),
         prior_weight=seg.edge_multiplicity / max(1, seg.knn.shape[1]),
-        prior_relief=np.zeros(len(seg.edges)),
         depth_weight=np.zeros(len(seg.edges)),
         depth_change=np.zeros(len(seg.edges)),
         order_weight=np.zeros(len(seg.pairs)),

@@ -59,27 +59,16 @@ class Weights(Section):
 # where a bending surface is connected, and gives rotations almost no weight. Lengths, continuity
 # and orientation then hold the relief. This energy is always in pixels.
 
-BENDING_WEIGHTS = {"cont": 0.05, "orient": 4.0, "prior": 4.0, "sigma_arap": 1.0, "leak_arap": 0.05}
-"""Constants for surfaces that bend where `Weights` has its defaults; orient is for N = 1,000."""
-BENDING_ROTATION_PX = 1e-3
-"""Pixels per radian of rotation difference where surfaces bend."""
-ACROSS_DISCONTINUITIES = {"arap": 0.3, "cont": 0.01, "orient": 0.3}
-"""Factors of terms across a flow discontinuity where the whole image bends."""
+BENDING = {"cont": 500 / 3, "orient": 800.0, "prior": 400 / 3}
+"""Factors of terms between superpixels that bend; orient is for N = 1,000: on the same relief
+1 - cos between neighbours falls as 1 / N. Fitted on kinect_paper, sheet and rgbd."""
+BENDING_TURN_PX = 1e-3
+"""Pixels per radian of rotation difference beside superpixels that bend."""
+BENDING_ARAP = {"sigma_arap": 1.0, "leak_arap": 0.05}
+"""Truncation of E_arap where the whole image bends."""
 WIDEST_BENDING_EPS = 0.1
 """Upper limit of solver.presolve_eps where surfaces bend, pixels. Relief changes the flow by a
 fraction of a pixel, so a wider smoothing would flatten it."""
-
-
-def bending_weights(weights: Weights, superpixels: int) -> Weights:
-    """The constants for surfaces that bend, in proportion to those of rigid surfaces.
-
-    On the same relief 1 - cos between neighbours falls as 1 / N, so that E_orient grows with N.
-    """
-    usual = Weights()
-    out = {k: v * (getattr(weights, k) / getattr(usual, k)) for k, v in BENDING_WEIGHTS.items()}
-    out["orient"] *= superpixels / 1000
-    out["leak_arap"] = min(1.0, out["leak_arap"])
-    return weights.replace(**out)
 
 
 class EnergyOptions(Section):
@@ -90,14 +79,12 @@ class EnergyOptions(Section):
     initial translations add up to 1)."""
     arap_at_anchors: bool = False
     """Compare motions at the anchors instead of the camera's origin."""
-    arap_across: Share = 0.03
-    """Factor of E_arap and E_prior between superpixels of different components; 1 is the
+    across: Share = 0.03
+    """Factor of E_arap, E_prior and E_cont between superpixels of different components; 1 is the
     paper's."""
     arap_scene: Share = 0.1
     """Weight w1 of further edges of E_arap, from the scene's superpixel of median depth to all of
     the scene with a flow and depth of their own; 0 is the paper's graph."""
-    cont_occluded: Share = 0.03
-    """Factor of E_cont where one component occludes another; 1 is the paper's."""
     pixel_samples: Samples | Literal["all"] = 16
     """Pixels per superpixel in E_proj, or all."""
     weights: Weights = Weights()

@@ -14,24 +14,8 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
-from soup_nlp.model.energy_options import (
-    ACROSS_DISCONTINUITIES,
-    BENDING_ROTATION_PX,
-    WIDEST_BENDING_EPS,
-    Weights,
-    bending_weights,
-)
-from soup_nlp.model.reweighting import (
-    across,
-    at_occlusions,
-    in_pixels,
-    in_translations,
-    over_ground,
-    rigid_scene,
-    with_order,
-    with_prior,
-    within_bending,
-)
+from soup_nlp.model.energy_options import BENDING_ARAP, WIDEST_BENDING_EPS, Weights
+from soup_nlp.model.reweighting import Known, in_pixels, in_translations, weighted
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
@@ -46,12 +30,6 @@ from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
 from soup_nlp.storage.progress import Watch
 from soup_nlp.storage.system import require_memory
-
-PRIOR_OVER_GROUND = 10.0
-"""Factor of E_prior between two superpixels with borrowed depth over a known ground, where it holds
-the relief of the initialisation."""
-OCCLUSION_GAP = 0.1
-"""Relative gap in depth, in the initialisation, from which one component occludes another."""
 
 
 def prepare(
@@ -226,44 +204,20 @@ def build_energy(
     e = problem.energy
     pixels = None if e.pixel_samples == "all" else e.pixel_samples
     bends = start.bends & (e.units == "pixel")
-    whole = bool(bends.all())
-    at_anchors = bool(bends.any()) or e.arap_at_anchors
-    data = build_energy_data(
-        seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, at_anchors
-    )
-    # E_prior is in units of the flow's noise, which supports no relief below a share of it
-    pixel_weight = np.where(start.wrong[:, None], 0.0, data.pixel_weight)
-    data = replace(data, prior_weight=start.noise * data.prior_weight, pixel_weight=pixel_weight)
-    prior_weight, bending = data.prior_weight, bending_weights(e.weights, len(seg))
-    data = across(data, start.component, arap=e.arap_across, prior=e.arap_across)
-    data = over_ground(data, start.soup, start.grounded, PRIOR_OVER_GROUND * prior_weight)
-    parts = start.component
-    if start.order is not None and e.weights.order > 0:
-        placed = np.isin(start.tie, [TIES.index("occlusion"), TOO_FAST])
-        data = with_order(data, start.soup, start.order, placed, start.noise)
+    anchors = bool(bends.any()) or e.arap_at_anchors
+    data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, anchors)
+    data = replace(data, pixel_weight=np.where(start.wrong[:, None], 0.0, data.pixel_weight))
+    prior = None
     if given_depth is not None and given_depth.evidence.used:
-        # the flow holds no slopes where the prior decides: E_orient does, as in bending regions
-        stiffer = np.where(bends, 1.0, bending.orient / max(e.weights.orient, 1e-12))
-        values = given_depth.log_depth, given_depth.opened, given_depth.error
-        arguments = *values, start.component, prior_weight, stiffer
-        data = with_prior(data, start.soup, *arguments, creased=not given_depth.evidence.confirmed)
-        # a given depth may have steps inside a component too
-        parts = np.where(given_depth.opened > 0.5, len(seg) + np.arange(len(seg)), start.component)
-    data = at_occlusions(data, start.soup, parts, OCCLUSION_GAP, e.cont_occluded)
-    if whole:
-        pieces = start.surface * (int(start.component.max()) + 1) + start.component
-        data = across(data, pieces, **ACROSS_DISCONTINUITIES)
-    scene = (start.component == 0) & (start.motion >= 0) & ~start.borrowed & ~bends
-    data = rigid_scene(data, start.soup, scene, e.arap_scene)
-    if e.units == "pixel":
-        data = in_pixels(data, start.soup, seg, BENDING_ROTATION_PX if whole else None)
-    else:
-        data = in_translations(data, start.soup)
-    if whole:
-        return data, bending
-    if bends.any():
-        data = within_bending(data, bends, e.weights, bending, BENDING_ROTATION_PX)
-    return data, e.weights
+        prior = given_depth.log_depth, given_depth.opened, given_depth.error
+    placed = np.isin(start.tie, [TIES.index("occlusion"), TOO_FAST])
+    known = Known(start.component, bends, start.variance, start.noise, start.order, placed, prior)
+    data = weighted(data, start.soup, known, e)
+    if e.units == "paper":
+        return in_translations(data, start.soup), e.weights
+    # what the truncation of E_arap is follows from all of the image
+    weights = e.weights.replace(**BENDING_ARAP) if bends.all() else e.weights
+    return in_pixels(data, start.soup, seg, bends), weights
 
 
 # --- memory, estimated before a solve ---------------------------------------------------------

@@ -39,7 +39,6 @@ energy/pixel_weight       1     N,S     confidence x usable share / sample size;
 energy/edges              1     E,2     edges i < k: K-NN, and those that join the scene
 energy/edge_weight        1     E       w1 = w2 of both directions, less between two components
 energy/prior_weight       1     E       weight of E_prior: flow noise / K for each direction
-energy/prior_relief       1     E       relative difference of 1/z that costs nothing in E_prior
 energy/depth_weight       1     E       weight of E_depth, 0 without a depth prior
 energy/depth_change       1     E       difference of log depth by the depth prior
 energy/order_weight       1     P       weight of E_order, > 0 where the second covers the first
@@ -71,7 +70,6 @@ start|solution|nlp|answer/t  soup  N,3  translations; lam t is next_from_ref
 start/error               px    N       mean re-projection error
 start/parallax            px    N       displacement that the translation causes
 start/borrowed            1     N       plane or motion from neighbours
-start/grounded            1     N       borrowed, and below the horizon of a known ground
 start/motion              1     N       dominant motion, -1 for its own
 start/component           1     N       rigid component
 start/part                1     N       what moves as one: its component, or the largest one \

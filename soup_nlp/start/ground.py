@@ -83,7 +83,7 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
     return np.maximum(plane_mu, 0.0)
 
 
-def on_ground(flow: FlowFit, soup: Soup, reliable: Mask, component: Int) -> tuple[Soup, Float]:
+def on_ground(flow: FlowFit, soup: Soup, reliable: Mask, component: Int) -> Soup:
     """The soup without unreliable or independently moving superpixels below the ground.
 
     They are lifted to it. Those of the scene keep the translation they share.
@@ -93,16 +93,13 @@ def on_ground(flow: FlowFit, soup: Soup, reliable: Mask, component: Int) -> tupl
         soup: Start, its components scaled.
         reliable: (N,) True where the depth is reliable.
         component: (N,) group that moves as one.
-
-    Returns:
-        The soup, and (N,) inverse depth of the ground, see `ground`.
     """
     mu, scene = 1 / soup.depth_at(flow.views.anchor), component == SCENE
     floor = ground(flow, mu, reliable & scene)
     lifted = (mu < (1 - BELOW) * floor) & ~(reliable & scene)
     factor = np.where(lifted, mu / np.maximum(floor, 1e-12), 1.0)
     t = np.where((lifted & scene)[:, None], soup.t / factor[:, None], soup.t)
-    return replace(soup, lam=soup.lam * factor, t=t), floor
+    return replace(soup, lam=soup.lam * factor, t=t)
 
 
 def off_ground(flow: FlowFit, soup: Soup, component: Int, reliable: Mask) -> Float:

@@ -53,7 +53,6 @@ class Start:
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
             where a region bends, discontinuities make up most of its outline.
         tie: (N,) origin of the scale of every superpixel's component, an index of `TIES`.
-        grounded: (N,) True where the depth is borrowed and the ground is known below the horizon.
         bends: (N,) True where the energy for bending surfaces is used. Its connected regions are
             components that start at a constant depth, each superpixel with a motion of its own. If
             the rigid part is small or has no parallax, or the camera is at rest, the whole image is
@@ -81,7 +80,6 @@ class Start:
     motions: list[Motion]
     surface: Int
     tie: Int
-    grounded: Mask
     bends: Mask
     unexplained: Mask
     wrong: Mask
@@ -114,12 +112,17 @@ class Start:
             motions=[],
             surface=zero,
             tie=zero,
-            grounded=none,
             bends=none,
             unexplained=none,
             wrong=none,
             noise=noise,
         )
+
+    @property
+    def variance(self) -> Float:
+        """(N,) variance of log depth by noise and parallax; inf where the depth is borrowed."""
+        with np.errstate(divide="ignore"):
+            return np.asarray((self.noise / np.where(self.borrowed, 0.0, self.parallax)) ** 2)
 
     @property
     def bending(self) -> bool:
@@ -175,7 +178,7 @@ def propose(flow: FlowFit) -> Start:
     scale, tie = contact_scales(flow, soup, component, fixed)
     soup = replace(soup, lam=soup.lam * scale)
     soup, tie = nearer_where_fast(flow, soup, component, tie)
-    soup, floor = on_ground(flow, soup, reliable, component)
+    soup = on_ground(flow, soup, reliable, component)
     noise = limited_noise(error[~bends])
     mixed = unmoved(flow, choice, component) & ~(fixed | bends)
     return Start(
@@ -189,7 +192,6 @@ def propose(flow: FlowFit) -> Start:
         motions=choice.motions,
         surface=surface,
         tie=tie,
-        grounded=weak & (floor > 0),
         bends=bends,
         unexplained=jumping | unexplained(rigid, error, component, noise),
         wrong=wrong & ~bends,

@@ -1,6 +1,7 @@
 """The exact energy: invariances, values by hand, pixel samples, degenerate problems."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,9 +33,9 @@ from soup_nlp.model.energy_data import (
     build_energy_data,
     sample_pixels,
 )
-from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.energy_options import BENDING, EnergyOptions, Weights
 from soup_nlp.model.matrix import build_matrix_nlp
-from soup_nlp.model.reweighting import across, in_pixels, rigid_scene
+from soup_nlp.model.reweighting import Known, in_pixels, weighted
 from soup_nlp.pipeline.case import build_energy
 from soup_nlp.start.choice import limited_noise
 
@@ -105,8 +106,7 @@ def test_the_order_of_the_superpixels_does_not_matter():
         rank[problem.seg.labels], problem.image, neighbours=11, boundary_samples=2
     )
     data = build_energy_data(seg, problem.flow, K_REF, K_NEXT, 3, 0)
-    none = 0 * problem.data.prior_relief
-    s, own = problem.soup, replace(problem.data, prior_relief=none, depth_weight=none)
+    s, own = problem.soup, replace(problem.data, depth_weight=0 * problem.data.depth_weight)
     own = replace(own, order_weight=0 * own.order_weight)
     soup = Soup(s.lam[order], s.n[order], s.d[order], s.R[order], s.t[order])
     np.testing.assert_allclose(energies(soup, data, weights), energies(s, own, weights), rtol=1e-12)
@@ -281,7 +281,7 @@ def test_one_superpixel_is_a_valid_problem():
 
 def test_prior_is_the_relative_slope_of_inverse_depth():
     problem = tiny("pixels")
-    soup, data = problem.soup, replace(problem.data, prior_relief=0 * problem.data.edge_unit)
+    soup, data = problem.soup, problem.data
     expected = 0.0
     ray, Z = data.anchor_ray, soup.depth_at(data.anchor_ray)
     for i, near in enumerate(problem.seg.knn):
@@ -310,16 +310,48 @@ def test_prior_is_measured_in_the_noise_of_the_flow(error, noise, small_room):
     assert data.pixel_weight[~wrong].any(axis=1).mean() > 0.9
 
 
-def test_ties_across_groups_keep_a_share_of_weight():
+def of_scene(count: int, **changes: Any) -> Known:
+    """A scene of one component with depth of its own, with changes."""
+    none = np.zeros(count, bool)
+    plain = Known(none.astype(int), none, np.ones(count), 1.0, None, none)
+    return replace(plain, **changes)
+
+
+def test_weights_are_shares_across_components_and_factors_where_surfaces_bend():
     data, count = tiny("pixels").data, len(tiny().soup)
-    part = np.arange(count) % 2
+    part, bends = np.arange(count) % 2, np.arange(count) < 8
     (a, b), (i, k) = data.edges.T, data.pairs.T
-    apart, split = part[a] != part[b], part[i] != part[k]
-    found = across(data, part, arap=0.4, prior=0.3, cont=0.2, orient=0.1)
-    np.testing.assert_allclose(found.edge_weight, np.where(apart, 0.4, 1.0) * data.edge_weight)
-    np.testing.assert_allclose(found.prior_weight, np.where(apart, 0.3, 1.0) * data.prior_weight)
-    np.testing.assert_allclose(found.pair_weight, np.where(split, 0.2, 1.0) * data.pair_weight)
-    np.testing.assert_allclose(found.orient_weight, np.where(split, 0.1, 1.0) * data.orient_weight)
+    joined, meets = (np.where(part[p] == part[q], 1.0, 0.2) for p, q in ((a, b), (i, k)))
+    options = EnergyOptions(across=0.2, arap_scene=0.0)
+    # wherever bending begins, it does so at superpixels that both bend
+    factor = {
+        name: [np.where(bends[p] & bends[q], value, 1.0) for p, q in ((a, b), (i, k))]
+        for name, value in BENDING.items()
+    }
+    found = weighted(
+        data, tiny().soup, of_scene(count, component=part, bends=bends, noise=0.5), options
+    )
+    np.testing.assert_allclose(found.edge_weight, joined * data.edge_weight)
+    expected = 0.5 * factor["prior"][0] * joined * data.prior_weight
+    np.testing.assert_allclose(found.prior_weight, expected)
+    np.testing.assert_allclose(found.pair_weight, factor["cont"][1] * meets * data.pair_weight)
+    steep = np.where(factor["orient"][1] > 1, count / 1000 * BENDING["orient"], 1.0)
+    np.testing.assert_allclose(found.orient_weight, steep * data.orient_weight)
+
+
+def test_order_weighs_by_the_noise_and_asks_for_steps_where_it_places():
+    data, soup = tiny("pixels").data, tiny().soup
+    count, first = len(soup), np.arange(len(data.pairs)) % 3 - 1.0
+    placed = np.arange(count) < 4
+    options = EnergyOptions()
+    found = weighted(data, soup, of_scene(count, order=first, placed=placed, noise=0.5), options)
+    np.testing.assert_allclose(found.order_weight, 0.5 * first)
+    beside = placed[data.pairs].any(axis=1)
+    assert (found.order_step[beside] > 0).any()
+    assert (found.order_step >= 0).all()
+    assert not found.order_step[~beside].any()
+    off = options.replace(weights=options.weights.replace(order=0.0))
+    assert not weighted(data, soup, of_scene(count, order=first), off).order_weight.any()
 
 
 def test_the_scene_is_joined_through_its_superpixel_of_median_depth():
@@ -330,8 +362,13 @@ def test_the_scene_is_joined_through_its_superpixel_of_median_depth():
     pixels = problem.data.pixel_weight.shape[1]
     data = replace(problem.data, pixel_weight=np.tile(usable[:, None] / pixels, pixels))
     scene = np.arange(count) != 3
-    assert rigid_scene(data, soup, scene, 0.0) is data
-    joined = rigid_scene(data, soup, scene, 0.25)
+    # without depth of its own a superpixel is not joined
+    variance = np.where(scene, 1.0, np.inf)
+    plain, joined = (
+        weighted(data, soup, of_scene(count, variance=variance), EnergyOptions(arap_scene=w))
+        for w in (0.0, 0.25)
+    )
+    np.testing.assert_array_equal(plain.edges, data.edges)
     Z, known = soup.depth_at(data.anchor_ray), {tuple(e) for e in data.edges.tolist()}
     members = sorted(set(range(count)) - {3, 5}, key=Z.__getitem__)
     hub = members[len(members) // 2]
@@ -347,7 +384,7 @@ def test_the_scene_is_joined_through_its_superpixel_of_median_depth():
         turn, shift = soup.R[i] - soup.R[k], soup.translation[i] - soup.translation[k]
         stretch = np.linalg.norm(X[i] - X[k]) - np.linalg.norm(moved[i] - moved[k])
         cost += 0.25 * (np.linalg.norm(turn) + np.linalg.norm(shift) + abs(stretch))
-    before, after = (oracle.energy(soup, d, PAPER) for d in (data, joined))
+    before, after = (oracle.energy(soup, d, PAPER) for d in (plain, joined))
     assert after["arap"] - before["arap"] == pytest.approx(PAPER.arap * cost)
     others = before.keys() - {"arap", "total"}
     assert {k: after[k] for k in others} == pytest.approx({k: before[k] for k in others})

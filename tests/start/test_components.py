@@ -12,11 +12,7 @@ from soup_nlp.geometry import camera
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.reweighting import (
-    at_occlusions,
-    in_pixels,
-    over_ground,
-)
+from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.pipeline.run import run
 from soup_nlp.start.components import TOO_FAST, contact_scales
 from soup_nlp.start.pace import nearer_where_fast, order_in_front
@@ -32,26 +28,6 @@ def world():
     component = (seg.anchors[:, 0] > 16).astype(np.int64)
     T = np.where(component[:, None] == 1, [[0.3, 0, 0]], [[0.1, 0, 0]])
     return seg, facing(np.full(8, 2.0), T), component, build_energy_data(seg, flow, K, K, 4)
-
-
-def test_the_prior_holds_the_relief_over_the_ground(world):
-    _, soup, _, data = world
-    grounded = np.arange(8) < 4
-    both = grounded[data.edges].all(axis=1)
-    assert both.any()
-    assert not both.all()
-    rng = np.random.default_rng(0)
-    rough = replace(soup, d=soup.d * rng.uniform(0.5, 2, 8))
-    weighted = over_ground(data, rough, grounded, 5 * data.prior_weight)
-    expected = np.where(both, 5.0, 1.0) * data.prior_weight
-    np.testing.assert_allclose(weighted.prior_weight, expected, rtol=1e-15)
-    usual, own = (oracle.values("prior", rough, d, Weights()) for d in (data, weighted))
-    np.testing.assert_allclose(own[both], 0.0, atol=1e-12)
-    np.testing.assert_array_equal(own[~both], usual[~both])
-    # in another unit of length the same relief costs nothing either
-    far = replace(rough, d=3.0 * rough.d)
-    own = oracle.values("prior", far, weighted, Weights())
-    np.testing.assert_allclose(own[both], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("factor", [10.0, 1e4])
@@ -71,30 +47,6 @@ def test_a_component_gains_little_by_receding(world, factor):
     assert (near <= 2 * gap * (1 + 1e-12)).all()
     receded = oracle.values("arap", away, data, weights)[across]
     assert (receded >= 2**-0.25 * gap * (1 - 1e-12)).all()
-
-
-def test_pairs_across_an_occlusion_weigh_less(world):
-    """Of the right component's outline the lower half touches the left one; the upper is in
-    front."""
-    seg, soup, component, data = world
-    upper = seg.anchors[:, 1] < 8
-    z = np.where((component == 1) & upper, 0.7, 1.0)
-    soup = replace(soup, d=soup.d * z)
-    i, k = seg.pairs.T
-    across = seg.across(component)
-    hidden = across & (upper[i] | upper[k])
-    assert hidden.sum() == 1
-    assert across.sum() == 2
-    less = at_occlusions(data, soup, component, 0.2, 0.1)
-    np.testing.assert_array_equal(less.pair_weight, np.where(hidden, 0.1, 1.0) * data.pair_weight)
-    np.testing.assert_array_equal(less.edge_weight, data.edge_weight)
-    same = {
-        "gap is no larger": at_occlusions(data, soup, component, 0.31, 0.1),
-        "one component": at_occlusions(data, soup, 0 * component, 0.2, 0.1),
-        "the paper's": at_occlusions(data, soup, component, 0.2, 1.0),
-    }
-    for why, one in same.items():
-        np.testing.assert_array_equal(one.pair_weight, data.pair_weight, err_msg=why)
 
 
 def placed(z, component, far=0.01, **options):

@@ -16,7 +16,8 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.model.energy_data import build_energy_data
-from soup_nlp.model.reweighting import with_prior
+from soup_nlp.model.energy_options import BENDING, EnergyOptions
+from soup_nlp.model.reweighting import Known, weighted
 from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run
@@ -105,25 +106,22 @@ def median_in(depth: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return np.array([np.log(np.median(depth[labels == i])) for i in range(labels.max() + 1)])
 
 
-def test_orientation_is_held_inside_a_plane_and_released_at_creases(pan):
+def test_orientation_is_held_where_the_prior_decides(pan):
     start, given = pan.by(pan.depth)
     pair, seg = pan.pair, pan.seg
     data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 4, 0, True)
-    free, stiffer = np.ones(len(data.edges)), np.full(len(seg), 100.0)
-    prior_data = given.log_depth, given.opened, given.error, start.component, free, stiffer
-    gain = (
-        with_prior(data, start.soup, *prior_data, creased=True).orient_weight / data.orient_weight
-    )
-    a, b = start.soup.n[data.pairs.T]
-    angle = np.degrees(np.arccos(np.clip((a * b).sum(axis=1), -1, 1)))
-    assert gain[angle < 1].min() > 90
-    assert gain[angle > 30].max() < 10
-    plain = with_prior(data, start.soup, *prior_data, creased=False).orient_weight
-    np.testing.assert_allclose(plain, 100 * data.orient_weight)
+    none = np.zeros(len(seg), bool)
+
+    def gain(opened: np.ndarray) -> np.ndarray:
+        prior = given.log_depth, opened, given.error
+        known = Known(start.component, none, start.variance, 1.0, None, none, prior)
+        found = weighted(data, start.soup, known, EnergyOptions())
+        assert (found.depth_weight > 0).any() == opened.any()
+        return found.orient_weight / data.orient_weight
+
+    np.testing.assert_allclose(gain(given.opened), BENDING["orient"] * len(seg) / 1000)
     # where the flow determines the slopes nothing changes
-    prior_data = given.log_depth, np.zeros(len(seg)), *prior_data[2:]
-    flat = with_prior(data, start.soup, *prior_data, creased=True).orient_weight
-    np.testing.assert_array_equal(flat, data.orient_weight)
+    np.testing.assert_array_equal(gain(0 * given.opened), 1.0)
 
 
 @pytest.mark.slow
@@ -148,10 +146,9 @@ def test_a_prior_scales_objects_beside_a_determined_background():
     assert np.abs(apart[firm]).max() > 0.05
     assert np.abs(road.error(start))[firm].mean() < 0.25 * np.abs(0.4 * WAVE).mean()
     data = build_energy_data(seg, road.pair.flow, road.pair.K_ref, road.pair.K_next, 4, 0, True)
-    values = given.log_depth, given.opened, given.error, start.component
-    changed = with_prior(
-        data, start.soup, *values, np.ones(len(data.edges)), np.ones(len(seg)), creased=False
-    )
+    none, prior = np.zeros(len(seg), bool), (given.log_depth, given.opened, given.error)
+    known = Known(start.component, none, start.variance, 1.0, None, none, prior)
+    changed = weighted(data, start.soup, known, EnergyOptions(arap_scene=0.0))
     i, k = data.edges.T
     across = start.component[i] != start.component[k]
     inside = firm[i] & firm[k]

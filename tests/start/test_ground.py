@@ -40,7 +40,7 @@ def moving(Z: np.ndarray) -> Soup:
 
 
 def lift(flow, Z, reliable, component):
-    return on_ground(flow, moving(Z), reliable, component * ALL)[0]
+    return on_ground(flow, moving(Z), reliable, component * ALL)
 
 
 def test_unknown_depth_comes_up_to_the_road(flow):
