@@ -16,10 +16,10 @@ from soup_nlp.data.accept import prior_of
 from soup_nlp.data.datasets.benchmarks import KittiInput, SintelInput, VkittiInput
 from soup_nlp.data.datasets.folders import FolderInput, MotorcycleInput, TumInput
 from soup_nlp.data.datasets.layout import FramesInput, PairInput, Resolve, make_pair
-from soup_nlp.data.flow.learned import learned_map
 from soup_nlp.data.flow.sources import is_network
 from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
 from soup_nlp.data.formats.map_files import read_depth
+from soup_nlp.data.network import learned_map
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes.catalogue import LAYOUTS, render_scene
 from soup_nlp.errors import ConfigError, DataError

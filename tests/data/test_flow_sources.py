@@ -8,13 +8,13 @@ import pytest
 from helpers_files import write_flo
 
 from soup_nlp.data.flow.dis import dis_flow
-from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.flow.sources import (
     FlowOptions,
     flow_from_truth,
     is_named,
     resolve_flow,
 )
+from soup_nlp.data.network import learned_flow
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.working_size import at_common_focal, resized_flow, scaled_camera

@@ -14,8 +14,8 @@ import numpy as np
 from soup_nlp.arrays import Image
 from soup_nlp.data.flow.consistency import check_flow, confidence_of, round_trip_error
 from soup_nlp.data.flow.dis import dis_flow
-from soup_nlp.data.flow.learned import learned_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
+from soup_nlp.data.network import learned_flow
 from soup_nlp.data.pair import Flow, Pair, check_size
 from soup_nlp.data.working_size import at_common_focal, resized_flow
 from soup_nlp.errors import ConfigError, DataError
