@@ -18,21 +18,19 @@ from soup_nlp.report.findings import (
 )
 from soup_nlp.report.summary import certainty
 from soup_nlp.start.components import FIXED, TIES
-from soup_nlp.start.pace import displacement
 
 
 def unsure(run, component_variance=None):
     """The same run where every pixel is a guess, though the flow is evidence of depth."""
     sure = run.confidence
-    far = np.full_like(sure.evidence.turn, 9.0)
+    far = np.full(int(run.start.component.max()) + 1, 9.0)
     evidence = replace(sure.evidence, turn=far, constant=far, solution=np.zeros_like(far))
     scale, start = sure.scale, run.start
     if component_variance is not None:
-        marginals = replace(
-            sure.marginals, component=np.full_like(sure.marginals.component, component_variance)
-        )
-        far = displacement(run.soup, run.data.anchor_ray, start.component)
-        scale = scale_by_contact(marginals, start, run.segmentation.sizes, far)
+        marginals = replace(sure.marginals, component=np.full_like(far, component_variance))
+        # all components move equally far
+        paces = np.ones(len(run.soup))
+        scale = scale_by_contact(marginals, start, run.segmentation.sizes, paces)
     sigma = np.full_like(sure.sigma, SIGMA_PRIOR)
     return replace(run, confidence=replace(sure, sigma=sigma, scale=scale, evidence=evidence))
 
@@ -55,6 +53,10 @@ def test_every_guess_has_one_reason(small_run):
 
 def test_a_scale_that_contact_hardly_determines_is_named(small_run):
     start, labels = small_run.start, small_run.segmentation.labels
+    two = (np.arange(len(start.soup)) < 9).astype(int)
+    tie = np.where(two, TIES.index("contact below"), TIES.index("reference"))
+    start = replace(start, component=two, tie=tie, off_ground=None)
+    small_run = replace(small_run, start=start)
     loose = certainty(unsure(small_run, 1.0))
     firm = certainty(unsure(small_run, 1e-6))
     tied_share = (start.tie != TIES.index("reference"))[labels].mean()

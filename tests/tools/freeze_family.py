@@ -59,17 +59,21 @@ def freeze(scene: str, size: int, path: Path) -> None:
 
 def record_of(case: Case) -> Frozen:
     """The record of a case with the proposal as best known point."""
-    start = case.start
+    start, data, seg = case.start, case.data, case.segmentation
+    edges = len(seg.edges)
     proposal = encoded(start.soup).astype(np.float32).astype(float)
     return Frozen(
         text=dump_problem(case.problem),
-        labels=case.segmentation.labels,
+        labels=seg.labels,
         component=start.component,
         surface=start.surface,
         error=start.error.astype(np.float32).astype(float),
         bending=start.bending,
-        pair_weight=case.segmentation.pair_weight,
-        prior_weight=rounded(case.data.prior_weight[: len(case.segmentation.edges)]),
+        pair_weight=seg.pair_weight,
+        prior_weight=rounded(data.prior_weight[:edges]),
+        edge_share=data.edge_weight[:edges] / seg.edge_weight,
+        pair_share=data.pair_weight / seg.pair_weight,
+        orient_share=data.orient_weight / 2.0,
         proposal=proposal,
         minimum=proposal,
     )
