@@ -44,6 +44,15 @@ FORM = Formulation(compiled=False)
 
 
 @pytest.fixture(scope="module")
+def small_room(small_room):
+    """The small room with a second component, whose scale is from contact."""
+    second = np.arange(len(small_room.soup)) < 9
+    tie = np.where(second, TIES.index("contact below"), TIES.index("reference"))
+    start = replace(small_room.start, component=second.astype(int), tie=tie, off_ground=None)
+    return replace(small_room, start=start)
+
+
+@pytest.fixture(scope="module")
 def info(small_room):
     return information(small_room.soup, small_room.data, small_room.weights, FORM)
 
