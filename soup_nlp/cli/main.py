@@ -23,7 +23,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from soup_nlp.errors import ConfigError, SoupError, StoppedError, printable
-from soup_nlp.storage.system import handling, prepare_streams, refusal
+from soup_nlp.storage.progress import interruptible
+from soup_nlp.storage.system import SIGNALS, prepare_streams, refusal
 from soup_nlp.storage.versions import __version__, versions
 
 BUG = 70
@@ -109,8 +110,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ["MPLBACKEND"] = "agg"
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        as_ctrl_c = handling(signal.default_int_handler, [signal.SIGTERM])
-        with as_ctrl_c, warnings.catch_warnings():
+        # a shell has its commands in the background ignore Ctrl-C
+        heeded = [n for n in SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]
+        with interruptible(numbers=heeded, at_once=True), warnings.catch_warnings():
             refuse_odd(words)
             warnings.showwarning = print_warning
             code = int(root(args=words, standalone_mode=False) or 0)

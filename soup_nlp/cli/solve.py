@@ -155,8 +155,7 @@ def solve_problem(
         0 for a good result that meets the expectation, else 1.
     """
     folder = prepare_folder(out, chosen.input_paths(), overwrite, chosen.subject)
-    interrupt = interruptible(log.interrupted)
-    interrupt.at_once = True
+    interrupt = interruptible(log.interrupted, at_once=True)
 
     def on_stage(stage: str) -> None:
         log.stage(stage)
@@ -169,9 +168,10 @@ def solve_problem(
             listeners = {**log.listeners, "on_stage": on_stage}
             run = run_problem(chosen, stop=stop, ipopt_log=str(ipopt_log), **listeners)
             if interrupt.aborted:
+                # in native code, which discarded it
                 raise KeyboardInterrupt
         except BaseException as error:
-            interrupted = isinstance(error, KeyboardInterrupt)
+            interrupted = interrupt.aborted or isinstance(error, KeyboardInterrupt)
             words = "interrupted" if interrupted else str(error) or type(error).__name__
             log.lines.append(f"failed: {words}")
             # for input that cannot be used the message is enough

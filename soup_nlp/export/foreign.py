@@ -82,8 +82,9 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
         **manifest["formulation"], **manifest["smoothing"], hessian="exact", compiled=False
     )
     nlp, layout = case.nlp(form)
+    stored: Any = manifest["fingerprint"]
     for key, now in fingerprint(case, nlp, layout).items():
-        then = float(manifest["fingerprint"][key])
+        then = float(stored[key])
         if abs(now - then) > SAME * max(1.0, abs(then)):
             raise ExportError(
                 "problem is not the one that was exported",

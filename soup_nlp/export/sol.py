@@ -131,9 +131,10 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     for line in lines[at:]:
         words = line.split()
         if words[:1] == ["objno"]:
-            if len(words) < 3 or not words[2].lstrip("-").isdigit():
-                raise wrong(line, "objno, objective, code")
-            code = int(words[2])
+            try:
+                code = int(words[2])
+            except (IndexError, ValueError):
+                raise wrong(line, "objno, objective, code") from None
     x = np.empty(len(variables))
     x[variables] = z
     lam_g = None

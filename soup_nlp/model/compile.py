@@ -6,11 +6,12 @@ import logging
 import os
 import platform
 import resource
+import shlex
 import shutil
 import stat
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -29,10 +30,11 @@ def cache_dir() -> Path:
     return Path(base) / "soup_nlp"
 
 
-def find_compiler() -> str | None:
-    """The C compiler to use: $CC, else cc, gcc or clang on the PATH; None when there is none."""
-    names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
-    return next((path for name in names if (path := shutil.which(name))), None)
+def find_compiler() -> list[str]:
+    """The C compiler with its options: $CC, else cc, gcc or clang on the PATH; empty for none."""
+    given = shlex.split(os.environ.get("CC", ""))
+    names = given[:1] or ["cc", "gcc", "clang"]
+    return next(([path, *given[1:]] for name in names if (path := shutil.which(name))), [])
 
 
 def compiler_seconds() -> float:
@@ -63,9 +65,9 @@ def shared_library(content: str, source: Callable[[], str]) -> Path | None:
         Path; None without a compiler that works (logged).
     """
     compiler = find_compiler()
-    if compiler is None:
+    if not compiler:
         return None
-    key = hashlib.sha256("\0".join([content, compiler, *FLAGS, _cpu()]).encode()).hexdigest()[:24]
+    key = hashlib.sha256("\0".join([content, *compiler, *FLAGS, _cpu()]).encode()).hexdigest()[:24]
     try:
         return _build(source, key, compiler)
     except (OSError, subprocess.SubprocessError) as error:
@@ -99,6 +101,7 @@ def _folder() -> Path:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
+        _require_programs(folder)
         if _ours_alone(folder):
             return folder
         log.warning("kernels are not cached: others can write to %s (chmod go-w)", folder)
@@ -108,8 +111,15 @@ def _folder() -> Path:
     return _own_folder()
 
 
-def _build(source: Callable[[], str], key: str, compiler: str) -> Path:
+def _require_programs(folder: Path) -> None:
+    """Raise OSError where no program can be run from a folder."""
+    if os.statvfs(folder).f_flag & os.ST_NOEXEC:
+        raise OSError(f"{folder} is mounted noexec (SOUP_NLP_CACHE names another folder)")
+
+
+def _build(source: Callable[[], str], key: str, compiler: Sequence[str]) -> Path:
     folder = _folder()
+    _require_programs(folder)
     library = folder / f"kernels-{key}.so"
     if library.exists() and not _ours_alone(library):
         log.warning("kernels are compiled again: others can write to %s", library)
@@ -119,12 +129,12 @@ def _build(source: Callable[[], str], key: str, compiler: str) -> Path:
         code = source()
         if len(code) > MOST_SOURCE:
             raise OSError(f"{len(code)} characters of C would take minutes")
-        log.info("compiling kernels with %s; this machine keeps them", Path(compiler).name)
+        log.info("compiling kernels with %s; this machine keeps them", Path(compiler[0]).name)
         with tempfile.TemporaryDirectory(dir=folder) as work:
             c_file, made = Path(work) / "kernels.c", Path(work) / library.name
             c_file.write_text(code)
             subprocess.run(
-                [compiler, *FLAGS, str(c_file), "-o", str(made), "-lm"],
+                [*compiler, *FLAGS, str(c_file), "-o", str(made), "-lm"],
                 check=True,
                 capture_output=True,
                 timeout=600,

@@ -17,6 +17,7 @@ from scipy import sparse
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ModelError
+from soup_nlp.model.compile import find_compiler
 from soup_nlp.model.kernel import Group, Hessian
 from soup_nlp.model.lanes import LANES, Summed, compile_lanes
 from soup_nlp.model.pattern import Pattern, hessian_entries, jacobian_entries
@@ -153,10 +154,8 @@ class NLP:
             library = compile_lanes(list(own.values())) if compiled and own else None
             if compiled and own and library is None:
                 compiled = False
-                log.info(
-                    "no machine code: kernels run in numpy, and a solve takes about a third"
-                    " longer (a C compiler on the PATH, gcc or clang, is used)"
-                )
+                hint = "" if find_compiler() else " (gcc or clang on the PATH is used)"
+                log.info("no machine code: kernels run in numpy, a third slower%s", hint)
             blocks = group.blocks(LANES, np.int32) if library else None
             for key, f in own.items():
                 size, targets = places[key]

@@ -17,6 +17,7 @@ from soup_nlp.evaluate import recompute
 from soup_nlp.evaluate.scoring import DEPTHS, SURE
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.report.layout import require_layout
+from soup_nlp.report.summary import Summary
 from soup_nlp.storage.files import as_path, read_json
 from soup_nlp.storage.folders import SUMS, digest_of, read_sums
 from soup_nlp.storage.store import read_h5, require
@@ -117,7 +118,7 @@ def check_folder(folder: str | Path) -> CheckReport:
         DataError: a file, a claim or an array is missing or malformed.
     """
     folder = as_path(folder, "result folder")
-    claims = read_json(folder / "summary.json", "summary.json")
+    claims = read_json(folder / "summary.json", "summary.json", Summary)
     stored = Stored(folder, claims, read_h5(folder / "result.h5"))
     try:
         require_layout(stored.tree)

@@ -28,6 +28,7 @@ from soup_nlp.report.figures import shown
 from soup_nlp.report.findings import guess_line
 from soup_nlp.report.layout import require_layout, result_tree
 from soup_nlp.report.pictures import overview, pictures
+from soup_nlp.report.summary import Summary
 from soup_nlp.storage.files import as_path, plain, read_json
 from soup_nlp.storage.store import ReadTree, read_h5, require
 
@@ -260,7 +261,7 @@ def load(folder: str | Path) -> Result:
     """
     folder = as_path(folder, "result folder")
     path = folder / "result.h5"
-    tree, summary = read_h5(path), read_json(folder / "summary.json", "summary.json")
+    tree, summary = read_h5(path), read_json(folder / "summary.json", "summary.json", Summary)
     require_layout(tree)
     try:
         _, _, K_ref, K_next, _ = (require(tree, f"input/{name}") for name in INPUTS)

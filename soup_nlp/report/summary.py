@@ -1,16 +1,18 @@
 """What a run found and how sure that is, as numbers: summary.json and the shares of the verdict."""
 
-from typing import Any
+from dataclasses import fields
+from typing import Any, Literal, NotRequired
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from soup_nlp.arrays import Mask
 from soup_nlp.evaluate.confidence import MOST_SIGMA
-from soup_nlp.evaluate.metrics import component_overlaps, skill
+from soup_nlp.evaluate.metrics import DepthMetrics, component_overlaps, skill
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import DETERMINED, ORIGINS, limits
+from soup_nlp.report.findings import DETERMINED, GUESSES, ORIGINS, limits
 from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.storage.versions import versions
 
@@ -19,6 +21,47 @@ _ROUND = (
     *("seconds", "proposed", "accepted"),
 )
 """Entries of a round of the refinement in summary.json."""
+
+Number = float | None
+"""A number in JSON, where null stands for one that is not finite."""
+_OTHERS = {"scale_rule": str, "n_pixels": int}
+_SHARES = "determined", *DETERMINED, "guess", *GUESSES
+Scores: Any = TypedDict(  # type: ignore[misc]
+    "Scores",
+    {f.name: _OTHERS.get(f.name, Number) for f in fields(DepthMetrics)}
+    | {"skill": NotRequired[Number]},
+)
+"""Scores of a depth map, a `DepthMetrics`, and its skill."""
+Shares: Any = TypedDict(  # type: ignore[misc]
+    "Shares", {k: NotRequired[float] if k == "given" else float for k in _SHARES}
+)
+"""Shares of the image, see `certainty`."""
+
+
+class Sizes(TypedDict):
+    """Sizes of the problem."""
+
+    superpixels: int
+
+
+class Summary(TypedDict):
+    """Entries of summary.json that are read back."""
+
+    name: str
+    status: str
+    converged: bool
+    delivered: str
+    energy: dict[Literal["start", "nlp", "solution"], dict[str, Number]]
+    residuals: dict[str, Number]
+    nlp_residuals: dict[str, Number]
+    answer_residuals: dict[str, Number]
+    metrics: dict[str, Scores]
+    truth_unit: str | None
+    seconds: dict[str, float]
+    sizes: Sizes
+    certainty: Shares
+    limits: list[str]
+    verdict: list[str]
 
 
 def summary(run: Run) -> dict[str, Any]:

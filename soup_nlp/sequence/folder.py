@@ -16,6 +16,7 @@ from soup_nlp.report.formats import check_formats, write_depths, write_formats, 
 from soup_nlp.report.page import pair_page
 from soup_nlp.report.result import PAGE, Result
 from soup_nlp.report.result import load as load_pair
+from soup_nlp.sequence.contents import Contents
 from soup_nlp.sequence.links import make_chain, read_pair
 from soup_nlp.sequence.score import certainty, chain_page, score
 from soup_nlp.storage.files import as_path, is_file, read_json, write_json, write_text
@@ -79,12 +80,9 @@ def read_chain(folder: Path) -> Chain:
     Raises:
         DataError: a pair is missing or damaged.
     """
-    contents = read_json(folder / CHAIN, CHAIN)
-    try:
-        count = int(contents["frames"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError("chain.json cannot be read", where=folder, found=error) from error
-    return make_chain([read_pair(pair_folder(folder, k)) for k in range(count - 1)], contents)
+    contents = read_json(folder / CHAIN, CHAIN, Contents)
+    pairs = range(len(contents["scales"]))
+    return make_chain([read_pair(pair_folder(folder, k)) for k in pairs], contents)
 
 
 def pair_folder(folder: Path, k: int) -> Path:

@@ -4,14 +4,18 @@ import json
 import os
 import stat
 from collections.abc import Callable, Mapping
+from itertools import chain, count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import from_json, to_jsonable_python
 
 from soup_nlp.errors import DataError, SoupError, printable
 
 PathLike = str | os.PathLike[str]
+Kind = TypeVar("Kind")
 
 MOST_BYTES = 2 << 30
 """Size limit of files of images or numbers, bytes."""
@@ -22,22 +26,13 @@ MOST_YAML = 1 << 20
 MOST_NODES = 100_000
 """Limit of the values in a YAML text with expanded aliases."""
 DEEPEST = 64
-"""Limit of nesting in JSON and YAML."""
-KINDS = {
-    stat.S_ISDIR: "a folder",
-    stat.S_ISFIFO: "a named pipe",
-    stat.S_ISSOCK: "a socket",
-    stat.S_ISCHR: "a device",
-    stat.S_ISBLK: "a device",
-}
+"""Limit of nesting in YAML."""
 
 
 def as_path(
     name: object, what: str = "file", *, error: type[SoupError] = DataError, home: bool = False
 ) -> Path:
-    """A name as a path.
-
-    `~` stands for the home folder if `home` is set.
+    """A name as a path; `~` stands for the home folder if `home` is set.
 
     Raises:
         SoupError: it is no path, no name of a file, or names the home of an unknown user.
@@ -49,22 +44,11 @@ def as_path(
             expected="text or a pathlib.Path",
         )
     try:
-        bad = b"\0" in os.fsencode(name)
-    except UnicodeEncodeError:  # half a surrogate pair
-        bad = True
-    if bad:
-        raise error(
-            f"name of {what} is no name of a file",
-            where=name,
-            expected="characters that file systems have, without NUL",
-        )
-    path = Path(name)
-    if not home:
-        return path
-    try:
-        return path.expanduser()
-    except RuntimeError as problem:
-        raise error(f"home folder of {what} is not known", where=name, found=problem) from None
+        if b"\0" in os.fsencode(name):
+            raise ValueError("a NUL character")
+        return Path(name).expanduser() if home else Path(name)
+    except (ValueError, RuntimeError) as problem:
+        raise error(f"name of {what} is no name of a file", where=name, found=problem) from None
 
 
 is_file: Callable[[PathLike], bool] = os.path.isfile
@@ -89,8 +73,8 @@ def require_file(path: PathLike, what: str, *, error: type[SoupError] = DataErro
     except OSError as problem:
         raise error(f"{what} cannot be read", where=path, found=problem.strerror) from None
     if not stat.S_ISREG(mode):
-        kind = next((word for test, word in KINDS.items() if test(mode)), None)
-        raise error(f"{what} cannot be read", where=path, found=kind, expected="a readable file")
+        found = "a folder" if stat.S_ISDIR(mode) else "a pipe, socket or device"
+        raise error(f"{what} cannot be read", where=path, found=found, expected="a readable file")
     return path
 
 
@@ -153,69 +137,45 @@ def parse_json(text: str) -> Any:
     Raises:
         ValueError: it is not JSON, is nested too deeply, or has a number that is no float64.
     """
-    try:
-        return _plain(json.loads(text, parse_constant=_constant, parse_int=_whole), 0)
-    except RecursionError:
-        raise ValueError(f"brackets are nested more than {DEEPEST} deep") from None
+    return _printable(from_json(text, allow_inf_nan=False))
 
 
-def read_json(path: PathLike, what: str, *, error: type[SoupError] = DataError) -> Any:
+def read_json(
+    path: PathLike, what: str, kind: type[Kind], *, error: type[SoupError] = DataError
+) -> Kind:
     """The value of a JSON file, see `parse_json`.
 
+    Args:
+        path: The file.
+        what: Its name in messages.
+        kind: Type that the value must have, such as a TypedDict; further entries are left out.
+        error: Type of the exception.
+
     Raises:
-        SoupError: the file cannot be read, or is not such JSON.
+        SoupError: the file cannot be read, is not such JSON, or an entry is of another type.
     """
     try:
-        return parse_json(read_text(path, what, error=error))
+        value = parse_json(read_text(path, what, error=error))
+        return TypeAdapter(kind).validate_python(value, strict=True)
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        raise error(
+            f"{what} lacks an entry, or has one that cannot be used",
+            where=f"{path}, {'.'.join(map(str, first['loc'])) or 'top'}",
+            found=first["input"] if first["type"] != "missing" else None,
+            expected=first["msg"],
+            hint="it may be damaged, or of another version: make it again",
+        ) from None
     except ValueError as problem:
         raise error(f"{what} is not JSON", where=path, found=problem) from None
 
 
-def _constant(word: str) -> float:
-    raise ValueError(f"{word} is no number of JSON")
-
-
-def _whole(text: str) -> int:
-    if len(text) > 19:
-        raise ValueError(f"number of {len(text)} digits")
-    return int(text)
-
-
-def _plain(value: Any, level: int) -> Any:
-    """The value with its strings on one line each, control characters escaped.
-
-    Raises:
-        ValueError: it is nested too deeply.
-    """
-    if level > DEEPEST:
-        raise ValueError(f"brackets are nested more than {DEEPEST} deep")
+def _printable(value: Any) -> Any:
     if isinstance(value, str):
         return printable(value)
     if isinstance(value, Mapping):
-        return {printable(key): _plain(item, level + 1) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item, level + 1) for item in value]
-    return value
-
-
-def _check_node(node: yaml.Node) -> None:
-    """Raise ValueError for a YAML document with too many values or nested too deeply."""
-    sizes: dict[int, int] = {}
-
-    def size(node: yaml.Node, level: int) -> int:
-        """Number of values of a node with expanded aliases."""
-        if level > DEEPEST:
-            raise ValueError(f"brackets are nested more than {DEEPEST} deep")
-        if not isinstance(node, yaml.CollectionNode):
-            return 1
-        if id(node) not in sizes:
-            pairs = node.value if isinstance(node, yaml.MappingNode) else [node.value]
-            sizes[id(node)] = 1 + sum(size(item, level + 1) for pair in pairs for item in pair)
-        if sizes[id(node)] > MOST_NODES:
-            raise ValueError(f"more than {MOST_NODES} values")
-        return sizes[id(node)]
-
-    size(node, 0)
+        return {printable(key): _printable(item) for key, item in value.items()}
+    return [_printable(item) for item in value] if isinstance(value, list) else value
 
 
 def parse_yaml(
@@ -236,13 +196,26 @@ def parse_yaml(
     """
     if len(text) > MOST_YAML:
         raise ValueError(f"{len(text)} characters, at most {MOST_YAML} are read")
+    seen = count(1)
+
+    def check(node: yaml.Node, level: int) -> None:
+        """Visit every value as often as aliases expand it."""
+        if level > DEEPEST:
+            raise ValueError(f"brackets are nested more than {DEEPEST} deep")
+        if next(seen) > MOST_NODES:
+            raise ValueError(f"more than {MOST_NODES} values")
+        if isinstance(node, yaml.CollectionNode):
+            mapping = isinstance(node, yaml.MappingNode)
+            for item in chain(*node.value) if mapping else node.value:
+                check(item, level + 1)
+
     try:
         loader = kind(text)
         try:
             node = loader.get_single_node()
             if node is None:
                 return None
-            _check_node(node)
+            check(node, 0)
             see(node)
             return loader.construct_document(node)
         finally:
@@ -258,9 +231,7 @@ def parse_yaml(
 
 
 def write_bytes(path: PathLike, data: bytes) -> None:
-    """Write a file.
-
-    Commands write into a folder of `folders.staged`, so that results appear whole or not at all.
+    """Write a file; commands do so in a folder of `folders.staged`.
 
     Raises:
         DataError: the folder is missing or cannot be written, or the disk is full.
@@ -287,9 +258,6 @@ def plain(obj: object) -> Any:
     Raises:
         DataError: a type that JSON does not have.
     """
-    # imported on use, as NumPy is: processes that only move files need neither
-    from pydantic_core import to_jsonable_python
-
     return to_jsonable_python(obj, inf_nan_mode="null", fallback=_builtin)
 
 

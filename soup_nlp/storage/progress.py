@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from types import FrameType
+from typing import Any
 
 from soup_nlp.storage.system import SIGNALS, handling
 
@@ -61,27 +62,33 @@ class interruptible:  # noqa: N801
 
     SIGTERM does the same. The second signal raises KeyboardInterrupt, and the first one while
     `at_once` is set, as long as there is nothing to keep; neither does while `deferred` is set, as
-    during the writing of files. CasADi discards a KeyboardInterrupt from its callbacks; `aborted`
-    records it.
+    during the writing of files. Native code may discard a KeyboardInterrupt, or turn it into
+    another exception: `aborted` records it, and the block ends with a KeyboardInterrupt for any.
 
     Args:
         say: Called in a signal handler, with the effect of this Ctrl-C.
         numbers: The signals.
+        at_once: See above.
     """
 
     def __init__(
-        self, say: Callable[[str], None] | None = None, numbers: Iterable[int] = SIGNALS
+        self,
+        say: Callable[[str], None] = lambda line: None,
+        numbers: Iterable[int] = SIGNALS,
+        at_once: bool = False,
     ) -> None:
-        self._handling = handling(self._set, numbers)
+        self._handling = handling(self.handle, numbers)
         self.event = threading.Event()
-        self.at_once = self.deferred = self.aborted = False
-        self._say = say or (lambda line: None)
+        self.at_once = at_once
+        self.deferred = self.aborted = False
+        self._say = say
 
     def __enter__(self) -> threading.Event:
         self._handling.__enter__()
         return self.event
 
-    def _set(self, number: int, frame: FrameType | None) -> None:
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal."""
         if self.deferred:
             self._say("interrupt received: the files are being written, this ends then")
         elif self.at_once or self.event.is_set():
@@ -97,10 +104,18 @@ class interruptible:  # noqa: N801
             )
         self.event.set()
 
-    def __exit__(self, *exc: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._handling.__exit__(None, None, None)
+        if self.aborted and isinstance(error, Exception):
+            raise KeyboardInterrupt from error
 
 
 def raising() -> list[int]:
     """Signals that would raise KeyboardInterrupt, which CasADi discards in its callbacks."""
-    return [n for n in SIGNALS if signal.getsignal(n) is signal.default_int_handler]
+
+    def raises(handler: Any) -> bool:
+        own = getattr(handler, "__self__", None)
+        at_once = isinstance(own, interruptible) and own.at_once
+        return at_once or handler is signal.default_int_handler
+
+    return [number for number in SIGNALS if raises(signal.getsignal(number))]

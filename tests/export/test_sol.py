@@ -96,6 +96,7 @@ def test_written_files_read_back(message, read, lam, tmp_path):
         ("\n2\n2\n3\n3\n", "\n2\n2\n3\n0\n", "no point"),
         ("\n30\n", "\nnan\n", "not finite"),
         ("objno 0 0", "objno 0 abc", "objno"),
+        ("objno 0 0", f"objno 0 {'9' * 5000}", "objno"),
         *[("Options\n3\n", f"Options\n{count}\n", "a.sol") for count in ("nan", "-3", "1e300")],
         ("\n2\n2\n3\n3\n", "\n2\n2\n3.5\n3\n", "a.sol"),
         *[("-1.5\n", f"{value}\n", "not finite") for value in ("nan", "inf")],

@@ -1,7 +1,9 @@
 """Machine code, numpy and CasADi's graph give the same numbers; the cache of machine code."""
 
 import logging
+import os
 from dataclasses import replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -23,7 +25,7 @@ from soup_nlp.solve.functions import Functions
 
 pytestmark = pytest.mark.slow
 
-needs_compiler = pytest.mark.skipif(compiling.find_compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(not compiling.find_compiler(), reason="no C compiler")
 
 
 @pytest.fixture
@@ -223,6 +225,29 @@ def test_a_library_that_does_not_load_is_replaced_by_numpy(monkeypatch, tmp_path
 
 
 SOURCE = "double two(void) { return 2; }\n"
+
+
+@needs_compiler
+def test_nothing_is_compiled_where_no_program_can_run(own_cache, monkeypatch, caplog):
+    caplog.set_level("INFO")
+    flags, free = SimpleNamespace(f_flag=os.ST_NOEXEC), SimpleNamespace(f_flag=0)
+    monkeypatch.setattr(os, "statvfs", lambda folder: flags if folder == own_cache else free)
+    made = compiling.shared_library("key", lambda: SOURCE)
+    assert made.parent != own_cache
+    assert "noexec" in caplog.text
+    monkeypatch.setattr(os, "statvfs", lambda folder: flags)
+    assert engine(squares(5)) is vectors.Vectors
+    assert "on the PATH" not in caplog.text
+
+
+@needs_compiler
+def test_a_compiler_may_have_options(own_cache, monkeypatch):
+    compiler = compiling.find_compiler()[0]
+    monkeypatch.setenv("CC", f"{compiler} -DTHREE=3")
+    made = compiling.shared_library("key", lambda: "double three(void) { return THREE; }\n")
+    assert made.is_file()
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert compiling.find_compiler() == []
 
 
 @needs_compiler

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -260,7 +261,7 @@ def test_json(tmp_path):
         "text": "ä",
         "3": None,
     }
-    assert read_json(path, "file") == back
+    assert read_json(path, "file", dict[str, Any]) == back
 
 
 @pytest.mark.parametrize(
@@ -270,10 +271,10 @@ def test_json_that_is_none_is_an_error_of_the_file(text, tmp_path):
     path = tmp_path / "summary.json"
     path.write_text(text)
     with pytest.raises(DataError, match=r"summary\.json"):
-        read_json(path, "summary.json")
+        read_json(path, "summary.json", dict[str, Any])
     path.write_bytes(b"\xff\xfe{}")
     with pytest.raises(DataError, match="not text"):
-        read_json(path, "summary.json")
+        read_json(path, "summary.json", dict[str, Any])
 
 
 def test_versions():

@@ -6,7 +6,7 @@ Each needs the two images and the camera. The truth is None without its file, an
 import re
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import skimage
@@ -97,10 +97,10 @@ class FolderInput(FramesInput):
 
 def _refuse_result(folder: Folder) -> None:
     """Raise DataError for a folder with a result."""
-    marked, summary = read_sums(folder.path) is not None, None
+    marked, summary = read_sums(folder.path) is not None, {}
     with suppress(DataError):
-        summary = read_json(folder.path / "summary.json", "summary.json")
-    if marked or (isinstance(summary, dict) and "problem_hash" in summary):
+        summary = read_json(folder.path / "summary.json", "summary.json", dict[str, Any])
+    if marked or "problem_hash" in summary:
         raise DataError(
             "input folder holds a result, whose depth and flow would pass for truth",
             where=folder.path,
