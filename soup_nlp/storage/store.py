@@ -5,12 +5,11 @@ Reading rejects links and checks sizes before it allocates memory.
 
 import json
 import platform
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from io import BytesIO
 from types import MappingProxyType
-from typing import Any, NamedTuple, NoReturn, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import h5py
 import numpy as np
@@ -151,6 +150,8 @@ ReadTree: TypeAlias = dict[str, Any]
 
 DEEPEST = 16
 """Largest number of nested groups."""
+MOST_COMPRESSION = 1100
+"""Largest ratio of an array's bytes to its stored ones: deflate reaches 1032."""
 BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError)
 """Exceptions that h5py raises for damaged files."""
 
@@ -162,76 +163,11 @@ def read_h5(path: PathLike) -> ReadTree:
         DataError: the file is missing, damaged or not HDF5, holds a link or a type that no result
             has, or does not fit into memory.
     """
-    with _opened(path) as file:
-        items = _items(file)
-        size = sum(i.size * i.dtype.itemsize for _, i in items if isinstance(i, h5py.Dataset))
-        require_memory(size, "the arrays of the result", path, "the file may be damaged")
-        out: ReadTree = {}
-        for name, item in items:
-            *groups, last = name.split("/")
-            node = out
-            for group in groups:
-                node = node.setdefault(group, {})
-            if isinstance(item, h5py.Group):
-                node[last] = {}
-            elif h5py.check_string_dtype(item.dtype):
-                node[last] = np.asarray(item.asstr()[()])
-            else:
-                node[last] = np.asarray(item[()])
-        return out
-
-
-def _items(file: h5py.File) -> list[tuple[str, h5py.Group | h5py.Dataset]]:
-    """Names, groups and arrays of an open file, which must be a tree without links.
-
-    Raises:
-        DataError: there is an object that no result has, a soft or external link, or an object
-            under two names.
-    """
-    items: list[tuple[str, h5py.Group | h5py.Dataset]] = []
-    links: dict[str, type] = {}
-
-    def refuse(name: str, actual: str) -> NoReturn:
-        raise DataError(
-            "result holds what no result has",
-            where=f"{file.filename}, {name}",
-            found=actual,
-            expected=f"numbers or text under one name, in at most {DEEPEST} levels of groups",
-        )
-
-    def see_link(name: str, link: Any) -> None:
-        # an exception raised here becomes a SystemError in h5py
-        links[name] = type(link)
-
-    def see(name: str, item: Any) -> None:
-        if name.count("/") > DEEPEST:
-            refuse(name, "groups within groups")
-        if not isinstance(item, h5py.Group | h5py.Dataset):
-            refuse(name, type(item).__name__)
-        if isinstance(item, h5py.Dataset):
-            if item.shape is None or item.external or item.is_virtual:
-                refuse(name, "an array without values of its own")
-            if item.dtype.kind not in "fiub" and not h5py.check_string_dtype(item.dtype):
-                refuse(name, f"type {item.dtype}")
-        items.append((name, item))
-
-    # neither visit follows a soft or external link, and `see` gets every object once
-    file.visititems(see)
-    file.visititems_links(see_link)
-    for name in sorted(links.keys() - {name for name, _ in items}):
-        hard = links[name] is h5py.HardLink
-        refuse(name, "an object under two names" if hard else links[name].__name__)
-    return items
-
-
-@contextmanager
-def _opened(path: PathLike) -> Iterator[h5py.File]:
-    """An open file; errors of h5py in the block become DataErrors."""
     require_file(path, "result file")
     try:
         # file systems of clusters often have no locks
         with h5py.File(path, "r", locking=False) as file:
-            yield file
+            return _read_group(file, set())
     except BROKEN as error:
         raise DataError(
             "file is not a readable HDF5 file",
@@ -239,6 +175,52 @@ def _opened(path: PathLike) -> Iterator[h5py.File]:
             found=error,
             expected="a result file written by soup_nlp",
         ) from error
+
+
+def _read_group(group: h5py.Group, seen: set[object], level: int = 0) -> ReadTree:
+    """Arrays of a group; `seen` are the places of the objects that were read."""
+    out: ReadTree = {}
+    for name in group:
+        link: Any = group.get(name, getlink=True)
+        item: Any = None
+        odd = "" if isinstance(link, h5py.HardLink) else type(link).__name__
+        if not odd:
+            item = group[name]
+            odd = "groups within groups" if level > DEEPEST else _odd(item, seen)
+        where = f"{group.file.filename}, {group.name.rstrip('/')}/{name}"
+        if odd:
+            raise DataError(
+                "result holds what no result has",
+                where=where,
+                found=odd,
+                expected=f"numbers or text under one name, in at most {DEEPEST} levels of groups",
+            )
+        if isinstance(item, h5py.Group):
+            out[name] = _read_group(item, seen, level + 1)
+        else:
+            require_memory(item.nbytes, "an array", where, "the file may be damaged")
+            text = h5py.check_string_dtype(item.dtype)
+            out[name] = np.asarray((item.asstr() if text else item)[()])
+    return out
+
+
+def _odd(item: Any, seen: set[object]) -> str:
+    """What no result has of an object; empty for nothing."""
+    place = h5py.h5o.get_info(item.id).addr
+    if place in seen:
+        return "an object under two names"
+    seen.add(place)
+    if isinstance(item, h5py.Group):
+        return ""
+    if not isinstance(item, h5py.Dataset):
+        return type(item).__name__
+    if item.shape is None or item.external or item.is_virtual:
+        return "an array without values of its own"
+    if item.dtype.kind not in "fiub" and not h5py.check_string_dtype(item.dtype):
+        return f"type {item.dtype}"
+    stored = item.id.get_storage_size()
+    few = item.nbytes > MOST_COMPRESSION * stored
+    return f"{item.nbytes} bytes of which {stored} are stored" if few else ""
 
 
 def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:
@@ -251,12 +233,8 @@ def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:
     for key in name.split("/"):
         if not isinstance(here, Mapping) or key not in here:
             names = sorted(here) if isinstance(here, Mapping) else "an array, not a group"
-            raise DataError(
-                f"result has no {name!r}",
-                found=names,
-                expected=repr(key),
-                hint="the file may come from another version, or the run ended early",
-            )
+            hint = "the file may come from another version, or the run ended early"
+            raise DataError(f"result has no {name!r}", found=names, expected=repr(key), hint=hint)
         here = here[key]
     if isinstance(here, Mapping):
         raise DataError(f"{name!r} is a group, not an array", found=sorted(here))
