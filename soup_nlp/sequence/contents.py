@@ -19,7 +19,7 @@ class Scaled(TypedDict):
 
 
 class Linked(TypedDict):
-    """A link between two pairs, see `sequence.chain.Link`."""
+    """A link between two pairs, see `report.chain.Link`."""
 
     pairs: Two
     ratio: float
@@ -51,6 +51,7 @@ class PathError(TypedDict):
 class Score(TypedDict):
     """Errors against the truth, see `sequence.score.score`."""
 
+    scale: float
     mre_own_scale: float
     mre_one_scale: float
     cost: float
