@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from benchmarks.family.frozen import RECORDS, Frozen, load_frozen
 from benchmarks.family.instances import (
@@ -189,17 +190,33 @@ def check_sol(path: Path) -> tuple[str, bool]:
     return text, r.optimal
 
 
+class BestKnown(TypedDict):
+    """Lowest objective that was found."""
+
+    objective: float
+
+
+class Indexed(TypedDict):
+    """An instance."""
+
+    name: str
+    best_known: BestKnown
+
+
+class Index(TypedDict):
+    """Entries of the index that are read back."""
+
+    instances: list[Indexed]
+
+
 def family_tasks(folder: Path) -> Iterator[Labelled]:
     """The tasks of all instances in a folder, for `export.compare.compare`.
 
     Raises:
         DataError: the index cannot be read.
     """
-    try:
-        entries = read_json(folder / INDEX, "index of the family")["instances"]
-        best = {e["name"]: float(e["best_known"]["objective"]) for e in entries}
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError("index of the family cannot be read", where=folder, found=error) from error
+    entries = read_json(folder / INDEX, "index of the family", Index)["instances"]
+    best = {e["name"]: e["best_known"]["objective"] for e in entries}
     for name, objective in best.items():
         instance = parse_name(name)
         label = {

@@ -18,7 +18,7 @@ from soup_nlp.storage.each import Row
 from soup_nlp.storage.files import write_text
 from soup_nlp.storage.folders import claim, default_folder, staged
 
-PAGE = "README.md"
+PAGE, ROWS = "README.md", "runs.jsonl"
 
 
 def compare(
@@ -51,7 +51,7 @@ def compare(
     subject = ", ".join(dict.fromkeys(p.subject for p in chosen))
     name = title(f"solvers-{'-'.join(dict.fromkeys(p.name for p in chosen))}")
     out = out or default_folder(name, subject)
-    folder = claim(out, [PAGE], overwrite, subject)
+    folder = claim(out, [PAGE], overwrite, subject, ROWS)
     tasks = [problem_task(prepare(problem), coordinates) for problem in chosen]
 
     def keep(rows: list[Row]) -> None:
@@ -59,9 +59,12 @@ def compare(
         with staged(folder, overwrite=overwrite, subject=subject) as new:
             write_text(new / PAGE, page(rows, limits))
 
+    with staged(folder, overwrite=overwrite, subject=subject):
+        # from here on, the folder is this command's
+        pass
     with options.resumable("the runs that were finished are kept, with a page of them", folder):
-        rows = run_all(tasks, names, limits, folder / "runs.jsonl", print, keep)
+        rows = run_all(tasks, names, limits, folder / ROWS, print, keep)
     print(conclusion(rows))
-    print(f"files       {out}/: {PAGE}, runs.jsonl")
+    print(f"files       {out}/: {PAGE}, {ROWS}")
     verified = sum(bool(row.get("verified")) for row in rows)
     return options.finish(bool(verified), f"{verified} of {len(rows)} runs are verified")
