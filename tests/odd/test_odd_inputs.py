@@ -44,7 +44,7 @@ def world(tmp_path_factory) -> World:
 
 
 def test_the_collection_is_large_and_its_names_are_unique():
-    assert sum(map(len, TABLES.values())) > 1000
+    assert sum(map(len, TABLES.values())) > 750
     assert len({(case.group, case.name) for case in CASES}) == len(CASES)
 
 
