@@ -33,7 +33,8 @@ Scores: Any = TypedDict(  # type: ignore[misc]
 )
 """Scores of a depth map, a `DepthMetrics`, and its skill."""
 Shares: Any = TypedDict(  # type: ignore[misc]
-    "Shares", {k: NotRequired[float] if k == "given" else float for k in _SHARES}
+    "Shares",
+    {k: NotRequired[float] if k == "given" else float for k in _SHARES} | {"median_sigma": Number},
 )
 """Shares of the image, see `certainty`."""
 

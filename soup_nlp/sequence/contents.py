@@ -43,9 +43,12 @@ class TrueLink(TypedDict):
 
 
 class PathError(TypedDict):
-    """Error of the camera positions."""
+    """Error of the camera's path."""
 
     share: float
+    ate: float
+    rpe: float
+    rpe_degrees: float
 
 
 class Score(TypedDict):
@@ -66,7 +69,6 @@ class Contents(TypedDict):
     unit: str
     sources: list[str]
     scales: Annotated[list[Scaled], Len(1)]
-    over: list[Two]
     links: list[Linked]
     tracks: list[Tracked]
     world_from_camera: list[Annotated[list[Row], Len(4, 4)]]

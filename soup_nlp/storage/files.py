@@ -148,15 +148,15 @@ def read_json(
     Args:
         path: The file.
         what: Its name in messages.
-        kind: Type that the value must have, such as a TypedDict; further entries are left out.
+        kind: Type that the value must have, such as a TypedDict; further entries stay.
         error: Type of the exception.
 
     Raises:
         SoupError: the file cannot be read, is not such JSON, or an entry is of another type.
     """
     try:
-        value = parse_json(read_text(path, what, error=error))
-        return TypeAdapter(kind).validate_python(value, strict=True)
+        value: Kind = parse_json(read_text(path, what, error=error))
+        TypeAdapter(kind).validate_python(value, strict=True)
     except ValidationError as problem:
         first = problem.errors()[0]
         raise error(
@@ -168,6 +168,7 @@ def read_json(
         ) from None
     except ValueError as problem:
         raise error(f"{what} is not JSON", where=path, found=problem) from None
+    return value
 
 
 def _printable(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +33,8 @@ class Job:
 
 def reason(row: Mapping[str, Any]) -> str:
     """The reason of a failure on one line: first line of the error, its place and actual value."""
-    first, *lines = str(row.get("error")).splitlines() or ["no reason"]
-    details = (line.strip() for line in lines)
+    # a stored row has its lines on one
+    first, *details = re.split(r"\n *| {3,}", str(row.get("error") or "no reason"))
     return ", ".join([first, *(d for d in details if d.startswith(("where: ", "found: ")))])
 
 

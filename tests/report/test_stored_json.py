@@ -54,7 +54,10 @@ def test_every_entry_of_a_chain(tmp_path):
     tree, accepted = json.loads(path.read_text()), 0
     tree["score"] = {
         **{"scale": 2.0, "mre_own_scale": 0.1, "mre_one_scale": 0.1, "cost": 0.0},
-        **{"links": [{"pairs": [0, 1], "true": 2.0}], "path": {"share": 0.1}},
+        **{
+            "links": [{"pairs": [0, 1], "true": 2.0}],
+            "path": dict.fromkeys(("share", "ate", "rpe", "rpe_degrees"), 0.1),
+        },
     }
     for _, root in changes(tree):
         path.write_text(json.dumps(root))
