@@ -48,7 +48,12 @@ def as_path(
             raise ValueError("a NUL character")
         return Path(name).expanduser() if home else Path(name)
     except (ValueError, RuntimeError) as problem:
-        raise error(f"name of {what} is no name of a file", where=name, found=problem) from None
+        raise error(
+            f"name of {what} is no name of a file",
+            where=name,
+            found=problem,
+            expected="characters that file systems have, without NUL",
+        ) from None
 
 
 is_file: Callable[[PathLike], bool] = os.path.isfile

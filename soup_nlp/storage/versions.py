@@ -25,7 +25,8 @@ def code_version() -> str:
     Benchmarks store it in their rows, and measure rows of another version again.
     """
     root, digest = Path(__file__).parents[1], hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
+    # presets are YAML
+    for path in sorted(p for p in root.rglob("*.*") if p.suffix in (".py", ".yaml")):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return f"{__version__}+{digest.hexdigest()[:10]}"
 

@@ -40,7 +40,7 @@ TINY = [
     "input.width=64", "input.height=48", "flow.source=truth", "segmentation.superpixels=12",
     "segmentation.neighbours=4", "refine.rounds=1", "refine.particles=6", "output.page=false",
 ]  # fmt: skip
-NAMES = ("solve", "export", "import", "compare", "chain")
+NAMES = ("solve", "convert", "export", "import", "compare", "chain")
 SIGNALS: Mapping[str, Sequence[int]] = {
     "SIGKILL": [signal.SIGKILL],
     "SIGTERM": [signal.SIGTERM],
@@ -69,8 +69,13 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         "import": ["import", str(root / "exported"), str(root / "a.sol"), "-o", str(out["import"])],
         "compare": f"compare orbit --solvers ipopt --seconds 20 -o {out['compare']}".split()
         + overrides,
-        "chain": f"chain {clip(root)} --fov=50 -q -o {out['chain']}".split() + overrides[6:],
+        # a pair that is solved again ends the chain that it was part of
+        "chain": f"chain {clip(root)} --fov=50 -q --overwrite -o {out['chain']}".split()
+        + overrides[6:],
+        "convert": f"convert {root / 'solved'} --to glb,colmap,npy -o {out['convert']}".split(),
     }
+    if "convert" in names:
+        run([*words["solve"][:-1], str(root / "solved")])
     if "import" in names:
         run([*export, "--out", str(root / "exported")])
         problem = load_problem(root / "exported" / "problem.yaml")
