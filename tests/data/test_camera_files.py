@@ -265,6 +265,7 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
         "nested too deeply|no camera",
     ),
     "XML": ("<?xml version='1.0'?><opencv_storage></opencv_storage>", "XML"),
+    "empty file": ("", "is empty"),
     "binary": (b"\x80\x04\x95\x00\x00", "not text"),
     "odd UTF-16": (FOUR.encode("utf-16")[:-1], "not text"),
     "objects": (npy(np.array([None])), "not text"),

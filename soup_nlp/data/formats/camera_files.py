@@ -90,7 +90,9 @@ def read_camera(path: PathLike) -> tuple[Float, Float]:
             return read_cam(path), np.zeros(0)
         named = leaves(path)
     except DataError as error:
-        raise refused(error.what, path, error.found, error.hint or TRY) from None
+        if error.hint:
+            raise
+        raise refused(error.what, path, error.found) from None
     except ValueError as error:  # also of decoding
         raise refused("camera file is not text of a known kind", path, error) from None
     if [names for names, _ in named] == [()]:
