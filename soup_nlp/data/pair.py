@@ -81,12 +81,10 @@ class Flow:
 
     def __post_init__(self) -> None:
         put = partial(object.__setattr__, self)
+        named = is_path(self.uv) and self.source == "unknown"
+        put("source", printable(self.uv if named else self.source))
         flow: FlowLike = self.uv
-        if is_path(flow):
-            put("source", str(flow) if self.source == "unknown" else self.source)
-            flow = read_flow(flow)
-        # the name of a file may hold anything
-        put("source", printable(self.source))
+        flow = read_flow(flow) if is_path(flow) else flow
         expected = "numbers (H, W, 2) or (2, H, W) in pixels, or a path"
         uv = flow_layout(array_of(flow, "flow", self.source, expected), self.source)
         put("uv", uv if uv.dtype.kind == "f" and uv.dtype.itemsize >= 4 else uv.astype(np.float32))

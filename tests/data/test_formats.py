@@ -144,7 +144,7 @@ def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
     with raises("image is missing"):
         read_image(tmp_path / "none.png")
     for name in ("\ud800.png", "a\0b.png"):
-        with raises(r"no name of a file[\s\S]*expected: "):
+        with raises(r"no name of a file"):
             read_image(name)
         with raises("no name of a file"):
             Pair(name, name, fov=60)
@@ -250,7 +250,7 @@ def test_a_prior_is_read_from_more_files_than_a_depth(tmp_path: Path) -> None:
     deep = stored(tmp_path / "c.png", depth.astype(np.uint16))
     np.testing.assert_array_equal(fmt.read_prior(deep), known)
     colour = stored(tmp_path / "d.png", np.dstack([grey, grey, grey + 1]))
-    for path, match in ((colour, "in colour"), (tmp_path / "none.png", "missing")):
+    for path, match in ((colour, "16-bit PNG with 1 channel"), (tmp_path / "none.png", "missing")):
         with raises(match):
             fmt.read_prior(path)
 

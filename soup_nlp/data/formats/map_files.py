@@ -31,26 +31,18 @@ Reader = Callable[[PathLike], NDArray[Any]]
 
 MAGIC = b"PIEH"
 """First four bytes of .flo, .dpt and .cam files; as a little-endian float32 they read 202021.25."""
-
 UNKNOWN_FLOW = 1e9
 """A component larger than this marks an unknown flow."""
-
 VKITTI_SKY = 65535
 """Value of Virtual KITTI for depths of 655.35 m and more, such as the sky."""
-
 KITTI_DISPARITY = 256.0
 """Values per pixel of a KITTI disparity image."""
-
 MILLIMETRES = 1000.0
 """Values per unit of length of a depth image that is assumed if none are given."""
 
 
 def after_magic(path: PathLike, what: str) -> bytes:
-    """Content of a file of Sintel or Middlebury behind `MAGIC`.
-
-    Raises:
-        DataError: the file does not start with it.
-    """
+    """Content of a file of Sintel or Middlebury behind `MAGIC`, which it must start with."""
     content = read_bytes(path, what)
     if not content.startswith(MAGIC):
         raise DataError(
@@ -134,9 +126,6 @@ def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> NDAr
     return readers[suffix](path)
 
 
-# --- flow -----------------------------------------------------------------------------------------
-
-
 def flow_layout(flow: NDArray[Any], where: PathLike) -> NDArray[Any]:
     """A flow (H, W, 2), or (2, H, W) whose last axis has another length than 2, as (H, W, 2).
 
@@ -218,9 +207,6 @@ def read_confidence(path: PathLike) -> NDArray[Any]:
     image = decode(path, "confidence map")
     whole = image.dtype.kind == "u"
     return image / np.iinfo(image.dtype).max if whole else image
-
-
-# --- depth ----------------------------------------------------------------------------------------
 
 
 def known_depth(depth: NDArray[Any], path: PathLike) -> Float:
@@ -335,15 +321,15 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
 def _one_map(path: PathLike) -> NDArray[Any]:
     """The array named depth of a .npz file, or the only one of two axes."""
     arrays = read_npz(path, "depth file")
-    maps = [a for name, a in arrays.items() if name == "depth" or np.squeeze(a).ndim == 2]
-    if len(maps) != 1 and "depth" not in arrays:
+    maps = {name: a for name, a in arrays.items() if np.squeeze(a).ndim == 2}
+    if "depth" not in arrays and len(maps) != 1:
         raise DataError(
             "depth file does not hold one map",
             where=path,
             found=", ".join(f"{name} {a.shape}" for name, a in arrays.items()) or "no array",
             expected="one array (H, W), or one of the name depth",
         )
-    return arrays.get("depth", maps[0])
+    return arrays["depth"] if "depth" in arrays else maps.popitem()[1]
 
 
 def read_prior(path: PathLike) -> Float:
@@ -352,20 +338,11 @@ def read_prior(path: PathLike) -> Float:
     Warns:
         DataWarning: the values are those of an 8-bit picture.
     """
-    if Path(path).suffix.lower() != ".png":
-        return read_depth(path, 1.0)
-    image = decode(path, "depth prior")
-    if image.dtype != np.uint8:
-        return read_depth(path, 1.0)
+    image = decode(path, "depth prior") if Path(path).suffix.lower() == ".png" else np.empty(0)
     # a grey picture may be stored in colour
-    grey = image if image.ndim == 2 else image[:, :, 0]
-    if image.ndim == 3 and (image[:, :, :3] != grey[:, :, None]).any():
-        raise DataError(
-            "depth prior is a picture in colour",
-            where=path,
-            expected="numbers (.npy, .npz, .pfm, 16-bit .png), or a grey picture",
-            hint="write the values themselves: colours cannot be turned back into depth",
-        )
+    grey = image[:, :, 0] if image.ndim == 3 else image
+    if image.dtype != np.uint8 or (image.ndim == 3 and (image[:, :, :3] != grey[..., None]).any()):
+        return read_depth(path, 1.0)
     taken = "its grey values, of which black is unknown; a file of numbers is more exact"
     assumed(path, f"a depth prior of 8 bits has {len(np.unique(grey))} different values", taken)
     return known_depth(grey, path)
