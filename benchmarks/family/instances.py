@@ -206,7 +206,7 @@ def build_instance(
         formulation: gauge/norm.
         start: One of STARTS; "best" is the best known point without rounding.
     """
-    form = case.formulation(**parse_formulation(formulation), hessian="exact", compiled=False)
+    form = case.formulation(**parse_formulation(formulation), hessian="exact")
     assert form_label(form) == formulation
     soups = {"easy": record.best, "hard": record.start, "best": record.best}
     soup = constant_depth(case.data) if start == "cold" else soups[start]

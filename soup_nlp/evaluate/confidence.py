@@ -286,7 +286,7 @@ def confidence(
         start: Rigid components and the flow's noise.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
-        form: Visibility and whether kernels are compiled.
+        form: Visibility.
         given_depth: A depth prior, a measurement with its own error.
     """
     assert pair.flow is not None

@@ -57,7 +57,7 @@ def information(
         soup: The answer.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
-        form: Visibility and whether kernels are compiled; constraints carry no information.
+        form: Visibility; constraints carry no information.
     """
     whole = majorant(Formulation.make(dict(form)))
     nlp, layout = build_tangent_nlp(soup, data, weights, whole, "inverse-depth")

@@ -134,7 +134,7 @@ def export_case(
             raise ConfigError(
                 "unknown format", where="--format", found=word, expected=", ".join(FORMATS)
             )
-    form = form.replace(hessian="exact", compiled=False)
+    form = form.replace(hessian="exact")
     nlp, layout = case.nlp(form)
     target = claim(folder, EXPORT_FILES, overwrite, case.problem.subject)
     with staged(target, True, overwrite, case.problem.subject) as new:

@@ -77,7 +77,7 @@ def _of_case(case: Case, form: Formulation, limits: Limits) -> Task:
 
 def problem_task(case: Case, coordinates: str) -> Labelled:
     """Label of a case and the maker of its task; its energy limit is that of the initialisation."""
-    form = case.formulation(coordinates=coordinates, hessian="exact", compiled=False)
+    form = case.formulation(coordinates=coordinates, hessian="exact")
     ceiling = oracle.energy(case.start.soup, case.data, case.weights)["total"]
     label = {
         "problem": case.problem.name,

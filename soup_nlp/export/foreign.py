@@ -78,9 +78,7 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
     folder = as_path(folder, "exported folder", error=ExportError)
     manifest = read_manifest(folder)
     case = prepare(load_problem(folder / "problem.yaml", solved=False))
-    form = case.formulation(
-        **manifest["formulation"], **manifest["smoothing"], hessian="exact", compiled=False
-    )
+    form = case.formulation(**manifest["formulation"], **manifest["smoothing"], hessian="exact")
     nlp, layout = case.nlp(form)
     stored: Any = manifest["fingerprint"]
     for key, now in fingerprint(case, nlp, layout).items():

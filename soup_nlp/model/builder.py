@@ -179,7 +179,6 @@ class Builder:
             hessian_kind=f.hessian,
             x_names=lambda: self.layout.names() + _names(self.slacks),
             g_names=lambda: _names(self.rows),
-            compiled=f.compiled,
         )
         if not self.slacks:
             return nlp

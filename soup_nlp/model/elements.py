@@ -116,7 +116,7 @@ def _arap(data: EnergyData, w: Weights) -> Element:
 def _proj(data: EnergyData, w: Weights) -> Element:
     used = data.pixel_weight > 0
     owner, count = np.nonzero(used)[0][:, None], int(used.sum())
-    # intrinsics are data, so that kernels compiled once serve every camera
+    # intrinsics are data, so that kernels derived once serve every camera
     K = data.K_next[:2]
     nonzero = np.nonzero(K.T)[::-1]
     columns = {

@@ -30,8 +30,6 @@ class FormulationOptions(Section):
     """Visibility: lower bound c of -n . r."""
     depth_ratio: Annotated[float, Field(ge=1.01, le=MOST)] = 5.0
     """Depth at a rim pixel is at most this many times the anchor's (1 leaves one plane only)."""
-    compiled: bool = True
-    """Compile kernels where a C compiler is found."""
 
 
 Coordinates = Literal["matrix", "tangent"]

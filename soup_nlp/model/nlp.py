@@ -1,10 +1,5 @@
-"""The NLP record: kernels, tables, bounds; its functions are made when first asked for.
+"""The NLP record: kernels, tables, bounds; its functions are made when first asked for."""
 
-A kernel is machine code on vectors of eight elements (`lanes`) where a C compiler is found, else
-its instructions are calls of numpy on blocks of elements (`vectors`).
-"""
-
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -17,14 +12,11 @@ from scipy import sparse
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ModelError
-from soup_nlp.model.compile import find_compiler
 from soup_nlp.model.kernel import Group, Hessian
-from soup_nlp.model.lanes import LANES, Summed, compile_lanes
 from soup_nlp.model.pattern import Pattern, hessian_entries, jacobian_entries
 from soup_nlp.model.vectors import Vectors
 
-log = logging.getLogger(__name__)
-Terms = tuple[int, list[Summed | Vectors]]
+Terms = tuple[int, list[Vectors]]
 """Size of a vector, and functions of kernels over their tables, whose entries it is the sum of."""
 
 
@@ -40,7 +32,6 @@ class NLP:
         theta: Values of the parameters that all kernels share, by name in the kernels' order.
         hessian_kind: Kind of the Hessian (kernel.HESSIANS).
         x_names, g_names: Functions that make the readable names, on demand.
-        compiled: Use the C compiler where there is one.
     """
 
     name: str
@@ -54,7 +45,6 @@ class NLP:
     hessian_kind: Hessian
     x_names: Callable[[], list[str]]
     g_names: Callable[[], list[str]]
-    compiled: bool = True
 
     # --- numbers: what Ipopt and all reports are computed with ---
 
@@ -103,12 +93,12 @@ class NLP:
         """The vector of the terms at x; the multipliers are for Hessians.
 
         Raises:
-            ValueError: a vector has another length, which machine code does not see.
+            ValueError: a vector has another length.
         """
         theta = self.thetas() if theta is None else theta
         given = _vector("x", x, self.nx), _vector("theta", theta, len(self.theta))
         lam_g = lam_g if lam_g is None else _vector("lam_g", lam_g, self.ng)
-        # one entry more, for what fills the last block of lanes
+        # one entry more, for what fills the last block
         size, summands = terms
         out = np.zeros(size + 1)
         for term in summands:
@@ -138,7 +128,7 @@ class NLP:
         functions: Sequence[Mapping[str, ca.Function]],
         places: Mapping[str, tuple[int, Sequence[NDArray[np.integer]]]],
     ) -> Mapping[str, Terms]:
-        """Terms of sums, evaluated by the fastest way there is.
+        """Terms of sums.
 
         Args:
             functions: Of every group, by the sum that they belong to.
@@ -148,22 +138,10 @@ class NLP:
             ModelError: a kernel has an unknown operation.
         """
         out: dict[str, Terms] = {key: (size, []) for key, (size, _) in places.items()}
-        compiled = self.compiled
         for k, (group, own) in enumerate(zip(self.groups, functions)):
-            # one library per kernel: the cache then still holds the kernels that did not change
-            library = compile_lanes(list(own.values())) if compiled and own else None
-            if compiled and own and library is None:
-                compiled = False
-                hint = "" if find_compiler() else " (gcc or clang on the PATH is used)"
-                log.info("no machine code: kernels run in numpy, a third slower%s", hint)
-            blocks = group.blocks(LANES, np.int32) if library else None
             for key, f in own.items():
                 size, targets = places[key]
-                out[key][1].append(
-                    Summed(library, f, blocks, targets[k], size)
-                    if library and blocks
-                    else Vectors(f, group, targets[k], size)
-                )
+                out[key][1].append(Vectors(f, group, targets[k], size))
         return out
 
     def evaluated(self) -> Self:

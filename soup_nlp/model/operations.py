@@ -1,4 +1,4 @@
-"""Operations that kernels may have: in C on vectors of elements, in numpy, and in .nl files."""
+"""Operations that kernels may have: in numpy, and in .nl files."""
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -14,21 +14,16 @@ class Operation(NamedTuple):
     """One operation of a kernel.
 
     Attributes:
-        c: Its C expression, with {0} and {1} for the operands; `lanes` defines its functions.
         numpy: Function of arrays and, last, of the array that takes the result (or None).
         nl: Its prefix text in AMPL's format, with {0} and {1} for the operands; "" where an
             expression with the operation cannot be written. "o11" and "o12" (min, max) are
             followed by their argument count.
+        operands: One or two.
     """
 
-    c: str
     numpy: Callable[..., Any]
     nl: str = ""
-
-    @property
-    def operands(self) -> int:
-        """One or two."""
-        return 1 + ("{1}" in self.c)
+    operands: int = 1
 
 
 def _if_else_zero(a: Any, b: Any, out: Any = None) -> Any:
@@ -38,40 +33,28 @@ def _if_else_zero(a: Any, b: Any, out: Any = None) -> Any:
 
 _ONE = np.array(1.0)
 OPERATIONS: Mapping[int, Operation] = {
-    ca.OP_ADD: Operation("{0} + {1}", np.add, "o0 {0} {1}"),
-    ca.OP_SUB: Operation("{0} - {1}", np.subtract, "o1 {0} {1}"),
-    ca.OP_MUL: Operation("{0} * {1}", np.multiply, "o2 {0} {1}"),
-    ca.OP_DIV: Operation("{0} / {1}", np.divide, "o3 {0} {1}"),
-    ca.OP_NEG: Operation("-{0}", np.negative, "o16 {0}"),
-    ca.OP_SQ: Operation("{0} * {0}", np.square, "o5 {0} n2"),
-    ca.OP_TWICE: Operation("{0} + {0}", lambda a, out=None: np.add(a, a, out), "o2 n2 {0}"),
-    ca.OP_INV: Operation("one / {0}", lambda a, out=None: np.divide(_ONE, a, out), "o3 n1 {0}"),
-    ca.OP_FABS: Operation("choose({0} < zero, -{0}, {0})", np.abs, "o15 {0}"),
+    ca.OP_ADD: Operation(np.add, "o0 {0} {1}", 2),
+    ca.OP_SUB: Operation(np.subtract, "o1 {0} {1}", 2),
+    ca.OP_MUL: Operation(np.multiply, "o2 {0} {1}", 2),
+    ca.OP_DIV: Operation(np.divide, "o3 {0} {1}", 2),
+    ca.OP_NEG: Operation(np.negative, "o16 {0}"),
+    ca.OP_SQ: Operation(np.square, "o5 {0} n2"),
+    ca.OP_TWICE: Operation(lambda a, out=None: np.add(a, a, out), "o2 n2 {0}"),
+    ca.OP_INV: Operation(lambda a, out=None: np.divide(_ONE, a, out), "o3 n1 {0}"),
+    ca.OP_FABS: Operation(np.abs, "o15 {0}"),
     # an output as third argument is deprecated in these two
-    ca.OP_FMAX: Operation(
-        "choose({0} > {1}, {0}, {1})",
-        lambda a, b, out=None: np.maximum(a, b, out=out),
-        "o12 2 {0} {1}",
-    ),
-    ca.OP_FMIN: Operation(
-        "choose({0} < {1}, {0}, {1})",
-        lambda a, b, out=None: np.minimum(a, b, out=out),
-        "o11 2 {0} {1}",
-    ),
-    ca.OP_LT: Operation("choose({0} < {1}, one, zero)", np.less),
-    ca.OP_LE: Operation("choose({0} <= {1}, one, zero)", np.less_equal),
-    ca.OP_NOT: Operation(
-        "choose({0} == zero, one, zero)", lambda a, out=None: np.equal(a, 0.0, out)
-    ),
-    ca.OP_IF_ELSE_ZERO: Operation("choose({0} != zero, {1}, zero)", _if_else_zero),
-    ca.OP_SQRT: Operation("root({0})", np.sqrt, "o39 {0}"),
-    ca.OP_POW: Operation("both(pow, {0}, {1})", np.power, "o5 {0} {1}"),
-    ca.OP_CONSTPOW: Operation("both(pow, {0}, {1})", np.power, "o5 {0} {1}"),
-    ca.OP_ATAN2: Operation("both(atan2, {0}, {1})", np.arctan2, "o48 {0} {1}"),
+    ca.OP_FMAX: Operation(lambda a, b, out=None: np.maximum(a, b, out=out), "o12 2 {0} {1}", 2),
+    ca.OP_FMIN: Operation(lambda a, b, out=None: np.minimum(a, b, out=out), "o11 2 {0} {1}", 2),
+    ca.OP_LT: Operation(np.less, operands=2),
+    ca.OP_LE: Operation(np.less_equal, operands=2),
+    ca.OP_NOT: Operation(lambda a, out=None: np.equal(a, 0.0, out)),
+    ca.OP_IF_ELSE_ZERO: Operation(_if_else_zero, operands=2),
+    ca.OP_SQRT: Operation(np.sqrt, "o39 {0}"),
+    ca.OP_POW: Operation(np.power, "o5 {0} {1}", 2),
+    ca.OP_CONSTPOW: Operation(np.power, "o5 {0} {1}", 2),
+    ca.OP_ATAN2: Operation(np.arctan2, "o48 {0} {1}", 2),
     **{
-        getattr(ca, f"OP_{name.upper()}"): Operation(
-            f"each({name}, {{0}})", function, f"o{code} {{0}}"
-        )
+        getattr(ca, f"OP_{name.upper()}"): Operation(function, f"o{code} {{0}}")
         for name, function, code in (
             ("exp", np.exp, 44),
             ("log", np.log, 43),

@@ -1,4 +1,4 @@
-"""Kernels in numpy, summed over their table: what replaces `lanes` where there is no compiler.
+"""Kernels in numpy, summed over their table.
 
 The kernel's instructions run one after the other on blocks of elements, so that an instruction
 costs one call of numpy a block. In CasADi's virtual machine, instruction by instruction and element
@@ -70,7 +70,15 @@ class Vectors:
         return calls
 
     def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
-        """Add the elements' entries to `out`; arguments as of `lanes.Summed.add`."""
+        """Add the elements' entries to `out`.
+
+        Args:
+            out: Added to.
+            x: (nx,) variables.
+            theta: Shared parameters.
+            lam_f: Multiplier of f, for Hessians.
+            lam_g: (ng,) multipliers of g, for Hessians.
+        """
         self._theta[:], self._lam_f[0] = theta[: len(self._theta)], lam_f
         with np.errstate(all="ignore"):
             for index, data, rows, target in self._blocks:

@@ -94,7 +94,7 @@ class Functions:
     """
 
     def __init__(self, nlp: NLP) -> None:
-        """Find the patterns; kernels are compiled by the first call."""
+        """Find the patterns; kernels are translated by the first call."""
         at = {"x": nlp.nx, "p": len(nlp.theta)}
         f = Output(ca.Sparsity.dense(1, 1), nlp.value)
         g = Output(ca.Sparsity.dense(nlp.ng, 1), nlp.constraints)

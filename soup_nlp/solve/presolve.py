@@ -85,7 +85,7 @@ class Presolve:
         soup: Where the last stage ended.
         data: Pixels, graphs and weights of the pair.
         weights: Constants of the energy.
-        form: Visibility, and whether kernels are compiled.
+        form: Visibility.
         o: Widths, limits and stagnation.
         watch: Listeners, stop event and log.
         deadline: `time.process_time` at which they end.

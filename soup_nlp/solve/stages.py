@@ -12,7 +12,6 @@ from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
-from soup_nlp.model.compile import compiler_seconds
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
@@ -46,8 +45,7 @@ class Solution:
         multipliers: lam_g by constraint name, lam_x.
         nlp: Sizes of the constrained NLP.
         description: The NLP as it prints itself.
-        seconds: Wall time of "presolve", "build" and "solve"; "compile" is CPU time of the C
-            compiler in them.
+        seconds: Wall time of "presolve", "build" and "solve".
         cpu_seconds: CPU time of this process in the same.
         delivered: What `soup` is: "constrained NLP", "presolve" or "start".
         far: Whether the presolve ended before a minimum, so that Ipopt had few iterations.
@@ -151,7 +149,7 @@ class _Solve:
 
     def run(self) -> Solution:
         """Run all stages; the result is the best of their final points."""
-        compiling, (presolved, rim) = compiler_seconds(), self.presolve()
+        presolved, rim = self.presolve()
         near, far = bool(self.stages) and _near(self.stages[-1]), _far(self.stages)
         # far from its minimum the presolve may have raised the exact energy
         worse = not near and self.energy(presolved) > self.energy(self.start)
@@ -192,7 +190,7 @@ class _Solve:
             multipliers=multipliers(nlp, stage),
             nlp=nlp.sizes(),
             description=str(nlp),
-            seconds={**self.laps.wall, "compile": compiler_seconds() - compiling},
+            seconds=self.laps.wall,
             cpu_seconds=self.laps.cpu,
             delivered=delivered,
             far=far,

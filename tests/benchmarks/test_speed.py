@@ -75,7 +75,7 @@ def test_bad_input_ends_with_2(tmp_path, capsys):
 def test_a_real_run_and_its_table(tmp_path):
     size = ["--scenes", "street", "--superpixels", "12", "--neighbours", "4", "--widths", "64"]
     small = sets(
-        "formulation.compiled=false solver.presolve_eps=[0.3] solver.presolve_iterations=3"
+        "solver.presolve_eps=[0.3] solver.presolve_iterations=3"
         " solver.exact_iterations=0 solver.max_iter=1"
     )
     assert main(["speed", *size, *small, "--out", str(tmp_path)]) == 0

@@ -40,7 +40,7 @@ from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import TIES
 from soup_nlp.start.ground import STANDS
 
-FORM = Formulation(compiled=False)
+FORM = Formulation()
 
 
 @pytest.fixture(scope="module")

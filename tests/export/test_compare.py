@@ -39,7 +39,7 @@ def make_task(limits: Limits = LIMITS, **form: str) -> Task:
     # wide smoothing: with 0.2 the way from a cold start is so long that rounding decides its end
     # (a length of 1, which is the focal length in pixels)
     wide = float(tiny.data.K_next[0, 0])
-    style = Formulation(hessian="exact", eps=wide, eps_pixel=1.0, compiled=False, **form)
+    style = Formulation(hessian="exact", eps=wide, eps_pixel=1.0, **form)
     return Task(*tiny.nlp(PAPER, style), tiny.soup, tiny.data, PAPER, style, limits)
 
 

@@ -55,7 +55,7 @@ def problem_of(folder: Path):
     manifest = json.loads((folder / "manifest.json").read_text())
     case = prepare(load_problem(folder / "problem.yaml"))
     chosen = {**manifest["formulation"], **manifest["smoothing"]}
-    nlp, layout = case.nlp(case.formulation(**chosen, hessian="exact", compiled=False))
+    nlp, layout = case.nlp(case.formulation(**chosen, hessian="exact"))
     return case, nlp, layout, file_orders(nlp), manifest
 
 
@@ -106,7 +106,7 @@ def test_casadi_and_hdf5_agree_with_the_nlp(exported):
     listed = json.loads((exported / "manifest.json").read_text())["files"]
     assert all((exported / name).is_file() for name in listed)
     found = sparse.coo_matrix((value, (row, column)), shape).toarray()
-    form = case.formulation(hessian="exact", compiled=False)
+    form = case.formulation(hessian="exact")
     expected = information(case.soup, case.data, case.weights, form).matrix.toarray()
     assert not np.tril(found, -1).any()
     np.testing.assert_allclose(found, np.triu(expected), rtol=1e-9, atol=1e-9 * expected.max())
@@ -124,7 +124,7 @@ def answer(folder: Path, name: str, move: float = 0.0, code: int = 0) -> Path:
 def optimum(exported):
     """Point and multipliers of a local minimum of the exported problem, by presolve and Ipopt."""
     case, _, _, _, _ = problem_of(exported)
-    form = case.formulation(hessian="exact", compiled=False)
+    form = case.formulation(hessian="exact")
     found = solve_soup(case.start.soup, case.data, case.weights, form, case.options)
     assert found.converged, found.status
     return found.stages[-1].x, found.stages[-1].lam_g

@@ -114,9 +114,7 @@ def test_the_file_has_nine_coordinates(exported):
     close(here, nlp.value(x))
     close(np.asarray(rows).ravel(), nlp.constraints(x)[r])
     # up to the smoothing, f is E of the soup that the vector stands for
-    sharp, _ = case.nlp(
-        case.formulation(coordinates="tangent", compiled=False, eps=1e-9, eps_pixel=1e-9)
-    )
+    sharp, _ = case.nlp(case.formulation(coordinates="tangent", eps=1e-9, eps_pixel=1e-9))
     value = sharp.value(sharp.x0)
     E = oracle.energy(layout.unpack(sharp.x0), case.data, case.weights)["total"]
     assert value == pytest.approx(E, rel=0.05)

@@ -20,7 +20,7 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 
-FORMS = [Formulation(gauge=g, norm=n, compiled=False) for g in GAUGES for n in NORMS]
+FORMS = [Formulation(gauge=g, norm=n) for g in GAUGES for n in NORMS]
 
 
 def form_id(form: Formulation) -> str:
@@ -76,7 +76,7 @@ def test_shared_expressions_are_written_once(tmp_path):
     depths = [t for t in texts if t.startswith("o3\nv") and int(t.split("\n")[1][1:]) in scales]
     # every anchor once, and one more for each end of each boundary point
     assert len(depths) == 12 + 2 * 2 * 17
-    epigraph, _ = tiny().nlp(TRUNCATED, Formulation(norm="epigraph", compiled=False))
+    epigraph, _ = tiny().nlp(TRUNCATED, Formulation(norm="epigraph"))
     both, *others = defined_variables(write_nl(tmp_path / "e.nl", epigraph))
     assert both == 0
     assert all(others[k] > 0 for k in (0, 2, 3))
@@ -96,7 +96,7 @@ def test_variables_and_rows_are_ordered_by_class(tmp_path):
     curved = file.counts["nonlinear_rows"]
     assert {n.partition("[")[0] for n in rows[:curved]} == {"so3", "normal"}
     assert {n.partition("[")[0] for n in rows[curved:]} == {"visible", "simplex", "E"}
-    slack, _ = tiny().nlp(PAPER, Formulation(norm="epigraph", compiled=False))
+    slack, _ = tiny().nlp(PAPER, Formulation(norm="epigraph"))
     file = write_nl(tmp_path / "e.nl", slack)
     # slacks of untruncated norms are linear in the objective
     assert file.counts["nonlinear_variables"]["both"] < file.counts["nonlinear_variables"]["rows"]
@@ -107,7 +107,7 @@ def test_variables_and_rows_are_ordered_by_class(tmp_path):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    form = Formulation(gauge="unit-translation", norm="epigraph", compiled=False)
+    form = Formulation(gauge="unit-translation", norm="epigraph")
     nlp, layout = tiny().nlp(TRUNCATED, form)
     folder = tmp_path_factory.mktemp("foreign")
     lam_g = np.full(nlp.ng, -1.0)
@@ -240,7 +240,7 @@ def swinging(tmp_path_factory) -> Case:
 @pytest.mark.parametrize("norm", NORMS)
 def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, norm, tmp_path):
     data, eps = swinging.data, 2e-5
-    form = swinging.formulation(norm=norm, hessian="exact", compiled=False, eps=eps, eps_pixel=eps)
+    form = swinging.formulation(norm=norm, hessian="exact", eps=eps, eps_pixel=eps)
     nlp, layout = swinging.nlp(form)
     file = write_nl(tmp_path / "soup.nl", nlp)
     back = ReadBack(file.path)

@@ -296,7 +296,7 @@ def tiny(units: str = "paper", at_anchors: bool = False) -> Tiny:
 
 
 def form(**options) -> Formulation:
-    return Formulation(**{"compiled": False, **options})
+    return Formulation(**{**options})
 
 
 def assert_same_soup(a: Soup, b: Soup, tolerance: float = 1e-12) -> None:

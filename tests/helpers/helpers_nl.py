@@ -30,7 +30,7 @@ def plain_nlp(name: str, groups: Sequence[Group], x0: ArrayLike, **given: object
         for v, n in (("x", len(x0)), ("g", rows))
     }
     names = {key: partial(list, words) for key, words in lists.items()}
-    rest = {"theta": {}, "hessian_kind": "exact", "compiled": False, **given}
+    rest = {"theta": {}, "hessian_kind": "exact", **given}
     return NLP(name, tuple(groups), x0, **bounds, **names, **rest)
 
 

@@ -43,9 +43,7 @@ EVERY = [
 def form(units: str = "paper", **options) -> Formulation:
     """Smoothing wide enough that finite differences see a smooth function."""
     wide = {"paper": (0.1 * K_NEXT[0, 0], 0.5), "pixels": (3.0, 0.5)}[units]
-    return Formulation(
-        **{"eps": wide[0], "eps_pixel": wide[1], "compiled": False, "hessian": "exact", **options}
-    )
+    return Formulation(**{"eps": wide[0], "eps_pixel": wide[1], "hessian": "exact", **options})
 
 
 def program(coordinates, norm, units, at_anchors, truncated=True, **options):

@@ -27,7 +27,6 @@ TINY = {
     "refine.enabled": False,
     "solver.presolve": False,
     "solver.max_iter": 2,
-    "formulation.compiled": False,
 }
 """Settings with which a solve ends in a fraction of a second, mostly not converged."""
 SET = [word for key, value in TINY.items() for word in ("--set", f"{key}={value}".lower())]

@@ -55,9 +55,7 @@ OPTIONS = SolverOptions(presolve_eps=(0.3, 0.1, 0.03), eps=0.03, max_iter=100, m
 
 
 def form(**options) -> Formulation:
-    return Formulation(
-        **{"compiled": False, "hessian": "gauss-newton+constraints", "norm": "smooth", **options}
-    )
+    return Formulation(**{"hessian": "gauss-newton+constraints", "norm": "smooth", **options})
 
 
 # --- soups ---------------------------------------------------------------------------------------

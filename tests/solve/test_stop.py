@@ -18,7 +18,7 @@ from soup_nlp.storage.progress import Progress, interruptible
 SMALL = (
     "input.width=64 input.height=48 flow.source=truth segmentation.superpixels=10"
     " segmentation.neighbours=3 solver.presolve_iterations=2 solver.exact_iterations=2"
-    " solver.presolve_eps=[0.3] refine.particles=4 formulation.compiled=false"
+    " solver.presolve_eps=[0.3] refine.particles=4"
 )
 
 

@@ -19,7 +19,7 @@ from soup_nlp.solve.kkt import optimality, warm_start
 from soup_nlp.solve.presolve import _rim
 from soup_nlp.solve.solver_options import SolverOptions
 
-FORM = Formulation(compiled=False)
+FORM = Formulation()
 
 
 @pytest.mark.parametrize("place", ["primal", "dual", "complementarity"])
