@@ -176,7 +176,7 @@ def died(signal_name: str | None) -> str:
 def _on_cluster(jobs: Mapping[str, Work], address: str) -> Iterator[tuple[str, Row]]:
     """Rows from the workers of a Dask cluster, which solves the job of a lost worker elsewhere."""
     distributed = optional("distributed", "cluster")
-    with distributed.Client(address, set_as_default=False) as client:
+    with distributed.Client(address) as client:
         futures = {
             client.submit(attempt, work, key=f"soup-nlp {name} {os.getpid()}", pure=False): name
             for name, work in jobs.items()
