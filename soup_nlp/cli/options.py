@@ -22,7 +22,6 @@ from soup_nlp.config.problem import Problem as ProblemFile
 from soup_nlp.config.problem import shipped_problems
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, StoppedError, printable
-from soup_nlp.schema.limits import MAX_SEED
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.progress import Progress
 from soup_nlp.storage.rows import Row, failed, reason
@@ -88,7 +87,6 @@ Coordinates = Annotated[Literal["matrix", "tangent"], option(COORDINATES)]
 Superpixels = Annotated[
     list[int] | None, option("Number of superpixels, 50 to 2000; may be repeated.")
 ]
-Data = Annotated[Path | None, option("Root folder of the dataset.")]
 DEPTH_SCALE = "Values per unit of length of a true depth in .png (KITTI 256); default 1000."
 DepthScale = Annotated[float | None, option(DEPTH_SCALE)]
 Workers = Annotated[int, option("Processes of this machine.", min=1)]
@@ -115,26 +113,6 @@ def changed(
 def located(name: str | None, what: str) -> str | None:
     """A file of the command line as the value of a key, whose paths start at the problem file."""
     return name and json.dumps(str(as_path(name, what, home=True).absolute()))
-
-
-def numbers(text: str, where: str, least: int = 0, most: int = MAX_SEED) -> list[int]:
-    """Different whole numbers of a comma-separated list.
-
-    Raises:
-        ConfigError: a word is no whole number from `least` to `most`.
-    """
-    try:
-        values = list(dict.fromkeys(int(word) for word in text.split(",")))
-    except ValueError:
-        values = []
-    if not values or min(values) < least or max(values) > most:
-        raise ConfigError(
-            "not a list of whole numbers",
-            where=where,
-            found=text,
-            expected=f"whole numbers from {least} to {most}, comma separated",
-        )
-    return values
 
 
 def listed(text: str) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from soup_nlp.arrays import FloatMap, Image
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error
 from soup_nlp.data.pair import Flow
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, optional
 from soup_nlp.storage.files import require_file
 
 RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
@@ -28,17 +28,14 @@ class Network:
         count: Number of images, 1 or 2.
 
     Raises:
-        DataError: onnxruntime is not installed, or the file is missing or no such network.
+        ConfigError: onnxruntime is not installed.
+        DataError: the file is missing or no such network.
     """
 
     def __init__(self, source: str, count: int) -> None:
         self.source = source
         require_file(source, "file of a network")
-        try:
-            import onnxruntime
-        except ImportError as error:
-            what, hint = "an .onnx network needs onnxruntime", "pip install soup-nlp[onnx]"
-            raise DataError(what, where=source, hint=hint) from error
+        onnxruntime = optional("onnxruntime", "onnx")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         try:

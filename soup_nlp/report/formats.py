@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.errors import ConfigError, DataError, printable, repr_of
+from soup_nlp.errors import ConfigError, optional, printable, repr_of
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.rotation import log
 from soup_nlp.report.chain import AXES, Chain
@@ -172,16 +172,9 @@ def _write_recording(path: Path, chain: Chain) -> None:
     The world is the first camera (x right, y down, z ahead); the static scene does not move.
 
     Raises:
-        DataError: the package rerun-sdk is not installed.
+        ConfigError: the package rerun-sdk is not installed.
     """
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise DataError(
-            "recordings need the package rerun-sdk",
-            where=path,
-            hint="pip install 'soup-nlp[rerun]'",
-        ) from error
+    rr = optional("rerun", "rerun")
     out = rr.RecordingStream("soup_nlp")
     out.save(path)
     out.log("world", rr.ViewCoordinates.RDF, static=True)
