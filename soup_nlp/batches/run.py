@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 import os
 import socket
 import threading
@@ -130,12 +131,14 @@ def batch(
         # tables of many pairs are not written all the time
         told[0] = time.monotonic() + 10 * (time.monotonic() - begin)
 
-    with _alive(folder / "pairs", left, token):
+    with _alive(folder, left, token):
         while left:
             rows |= _stored(folder, [heads[name] for name in left], retry_failed)
             todo = [name for name in left if name not in rows]
+            size = (folder / ROWS).stat().st_size if (folder / ROWS).is_file() else 0
+            home = folder.absolute()
             works = {
-                name: partial(_solve, problems[name], folder.absolute() / "pairs" / name, token)
+                name: partial(_solve, problems[name], home, heads[name], token, size)
                 for name in todo
             }
             tell()
@@ -146,6 +149,8 @@ def batch(
                     continue
                 rows[name] = {**heads[name], **result}
                 append_row(folder / ROWS, rows[name])
+                # only now, so that another run that takes the mark finds the row
+                _mark(folder, name).unlink(missing_ok=True)
                 tell()
                 if say:
                     say(len(rows), len(problems), rows[name])
@@ -170,18 +175,26 @@ def _stored(folder: Path, heads: Sequence[Row], retry_failed: bool) -> dict[str,
     return out
 
 
-def _solve(problem: Problem, folder: Path, token: str) -> Row:
-    """Solve a pair into its folder, unless another run does: then the row says "claimed"."""
-    mark = folder.with_name(f"{folder.name}.claim")
+def _mark(folder: Path, name: str) -> Path:
+    """File that exists while a run solves a pair."""
+    return folder / "pairs" / f"{name}.claim"
+
+
+def _solve(problem: Problem, folder: Path, head: Row, token: str, size: int) -> Row:
+    """Solve a pair into its folder, unless another run does or did: then the row says "claimed".
+
+    `size` is that of the file of rows when this run read it.
+    """
+    mark = _mark(folder, problem.name)
     if not _claimed(mark, token):
         return {"claimed": True}
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            solved = run(problem)
-            solved.save(folder)
-    finally:
+    if any(all(row.get(k) == head[k] for k in head) for row in _rows_after(folder / ROWS, size)):
         mark.unlink(missing_ok=True)
+        return {"claimed": True}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solved = run(problem)
+        solved.save(folder / "pairs" / problem.name)
     code, why = exit_code(solved, problem.expected.mre_at_most)
     scores = {name: m.mre for name, m in solved.metrics.items()}
     return {
@@ -193,6 +206,15 @@ def _solve(problem: Problem, folder: Path, token: str) -> Row:
         "superpixels": len(solved),
         "warnings": [str(w.message) for w in caught],
     }
+
+
+def _rows_after(path: Path, size: int) -> Iterator[Row]:
+    """Rows of a file beyond its first bytes."""
+    with suppress(OSError), path.open("rb") as file:
+        file.seek(size)
+        for line in file.read().decode(errors="replace").splitlines():
+            with suppress(ValueError):
+                yield json.loads(line)
 
 
 def _claimed(mark: Path, token: str) -> bool:
@@ -219,7 +241,7 @@ def _alive(folder: Path, names: Sequence[str], token: str) -> Iterator[None]:
     def marks() -> Iterator[Path]:
         for name in names:
             with suppress(OSError):
-                mark = folder / f"{name}.claim"
+                mark = _mark(folder, name)
                 if mark.read_text() == token:
                     yield mark
 
