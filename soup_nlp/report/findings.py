@@ -80,10 +80,10 @@ def guess_line(shares: Mapping[str, float], of: str = "the image") -> str:
     return f"{shares['guess']:.0%} of {of} is a guess: {reason}"
 
 
-def guess_words(shares: Mapping[str, float], of: str = "") -> str:
+def guess_words(shares: Mapping[str, float]) -> str:
     """Sentence on the share that is a guess and the reasons."""
     reasons = _parts(shares, GUESSES)
-    return f"{shares['guess']:.0%}{of} is a guess (sigma above {MOST_SIGMA:.0%}): {reasons}"
+    return f"{shares['guess']:.0%} is a guess (sigma above {MOST_SIGMA:.0%}): {reasons}"
 
 
 def _parts(shares: Mapping[str, float], names: tuple[str, ...]) -> str:
@@ -215,17 +215,3 @@ def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
     if shares["scale"] + shares.get("unexplained", 0.0) >= SHARE:
         out.append("a depth from elsewhere (--depth-prior) for what moves")
     return ["; ".join(out)] if out else []
-
-
-def limits(run: Run, shares: Mapping[str, float]) -> list[str]:
-    """What limits a result and what to try, in the words of the verdict; at least one sentence."""
-    lines, s = [], run.solution
-    if not s.converged and s.status != "Skipped":
-        lines.append(f"The NLP did not converge ({s.status}): try a larger solver.max_iter.")
-    if shares["guess"] >= SHARE:
-        lines.append(f"{guess_words(shares, ' of the image')}.")
-    if run.start.bends.any():
-        share = float(run.start.bends[run.segmentation.labels].mean())
-        lines.append(f"{share:.0%} of the image bends: its relief is weakly determined.")
-    lines += [f"Try {text}." for text in hints(run, shares)]
-    return lines or ["Nothing stands out: flow, parallax and convergence are good."]

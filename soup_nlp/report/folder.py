@@ -33,16 +33,7 @@ from soup_nlp.storage.store import write_h5
 FULL = ("depth_ref_full.png", "depth_next_full.png")
 """Files of the depth at the size of the images, for a pair that was solved at a smaller size."""
 
-PICTURES = {
-    **{name: f"{name}_colour.png" for name in ("depth_ref", "depth_next")},
-    "superpixels": "superpixels.png",
-    "components": "components.png",
-    "flow": "flow.png",
-    "flow_confidence": "flow_confidence.png",
-    "normals": "normals.png",
-    "confidence": "confidence.png",
-    "error": "error.png",
-}
+PICTURES = {name: f"{name}_colour.png" for name in ("depth_ref", "depth_next")}
 """Files of the pictures that are also written alone, by name of the picture."""
 
 FILES = (
@@ -50,7 +41,7 @@ FILES = (
     *("depth_ref.png", "depth_next.png", *PICTURES.values(), "overview.png", PAGE),
     *("motions.json", "trajectory.tum", "points_ref.ply", "points_next.ply"),
 )
-"""Files of a result folder; error.png needs a dense truth."""
+"""Files of a result folder."""
 
 FAILED = "failed.log"
 """Log of a solve that failed; the next result removes it."""
@@ -137,8 +128,7 @@ def write_folder(
             name: write_depth_png16(new / f"depth_{name}.png", z) for name, z in depths.items()
         }
         for name, file in PICTURES.items():
-            if name in drawn:
-                write_picture(new / file, drawn[name])
+            write_picture(new / file, drawn[name])
         write_png(new / "overview.png", overview(drawn, result.title))
         write_formats(new, Chain.of(result), ("motions", "ply", *formats))
         if run.problem.output.page:

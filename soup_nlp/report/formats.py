@@ -21,20 +21,15 @@ from soup_nlp.storage.files import write_bytes, write_json, write_text
 
 CONVENTIONS = {
     "axes": f"of a camera: {AXES}",
-    "matrix": "row-major 4x4 of homogeneous points: X_next = next_from_ref X_ref",
-    "next_from_ref": "moves points from the reference camera's coordinates to the next camera's;"
+    "next_from_ref": "4x4, by rows: X_next = next_from_ref X_ref in the coordinates of both cameras;"
     " of a component it includes the motion of the camera",
-    "own_motion": "what a component does by itself, in the reference camera's coordinates:"
-    " inverse(camera.next_from_ref) component.next_from_ref",
+    "own_motion": "what a component does by itself, in the reference camera's coordinates",
     "quaternion_xyzw": "of the rotation, scalar last",
-    "rotation_deg": "rotation vector: axis times angle, degrees",
-    "position_in_ref": "where the next camera is, in the reference camera's coordinates",
+    "rotation_deg": "axis times angle, degrees",
     "label": "value in components/of_superpixel of result.h5; 0 is the background",
-    "residual_px": "median distance in the next image between this one motion and those of the"
-    " superpixels; large where the component is not rigid",
+    "residual_px": "median distance in the next image from the motions of the superpixels",
     "borrowed": "share of its pixels whose depth is a guess from neighbours",
-    "scale": "a component that moves by itself has a scale of its own, which no flow determines:"
-    " its translation is as good as its depth",
+    "scale": "of a component that moves by itself, no flow determines it",
 }
 """Meaning of the entries of motions.json."""
 

@@ -81,10 +81,8 @@ def page(chain: Chain, parts: Mapping[str, str], drawn: Mapping[str, Picture] | 
 def pair_page(result: Result, drawn: Mapping[str, Picture] | None = None) -> str:
     """The page of a result; `drawn` are its pictures, where they are drawn already."""
     chain = Chain.of(result)
-    limits = "".join(f"<li>{escape(line)}</li>" for line in result.summary["limits"])
     parts = {
         "summary": _summary(result),
-        "What limits this result": f"<ul>{limits}</ul>",
         "Paths": path_table(chain),
         "Verdict": preformatted(result.summary["verdict"]),
     }

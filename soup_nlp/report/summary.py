@@ -12,7 +12,7 @@ from soup_nlp.evaluate.metrics import DepthMetrics, component_overlaps, skill
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import DETERMINED, GUESSES, ORIGINS, limits
+from soup_nlp.report.findings import DETERMINED, GUESSES, ORIGINS
 from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.storage.versions import versions
 
@@ -61,7 +61,6 @@ class Summary(TypedDict):
     seconds: dict[str, float]
     sizes: Sizes
     certainty: Shares
-    limits: list[str]
     verdict: list[str]
 
 
@@ -131,7 +130,6 @@ def summary(run: Run) -> dict[str, Any]:
             "median_error_px": float(np.median(run.start.error)),
         },
         "certainty": shares,
-        "limits": limits(run, shares),
         "evidence": run.confidence.evidence.rows(),
         **({} if run.given is None else {"depth_prior": run.given.as_dict()}),
         "flow": str(run.pair.flow),

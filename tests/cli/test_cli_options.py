@@ -75,7 +75,7 @@ def test_a_folder_of_inputs_is_no_output_folder(tmp_path, capsys):
 
 def test_an_input_in_a_result_folder_is_not_overwritten(solved, tmp_path, capsys):
     args, out = solved[0], shutil.copytree(solved[1], tmp_path / "out")
-    flow = ["--flow", str(out / "flow.png")]
+    flow = ["--flow", str(out / "overview.png")]
     assert main([*args, "--out", str(out), *flow]) == 2
     assert "an input would be overwritten" in capsys.readouterr().err
 

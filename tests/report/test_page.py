@@ -71,7 +71,7 @@ def test_the_page_is_one_file_that_fetches_nothing(text):
     assert len(text) < 2e6
     assert "status  &lt;fine&gt; &amp; dandy" in text
     assert [name for name, _ in data_of(text)["modes"]] == list(MODES)
-    for word in ("What limits this result", "Verdict", "Components"):
+    for word in ("Paths", "Verdict"):
         assert word in text
     assert [*data_of(text)["pairs"][0]["pictures"]][:5] == [
         "image_ref", "image_next", "superpixels", "components", "flow",

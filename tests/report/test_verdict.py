@@ -111,18 +111,15 @@ def test_frames_without_a_common_scene_are_told_nothing_else(small_run):
         assert camera.endswith("(a guess: hardly any flow is usable)") == expected
 
 
-def test_limits_name_what_is_wrong(small_run):
-    good = " ".join(findings.limits(small_run, certainty(small_run)))
-    assert "did not converge" not in good
+def test_guesses_and_hints_name_what_is_wrong(small_run):
     shares = {"guess": 0.3, "unseen": 0.2, "rest": 0.004, "flat": 0.06, "weak": 0.036, "scale": 0}
-    failed = replace(small_run.solution, status="Time_Limit", converged=False)
-    run = replace(small_run, solution=failed)
-    found = findings.limits(seen(run, np.zeros_like(run.pair.flow.confidence)), shares)
-    assert found == [
-        "The NLP did not converge (Time_Limit): try a larger solver.max_iter.",
-        "30% of the image is a guess (sigma above 25%): 20% no usable flow, 6% a turn alone or a"
-        " constant depth explains the flow nearly as well, 4% little information.",
-        "Try a better flow (--flow); frames farther apart in time.",
+    assert findings.guess_words(shares) == (
+        "30% is a guess (sigma above 25%): 20% no usable flow, 6% a turn alone or a constant depth"
+        " explains the flow nearly as well, 4% little information"
+    )
+    unseen = seen(small_run, np.zeros_like(small_run.pair.flow.confidence))
+    assert findings.hints(unseen, shares) == [
+        "a better flow (--flow); frames farther apart in time"
     ]
 
 
