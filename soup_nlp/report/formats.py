@@ -21,7 +21,7 @@ from soup_nlp.storage.files import write_bytes, write_json, write_text
 
 CONVENTIONS = {
     "axes": f"of a camera: {AXES}",
-    "next_from_ref": "4x4, by rows: X_next = next_from_ref X_ref in the coordinates of both cameras;"
+    "next_from_ref": "4x4, by rows: X_next = next_from_ref X_ref, each in its own camera;"
     " of a component it includes the motion of the camera",
     "own_motion": "what a component does by itself, in the reference camera's coordinates",
     "quaternion_xyzw": "of the rotation, scalar last",
