@@ -1,6 +1,6 @@
 """result.h5: one table of its arrays, from which it is written, read and checked."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,6 @@ import numpy as np
 from soup_nlp.errors import DataError
 from soup_nlp.evaluate.scoring import DEPTHS
 from soup_nlp.pipeline.record import Run
-from soup_nlp.refine.records import Round
 from soup_nlp.storage.store import ReadTree, Row, parse_table, row_of
 
 TABLE = """
@@ -84,18 +83,6 @@ start/bending             1     -       a region bends
 start/at_rest             1     -       the camera is taken to be at rest, or to turn only
 start/noise               px    -       median error of the flow; if all bends, of affine flows
 
-refine/energy_*           1     T       exact E, *, by round
-refine/mrf_energy         1     T       energy of the chosen labels in the MRF of the particles
-refine/bound              1     T       TRW-S's lower bound on every choice among the particles
-refine/gap                1     T       largest excess over the best choice among the particles
-refine/moved              1     T       superpixels that left their belief
-refine/iterations         1     T       iterations of TRW-S
-refine/taken              1     T       whether the choice lowered the exact E
-refine/seconds            s     T       wall time
-refine/proposed           1     T,C     feasible particles by round and kind
-refine/accepted           1     T,C     chosen particles by round and kind
-refine/kinds              text  C       kinds of particles
-
 multipliers/lam_x         1     X       of the bounds of the variables, in the order of the NLP
 multipliers/lam_g_*       1     G       of the constraints *, in the order of the NLP
 
@@ -138,7 +125,7 @@ truth/points              truth  M,3    sparse truth: u and v in px, z in the un
 """
 """Path, unit, axes and description of every array, see `parse_table`.
 
-"soup" and "truth" are the units of length of the reconstruction and of the truth; "text" is text.
+"soup" and "truth" are the units of length of the reconstruction and of the truth.
 """
 LAYOUT = parse_table(TABLE)
 """Rows of `TABLE` by path."""
@@ -153,8 +140,8 @@ FREE = ("depth/next", "depth/sigma_next", "input/image_next", "truth/depth_next"
 
 def rows_in_file(truth_unit: str = "") -> dict[str, Row]:
     """The rows of `TABLE` as a file has them, with the unit of length of the truth."""
-    units = {"truth": truth_unit, "text": "1"}
-    return {k: row._replace(unit=units.get(row.unit, row.unit)) for k, row in LAYOUT.items()}
+    own = {k: row for k, row in LAYOUT.items() if row.unit == "truth"}
+    return LAYOUT | {k: row._replace(unit=truth_unit) for k, row in own.items()}
 
 
 def _listed(values: Mapping[str, Any], prefix: str = "") -> ReadTree:
@@ -187,7 +174,6 @@ def result_tree(run: Run) -> ReadTree:
         "start": {**vars(run.start.soup), **vars(run.start), "bending": run.start.bending},
         "solution": vars(run.soup),
         "nlp": vars(run.solution.soup),
-        "refine": {} if run.refined is None else _by_round(run.refined.rounds),
         "answer": vars(run.answer),
         "multipliers": dict(run.solution.multipliers),
         "iterations": {
@@ -213,20 +199,6 @@ def result_tree(run: Run) -> ReadTree:
     return _listed(arrays)
 
 
-def _by_round(rounds: Sequence[Round]) -> dict[str, Any]:
-    """The refinement by round, and by kind of particle; empty without rounds."""
-    if not rounds:
-        return {}
-    kinds = {k: [[*getattr(r, k).values()] for r in rounds] for k in ("proposed", "accepted")}
-    rows = [
-        {f"energy_{k}": e for k, e in r.energy.items()} | vars(r) | {"gap": r.gap} for r in rounds
-    ]
-    columns = {key: [row[key] for row in rows] for key in rows[0]} | kinds
-    return {key: np.array(column) for key, column in columns.items()} | {
-        "kinds": np.array(list(rounds[0].proposed))
-    }
-
-
 def require_layout(tree: ReadTree) -> None:
     """Check every stored array against its row of `TABLE`.
 
@@ -240,7 +212,7 @@ def require_layout(tree: ReadTree) -> None:
         values = tree.get(group, {})
         if not isinstance(values, Mapping):
             raise _wrong(group, "an array", "a group")
-        if name not in values or row.unit == "text":
+        if name not in values:
             continue
         value, axes = values[name], row.axes.split(",") if row.axes else []
         if isinstance(value, Mapping) or value.dtype.kind not in "biuf":
