@@ -34,10 +34,14 @@ def lift(s: State, ray: Float, superpixel: Int) -> tuple[Float, Float]:
 
 
 def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, float]:
-    """Exact E and its weighted terms (paper Eq. 1 to 6 as in docs/formulation.md)."""
+    """Exact E and its weighted terms (paper Eq. 1 to 6 as in docs/formulation.md).
+
+    A term whose factor or data are not stored is absent, as in results from before it existed.
+    """
     A, B = (x[:, 0] for x in lift(s, e["anchor_ray"][:, None], np.arange(len(s["lam"]))))
     T = s["lam"][:, None] * s["t"]
     rho = 1 / A[:, 2]
+    (i, k), (a, b) = e["edges"].T, e["pairs"].T
 
     def near(pairs: Int) -> Float:
         """Power mean of the inverse depths of two anchors."""
@@ -47,47 +51,64 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         scene = (e["share"] * s["lam"] * s["d"]).sum()
         return 1 / near(pairs) if bool(e["local_units"]) else np.full(len(pairs), scene)
 
-    i, k = e["edges"].T
-    length = unit(e["edges"]) * e["edge_unit"]
-    dR, shift = s["R"][i] - s["R"][k], T[i] - T[k]
-    if bool(e["arap_at_anchors"]):
-        shift = shift + np.einsum("eij,ej->ei", dR, (A[i] + A[k]) / 2)
-    stretch = norm(A[i] - A[k], axis=-1) - norm(B[i] - B[k], axis=-1)
-    parts = (
-        e["rotation_scale"] * norm(dR, axis=(1, 2)),
-        norm(shift, axis=-1) / length,
-        np.abs(stretch) / length,
-    )
-    leak = w["leak_arap"]
-    cut = sum((1 - leak) * np.minimum(p, w["sigma_arap"]) + leak * p for p in parts)
-    relief = np.abs((rho[i] - rho[k]) / near(e["edges"]))
-    relief /= norm(e["anchor_ray"][i] - e["anchor_ray"][k], axis=-1)
-    off = np.abs(np.log(A[i, 2]) - np.log(A[k, 2]) - e["depth_change"])
-    image = lift(s, e["pixel_ray"], np.arange(len(A)))[1] @ e["K_next"].T
-    miss = norm(image[..., :2] / image[..., 2:] - e["pixel_target"], axis=-1)
+    def arap() -> Float:
+        length = unit(e["edges"]) * e["edge_unit"]
+        dR, shift = s["R"][i] - s["R"][k], T[i] - T[k]
+        if bool(e["arap_at_anchors"]):
+            shift = shift + np.einsum("eij,ej->ei", dR, (A[i] + A[k]) / 2)
+        stretch = norm(A[i] - A[k], axis=-1) - norm(B[i] - B[k], axis=-1)
+        parts = (
+            e["rotation_scale"] * norm(dR, axis=(1, 2)),
+            norm(shift, axis=-1) / length,
+            np.abs(stretch) / length,
+        )
+        leak = w["leak_arap"]
+        cut = [(1 - leak) * np.minimum(p, w["sigma_arap"]) + leak * p for p in parts]
+        return np.sum(cut, axis=0)
 
-    i, k = e["pairs"].T
-    gaps = [a - b for a, b in zip(lift(s, e["boundary_ray"], i), lift(s, e["boundary_ray"], k))]
-    factor = e["pair_factor"] / (unit(e["pairs"]) * e["pair_unit"])
-    before, after = (factor * norm(gap, axis=(1, 2)) for gap in gaps)
-    turn = np.abs(1 - (s["n"][i] * s["n"][k]).sum(1))
-    # along the mean ray, whose length does not matter
-    middle = e["boundary_ray"].sum(axis=1, keepdims=True)
-    rhos = [1 / lift(s, middle, superpixel)[0][:, 0, 2] for superpixel in (i, k)]
-    behind, front = np.where(e["order_weight"] > 0, rhos, rhos[::-1])
-    lack = ((1 + e["order_step"]) * behind - front) / near(e["pairs"])
-    hinge = (lack + np.sqrt(lack**2 + 0.01**2)) / 2
-    gap = np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
-    costs = {
-        "arap": e["edge_weight"] * cut,
-        "proj": e["pixel_weight"] * np.minimum(miss, w["sigma_proj"]),
-        "cont": e["pair_weight"] * gap,
-        "orient": e["orient_weight"] * np.minimum(turn, w["sigma_orient"]),
-        "prior": e["prior_weight"] * relief,
-        **({"depth": e["depth_weight"] * off} if e["depth_weight"].any() else {}),
-        **({"order": np.abs(e["order_weight"]) * hinge} if e["order_weight"].any() else {}),
+    def proj() -> Float:
+        image = lift(s, e["pixel_ray"], np.arange(len(A)))[1] @ e["K_next"].T
+        miss = norm(image[..., :2] / image[..., 2:] - e["pixel_target"], axis=-1)
+        return np.minimum(miss, w["sigma_proj"])
+
+    def cont() -> Float:
+        gaps = [p - q for p, q in zip(lift(s, e["boundary_ray"], a), lift(s, e["boundary_ray"], b))]
+        factor = e["pair_factor"] / (unit(e["pairs"]) * e["pair_unit"])
+        before, after = (factor * norm(gap, axis=(1, 2)) for gap in gaps)
+        return np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
+
+    def orient() -> Float:
+        turn = np.abs(1 - (s["n"][a] * s["n"][b]).sum(1))
+        return np.minimum(turn, w["sigma_orient"])
+
+    def prior() -> Float:
+        reach = norm(e["anchor_ray"][i] - e["anchor_ray"][k], axis=-1)
+        return np.abs((rho[i] - rho[k]) / near(e["edges"])) / reach
+
+    def depth() -> Float:
+        return np.abs(np.log(A[i, 2]) - np.log(A[k, 2]) - e["depth_change"])
+
+    def order() -> Float:
+        # along the mean ray, whose length does not matter
+        middle = e["boundary_ray"].sum(axis=1, keepdims=True)
+        rhos = [1 / lift(s, middle, superpixel)[0][:, 0, 2] for superpixel in (a, b)]
+        behind, front = np.where(e["order_weight"] > 0, rhos, rhos[::-1])
+        lack = ((1 + e["order_step"]) * behind - front) / near(e["pairs"])
+        return np.asarray((lack + np.sqrt(lack**2 + 0.01**2)) / 2)
+
+    terms = {
+        cost.__name__: w[cost.__name__] * float((np.abs(e[weight]) * cost()).sum())
+        for cost, weight, always in (
+            (arap, "edge_weight", True),
+            (proj, "pixel_weight", True),
+            (cont, "pair_weight", True),
+            (orient, "orient_weight", True),
+            (prior, "prior_weight", True),
+            (depth, "depth_weight", False),
+            (order, "order_weight", False),
+        )
+        if cost.__name__ in w and weight in e and (always or e[weight].any())
     }
-    terms = {name: w[name] * float(cost.sum()) for name, cost in costs.items()}
     return {"total": sum(terms.values()), **terms}
 
 

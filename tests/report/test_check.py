@@ -142,6 +142,19 @@ def test_claims_that_are_missing_are_named(place, folder):
         check_folder(folder)
 
 
+def test_a_term_that_a_result_does_not_have_is_absent(folder):
+    """As in a result that was stored before E_order and E_prior were added."""
+    claims = json.loads((folder / "summary.json").read_text())
+    with h5py.File(folder / "result.h5", "a") as file:
+        for name, weight in (("prior", "prior_weight"), ("order", "order_weight")):
+            del file[f"energy/{weight}"], file[f"weights/{name}"]
+            for energy in claims["energy"].values():
+                energy["total"] -= energy.pop(name, 0.0)
+    (folder / "summary.json").write_text(json.dumps(claims))
+    found = {name for name in bad(check_folder(folder)) if "as written" not in name}
+    assert not {name for name in found if name.startswith("energy")}
+
+
 def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
     # without the presolve there is no other answer, whatever the rounding
     run = solve_pair(pair, **SMALL, solver={"presolve": False}, refine={"enabled": False})
