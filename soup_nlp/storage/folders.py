@@ -132,16 +132,13 @@ def claim(
         if subject and old not in ("", printable(subject)) and not overwrite:
             what = "output folder holds the result of something else"
             raise DataError(what, where=folder, found=old, expected=subject, hint=hint)
-        states = {name: _state(target, name, files) for name in names}
-        if before is None:
-            states[SUMS] = _state(target, SUMS, {})
-        kept = [target / name for name, state in states.items() if state == "blocked"]
-        if journal and _state(target, journal, {}) != "nothing":
-            # a journal grows, so that it is not listed
-            own = before is not None and _state(target, journal, {}) == "foreign"
-            kept += [] if own and not (target / journal).is_symlink() else [target / journal]
-        foreign = [name for name, state in states.items() if state == "foreign"]
-        foreign += [path.relative_to(target).as_posix() for path in kept]
+        own = {} if before else {SUMS: _state(target, SUMS, {})}
+        states = own | {name: _state(target, name, files) for name in names}
+        if journal and (state := _state(target, journal, {})) != "nothing":
+            # it grows, so that it is not listed
+            linked = (target / journal).is_symlink()
+            states[journal] = "made" if before and state == "foreign" and not linked else "blocked"
+        foreign = [name for name, state in states.items() if state in ("foreign", "blocked")]
         if foreign and not overwrite:
             raise DataError(
                 "output folder holds files that would be overwritten and that this program did not"
@@ -151,9 +148,9 @@ def claim(
                 expected="a new or empty folder, or that of an earlier result",
                 hint=f"move them away, {hint}",
             )
-        if kept:
+        for name in (name for name in foreign if states[name] == "blocked"):
             what = "cannot write over a folder, below a file or link, or into another one's file"
-            raise DataError(what, where=kept[0], hint="choose another --out")
+            raise DataError(what, where=target / name, hint="choose another --out")
     return Path(folder)
 
 
@@ -184,8 +181,8 @@ def staged(
         try:
             new.mkdir()
             yield new
-            claim(target, files_in(new), overwrite)
             with _locked(target.parent), deferred_signals():
+                claim(target, files_in(new), overwrite)
                 _commit(new, target, whole, subject)
         except DataError as error:
             # name the final path instead of the temporary one

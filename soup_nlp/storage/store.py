@@ -76,8 +76,8 @@ def write_h5(
     """Write a result file.
 
     Each array becomes a dataset with the attributes `units`, `description` and `shape_letters`;
-    each mapping a group. The root gets `attrs` (None is left out; values without a type of HDF5 are
-    stored as JSON text) plus `schema`, `versions` (JSON text) and `machine`.
+    each mapping a group. The root gets `attrs`, without None, plus `schema`, `versions` and
+    `machine`; what has no type of HDF5 is JSON text.
 
     Args:
         path: File to write; its folder must exist.

@@ -123,16 +123,13 @@ def end_with_parent() -> None:
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """A temporary folder in the system's folder for these.
-
-    Raises:
-        DataError: it cannot be made.
-    """
+    """A temporary folder in the system's folder for these."""
     try:
         folder = tempfile.TemporaryDirectory(prefix="soup_nlp-", ignore_cleanup_errors=True)
     except OSError as error:
-        where = tempfile.gettempdir()
-        what = "no temporary folder can be made"
-        raise DataError(what, where=where, found=error.strerror, hint="set TMPDIR") from error
+        what, found = "no temporary folder can be made", error.strerror
+        raise DataError(
+            what, where=tempfile.gettempdir(), found=found, hint="set TMPDIR"
+        ) from error
     with folder as name:
         yield Path(name)
