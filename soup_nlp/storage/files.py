@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
-from pydantic_core import from_json, to_jsonable_python
+from pydantic_core import to_jsonable_python
 
 from soup_nlp.errors import DataError, SoupError, printable
 
@@ -142,7 +142,10 @@ def parse_json(text: str) -> Any:
     Raises:
         ValueError: it is not JSON, is nested too deeply, or has a number that is no float64.
     """
-    return _printable(from_json(text, allow_inf_nan=False))
+    try:
+        return _printable(json.loads(text, parse_constant=_constant))
+    except RecursionError:
+        raise ValueError("brackets are nested too deeply") from None
 
 
 def read_json(
@@ -174,6 +177,10 @@ def read_json(
     except ValueError as problem:
         raise error(f"{what} is not JSON", where=path, found=problem) from None
     return value
+
+
+def _constant(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
 
 
 def _printable(value: Any) -> Any:
