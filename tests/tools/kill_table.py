@@ -80,7 +80,7 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         run([*export, "--out", str(root / "exported")])
         problem = load_problem(root / "exported" / "problem.yaml")
         case = prepare(problem)
-        nlp, _ = case.nlp(case.formulation(hessian="exact"))
+        nlp, _ = case.nlp(case.formulation(hessian="exact", compiled=False))
         write_sol(root / "a.sol", nlp.x0, None, *file_orders(nlp))
     return [Command(name, words[name], out[name]) for name in names]
 
@@ -199,9 +199,10 @@ def told(rows: Rows, **row: object) -> None:
     print(json.dumps(row), flush=True)
 
 
-def unfinished(*folders: Path) -> list[str]:
-    """Temporary files of the program in some folders."""
-    return [n for p in folders for n in (os.listdir(p) if p.is_dir() else ()) if UNFINISHED in n]
+def unfinished(*folders: Path) -> list[Path]:
+    """Temporary folders of the program in some folders."""
+    there = [path for folder in folders if folder.is_dir() for path in folder.iterdir()]
+    return [path for path in there if path.name.startswith((UNFINISHED, "soup_nlp-"))]
 
 
 def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
@@ -226,18 +227,13 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
                         seconds = spent if how == "before" and not writing else seconds
                     time.sleep(0.3)
                     when = f"writing + {delay:.3f} s" if writing else f"{delay:.2f} s"
-                    bad = broken(folder)
-                    told(rows, command=name, signal=word, when=when, ended=how, broken=bad)
-                    left = unfinished(root, folder / "pairs") + os.listdir(root / "tmp")
-                    if how != "SIGKILL":
-                        rows[-1]["left"] = left
-                    for path in (
-                        root / "tmp",
-                        *(p for p in (root, folder / "pairs") if p.is_dir()),
-                    ):
-                        for rest in path.iterdir():
-                            if path.name == "tmp" or rest.name.startswith(UNFINISHED):
-                                shutil.rmtree(rest)
+                    row = {"command": name, "signal": word, "when": when, "ended": how}
+                    row["broken"] = broken(folder)
+                    # SIGKILL leaves a temporary folder
+                    left = unfinished(root / "tmp", root, folder / "pairs")
+                    told(rows, **row, left=[] if how == "SIGKILL" else [*map(str, left)])
+                    for path in left:
+                        shutil.rmtree(path)
                 ended, bad = f"exit {run(command.words)[0]}", broken(folder)
                 told(rows, command=name, signal="none", ended=ended, broken=bad)
         finally:
@@ -297,7 +293,7 @@ def full_disks(names: Sequence[str]) -> Rows:
                         row = {"command": command.name, "disk": state, "size": space}
                         row |= {"exit": run(words)[0], "broken": broken(target)}
                         kept, left = listed(target) == before, unfinished(root / "disk", target)
-                        told(rows, **row, left=left, **{"earlier kept": kept})
+                        told(rows, **row, left=[*map(str, left)], **{"earlier kept": kept})
     return rows
 
 
