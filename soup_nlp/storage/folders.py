@@ -191,9 +191,9 @@ def staged(
             final = target / error.where.relative_to(new)
             raise DataError(error.what, where=final, found=error.found, hint=error.hint) from error
         finally:
-            if not (place / "old").exists():
-                shutil.rmtree(place, ignore_errors=True)
-            with suppress(OSError):
+            with deferred_signals(), suppress(OSError):
+                if not (place / "old").exists():
+                    shutil.rmtree(place, ignore_errors=True)
                 # fails for a folder that is not empty
                 for path in fresh:
                     path.rmdir()

@@ -3,8 +3,8 @@
 import json
 import warnings
 from pathlib import Path
-from typing import Any
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
