@@ -151,6 +151,8 @@ def _prior(data: EnergyData, w: Weights) -> Element:
         "reach": np.linalg.norm(rays["ray_i"] - rays["ray_k"], axis=1),
         **rays,
     }
+    if data.prior_relief.any():
+        columns["relief"] = data.prior_relief
     return Element(data.edges, columns, Norms(terms.prior))
 
 

@@ -38,6 +38,8 @@ class EnergyData:
         prior_weight: (E,) weight of E_prior: 1 / K for each direction of the edge, so that it is
             the mean over the neighbours of a superpixel, times the flow's noise in pixels where
             that is known.
+        prior_relief: (E,) relative difference of inverse depth along each edge that costs nothing
+            in E_prior: that of the start where the flow determines the depth of neither end.
         depth_weight: (E,) weight of E_depth; 0 without a depth prior, and where it is not reliable.
         depth_change: (E,) difference of log depth along each edge by the depth prior.
         order_weight: (P,) weight of E_order: positive where the second superpixel of a pair covers
@@ -71,6 +73,7 @@ class EnergyData:
     edge_weight: Float
     edge_unit: Float
     prior_weight: Float
+    prior_relief: Float
     depth_weight: Float
     depth_change: Float
     order_weight: Float
@@ -189,6 +192,7 @@ def build_energy_data(
         edge_weight=seg.edge_weight,
         edge_unit=np.ones(len(seg.edges)),
         prior_weight=seg.edge_multiplicity / max(1, seg.knn.shape[1]),
+        prior_relief=np.zeros(len(seg.edges)),
         depth_weight=np.zeros(len(seg.edges)),
         depth_change=np.zeros(len(seg.edges)),
         order_weight=np.zeros(len(seg.pairs)),

@@ -59,6 +59,9 @@ class Weights(Section):
 # where a bending surface is connected, and gives rotations almost no weight. Lengths, continuity
 # and orientation then hold the relief. This energy is always in pixels.
 
+HOLD = 10.0
+"""Factor of E_prior between two superpixels whose flow determines no depth, where it holds the
+relief of the start."""
 BENDING = {"cont": 500 / 3, "orient": 800.0, "prior": 400 / 3}
 """Factors of terms between superpixels that bend; orient is for N = 1,000: on the same relief
 1 - cos between neighbours falls as 1 / N. Fitted on kinect_paper, sheet and rgbd."""

@@ -71,6 +71,11 @@ def ends_of(soup: Soup, data: EnergyData) -> dict[GraphName, Ends]:
     return {graph: Ends(states, data, graph, unit) for graph in get_args(GraphName)}
 
 
+def relief(soup: Soup, data: EnergyData) -> Float:
+    """(E,) difference of the inverse depths of an edge's anchors, relative to the nearer one."""
+    return np.asarray(ends_of(soup, data)["edges"].relief[:, 0, 0])
+
+
 # --- superpixels and pairs of them in L states each ----------------------------------------------
 
 
@@ -287,12 +292,12 @@ def orientation(e: Ends, weights: Weights) -> AnyFloat:
 def prior(e: Ends, weights: Weights) -> AnyFloat:
     """E_prior of an edge: slope of the inverse depth between its anchors, relative to it.
 
-    `|1 / Z_i - 1 / Z_k| / m / |r_i - r_k|` with anchor rays r and m the mean of both
+    `|(1 / Z_i - 1 / Z_k) / m - relief| / |r_i - r_k|` with anchor rays r and m the mean of both
     inverse depths that is near the larger.
     """
     ray = e.states.anchor_ray
     reach = np.linalg.norm(ray[e.i] - ray[e.k], axis=1).astype(e.states.dtype)
-    return np.abs(e.relief) / reach[:, None, None]
+    return np.abs(e.relief - e.column(e.data.prior_relief)) / reach[:, None, None]
 
 
 def depth(e: Ends, weights: Weights) -> AnyFloat:

@@ -11,10 +11,11 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.model.energy_options import BENDING, BENDING_TURN_PX, EnergyOptions
+from soup_nlp.model.energy_options import BENDING, BENDING_TURN_PX, HOLD, EnergyOptions
+from soup_nlp.model.oracle import relief
 
 OF_EDGES: tuple[str, ...] = ("edges", "edge_weight", "edge_unit", "rotation_scale")
-OF_EDGES += ("prior_weight", "depth_weight", "depth_change")
+OF_EDGES += ("prior_weight", "prior_relief", "depth_weight", "depth_change")
 """Arrays of `EnergyData` with a row per edge."""
 
 
@@ -59,6 +60,9 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
     touching = np.where(group[a] == group[b], 1.0, options.across)
     stiff = bends.copy()
     prior = known.noise * data.prior_weight
+    # terms on shape flatten what is not seen: it keeps the relief of the start
+    unseen = np.isinf(known.variance) & ~bends
+    held = unseen[i] & unseen[k]
     by_prior, depth, change = np.zeros((3, len(i)))
     if known.prior is not None:
         log_depth, opened, error = known.prior
@@ -83,7 +87,11 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
     out = replace(
         data,
         edge_weight=joined * data.edge_weight,
-        prior_weight=bending("prior", data.edges) * (1 - by_prior) * joined * prior,
+        prior_weight=bending("prior", data.edges)
+        * (1 - by_prior)
+        * np.where(held, HOLD, joined)
+        * prior,
+        prior_relief=np.where(held, relief(soup, data), 0.0),
         depth_weight=depth,
         depth_change=change,
         pair_weight=bending("cont", data.pairs) * touching * data.pair_weight,

@@ -82,9 +82,13 @@ def orientation(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
 
 
 def prior(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
-    """E_prior of an edge: slope of the inverse depth between two anchors, relative to it."""
+    """E_prior of an edge: slope of the inverse depth between two anchors, relative to it.
+
+    A given difference `row["relief"]` costs nothing.
+    """
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
     change = (1 / Xa[2] - 1 / Xb[2]) / _nearness(Xa, Xb)
+    change = change - row["relief"] if "relief" in row else change
     return [Norm("slope", row["weight"], change / row["reach"], eps)]
 
 

@@ -38,6 +38,7 @@ energy/pixel_weight       1     N,S     confidence x usable share / sample size;
 energy/edges              1     E,2     edges i < k: K-NN, and those that join the scene
 energy/edge_weight        1     E       w1 = w2 of both directions, less between two components
 energy/prior_weight       1     E       weight of E_prior: flow noise / K for each direction
+energy/prior_relief       1     E       relative difference of 1/z that costs nothing in E_prior
 energy/depth_weight       1     E       weight of E_depth, 0 without a depth prior
 energy/depth_change       1     E       difference of log depth by the depth prior
 energy/order_weight       1     P       weight of E_order, > 0 where the second covers the first

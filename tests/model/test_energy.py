@@ -33,7 +33,7 @@ from soup_nlp.model.energy_data import (
     build_energy_data,
     sample_pixels,
 )
-from soup_nlp.model.energy_options import BENDING, EnergyOptions, Weights
+from soup_nlp.model.energy_options import BENDING, HOLD, EnergyOptions, Weights
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.reweighting import Known, in_pixels, weighted
 from soup_nlp.pipeline.case import build_energy
@@ -106,7 +106,8 @@ def test_the_order_of_the_superpixels_does_not_matter():
         rank[problem.seg.labels], problem.image, neighbours=11, boundary_samples=2
     )
     data = build_energy_data(seg, problem.flow, K_REF, K_NEXT, 3, 0)
-    s, own = problem.soup, replace(problem.data, depth_weight=0 * problem.data.depth_weight)
+    none = 0 * problem.data.prior_relief
+    s, own = problem.soup, replace(problem.data, prior_relief=none, depth_weight=none)
     own = replace(own, order_weight=0 * own.order_weight)
     soup = Soup(s.lam[order], s.n[order], s.d[order], s.R[order], s.t[order])
     np.testing.assert_allclose(energies(soup, data, weights), energies(s, own, weights), rtol=1e-12)
@@ -281,7 +282,7 @@ def test_one_superpixel_is_a_valid_problem():
 
 def test_prior_is_the_relative_slope_of_inverse_depth():
     problem = tiny("pixels")
-    soup, data = problem.soup, problem.data
+    soup, data = problem.soup, replace(problem.data, prior_relief=0 * problem.data.edge_unit)
     expected = 0.0
     ray, Z = data.anchor_ray, soup.depth_at(data.anchor_ray)
     for i, near in enumerate(problem.seg.knn):
@@ -337,6 +338,21 @@ def test_weights_are_shares_across_components_and_factors_where_surfaces_bend():
     np.testing.assert_allclose(found.pair_weight, factor["cont"][1] * meets * data.pair_weight)
     steep = np.where(factor["orient"][1] > 1, count / 1000 * BENDING["orient"], 1.0)
     np.testing.assert_allclose(found.orient_weight, steep * data.orient_weight)
+
+
+def test_what_is_not_seen_keeps_the_relief_of_the_start():
+    data, soup = tiny("pixels").data, tiny().soup
+    unseen = np.arange(len(soup)) < 7
+    variance = np.where(unseen, np.inf, 1.0)
+    found = weighted(
+        data, soup, of_scene(len(soup), variance=variance), EnergyOptions(arap_scene=0.0)
+    )
+    both = unseen[data.edges].all(axis=1)
+    assert 0 < both.sum() < len(both)
+    np.testing.assert_allclose(found.prior_weight, np.where(both, HOLD, 1.0) * data.prior_weight)
+    cost = oracle.values("prior", soup, found, Weights())
+    np.testing.assert_allclose(cost[both], 0.0, atol=1e-12)
+    assert not found.prior_relief[~both].any()
 
 
 def test_order_weighs_by_the_noise_and_asks_for_steps_where_it_places():
