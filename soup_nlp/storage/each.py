@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 
 from joblib.externals.loky import ProcessPoolExecutor
 
-from soup_nlp.errors import optional
+from soup_nlp.errors import DataError, optional
 from soup_nlp.storage.files import plain
 from soup_nlp.storage.system import end_with_parent
 
@@ -55,6 +56,7 @@ def each(
 
     Raises:
         ConfigError: Dask is not installed.
+        DataError: the scheduler of the cluster is lost.
     """
     if cluster is not None:
         yield from _on_cluster(jobs, cluster)
@@ -184,6 +186,12 @@ def _on_cluster(jobs: Mapping[str, Work], address: str) -> Iterator[tuple[str, R
         for future in distributed.as_completed(list(futures)):
             try:
                 row = dict(future.result())
+            except CancelledError as error:
+                raise DataError(
+                    "the scheduler of the cluster is lost",
+                    where=address,
+                    hint="what was finished is kept: the same command goes on",
+                ) from error
             except Exception as error:
                 row = failure(f"{type(error).__name__}: {str(error).strip()}")
             yield futures[future], row

@@ -23,6 +23,7 @@ from soup_nlp.config.identity import identity
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.storage.each import each
 from soup_nlp.storage.rows import read_rows
 
 TINY = [
@@ -254,40 +255,60 @@ def test_a_table_and_a_page_of_rows():
 # --- a cluster -----------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_a_cluster_of_two_workers_survives_the_loss_of_one(four, tmp_path):
+QUIET: dict[str, int] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """Address, scheduler and two workers of a cluster on the loopback address."""
     pytest.importorskip("distributed")
     place = tmp_path / "scheduler.json"
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    cli = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1"]
-    cli += ["--port", "0", "--no-dashboard", "--scheduler-file", str(place)]
-    started = [subprocess.Popen(cli, cwd=tmp_path, **quiet)]
+    words = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1"]
+    words += ["--port", "0", "--no-dashboard", "--scheduler-file", str(place)]
+    started = [subprocess.Popen(words, cwd=tmp_path, **QUIET)]
     try:
         while not place.is_file() or not place.stat().st_size:
             time.sleep(0.1)
         address = json.loads(place.read_text())["address"]
         for k in range(2):
-            worker = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--no-nanny"]
-            worker += [
-                "--nthreads",
-                "1",
-                "--no-dashboard",
-                "--local-directory",
-                str(tmp_path / f"{k}"),
-            ]
-            started.append(subprocess.Popen(worker, cwd=tmp_path, **quiet))
-        killed = []
-
-        def kill_one(done: int, total: int, row: dict) -> None:
-            if not killed:
-                killed.append(started[1].pid)
-                os.kill(started[1].pid, signal.SIGKILL)
-
-        done = batch(four, tmp_path / "out", overrides=TINY, cluster=address, say=kill_one)
-        assert done.good
-        assert len(killed) == 1
-        assert len(rows_of(tmp_path / "out")) == 4
+            words = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--no-nanny"]
+            words += ["--nthreads", "1", "--no-dashboard", "--local-directory", f"{tmp_path}/{k}"]
+            started.append(subprocess.Popen(words, cwd=tmp_path, **QUIET))
+        yield address, started
     finally:
         for process in started:
             process.kill()
             process.wait()
+
+
+@pytest.mark.slow
+def test_a_cluster_survives_the_loss_of_a_worker(four, tmp_path, cluster):
+    address, started = cluster
+    killed = []
+
+    def kill_one(done: int, total: int, row: dict) -> None:
+        if not killed:
+            killed.append(started[1].pid)
+            os.kill(started[1].pid, signal.SIGKILL)
+
+    done = batch(four, tmp_path / "out", overrides=TINY, cluster=address, say=kill_one)
+    assert done.good
+    assert len(killed) == 1
+    assert len(rows_of(tmp_path / "out")) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_the_loss_of_the_scheduler_ends_the_command(cluster):
+    address, started = cluster
+
+    # pickled by value: the workers do not know this module
+    def later() -> dict[str, int]:
+        time.sleep(0.5)
+        return {}
+
+    rows = each({str(k): later for k in range(8)}, cluster=address)
+    assert next(rows)[1]["ok"]
+    started[0].kill()
+    with pytest.raises(DataError, match="scheduler of the cluster is lost"):
+        list(rows)
