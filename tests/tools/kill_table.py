@@ -80,7 +80,7 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         run([*export, "--out", str(root / "exported")])
         problem = load_problem(root / "exported" / "problem.yaml")
         case = prepare(problem)
-        nlp, _ = case.nlp(case.formulation(hessian="exact", compiled=False))
+        nlp, _ = case.nlp(case.formulation(hessian="exact"))
         write_sol(root / "a.sol", nlp.x0, None, *file_orders(nlp))
     return [Command(name, words[name], out[name]) for name in names]
 
