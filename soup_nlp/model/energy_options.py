@@ -59,6 +59,8 @@ class Weights(Section):
 # where a bending surface is connected, and gives rotations almost no weight. Lengths, continuity
 # and orientation then hold the relief. This energy is always in pixels.
 
+GAP = 0.1
+"""Relative gap in depth, at the start, from which two components do not touch."""
 HOLD = 10.0
 """Factor of E_prior between two superpixels whose flow determines no depth, where it holds the
 relief of the start."""
@@ -83,8 +85,8 @@ class EnergyOptions(Section):
     arap_at_anchors: bool = False
     """Compare motions at the anchors instead of the camera's origin."""
     across: Share = 0.03
-    """Factor of E_arap, E_prior and E_cont between superpixels of different components; 1 is the
-    paper's."""
+    """Factor of E_arap, E_prior and, over gaps in depth, E_cont between superpixels of different
+    components; 1 is the paper's."""
     arap_scene: Share = 0.1
     """Weight w1 of further edges of E_arap, from the scene's superpixel of median depth to all of
     the scene with a flow and depth of their own; 0 is the paper's graph."""

@@ -11,7 +11,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.model.energy_options import BENDING, BENDING_TURN_PX, HOLD, EnergyOptions
+from soup_nlp.model.energy_options import BENDING, BENDING_TURN_PX, GAP, HOLD, EnergyOptions
 from soup_nlp.model.oracle import relief
 
 OF_EDGES: tuple[str, ...] = ("edges", "edge_weight", "edge_unit", "rotation_scale")
@@ -57,7 +57,10 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
     group, bends = known.component, known.bends
     # what two components have in common is not known: little of each term joins them
     joined = np.where(group[i] == group[k], 1.0, options.across)
-    touching = np.where(group[a] == group[b], 1.0, options.across)
+    # contact gives scales; where the start leaves a gap between components, the gap is real
+    z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
+    gap = z.min(axis=0) < (1 - GAP) * z.max(axis=0)
+    touching = np.where(gap & (group[a] != group[b]), options.across, 1.0)
     stiff = bends.copy()
     prior = known.noise * data.prior_weight
     # terms on shape flatten what is not seen: it keeps the relief of the start
@@ -72,11 +75,11 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
         depth, change = by_prior * prior / error, log_depth[i] - log_depth[k]
         # the flow holds no slopes where the prior decides, and a prior may have steps
         stiff |= opened > 0.5
-        touching = np.where((opened > 0.5)[data.pairs].any(axis=1), options.across, touching)
+        steps = gap & (opened > 0.5)[data.pairs].any(axis=1)
+        touching = np.where(steps, options.across, touching)
     order, step = np.zeros((2, len(a)))
     if known.order is not None and options.weights.order > 0:
         order = known.noise * known.order
-        z = soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
         step = np.where(order > 0, z[0] / z[1], z[1] / z[0]) - 1
         step = np.where(known.placed[data.pairs].any(axis=1), np.maximum(step, 0.0), 0.0)
 

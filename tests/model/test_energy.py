@@ -33,7 +33,7 @@ from soup_nlp.model.energy_data import (
     build_energy_data,
     sample_pixels,
 )
-from soup_nlp.model.energy_options import BENDING, HOLD, EnergyOptions, Weights
+from soup_nlp.model.energy_options import BENDING, GAP, HOLD, EnergyOptions, Weights
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.reweighting import Known, in_pixels, weighted
 from soup_nlp.pipeline.case import build_energy
@@ -322,7 +322,11 @@ def test_weights_are_shares_across_components_and_factors_where_surfaces_bend():
     data, count = tiny("pixels").data, len(tiny().soup)
     part, bends = np.arange(count) % 2, np.arange(count) < 8
     (a, b), (i, k) = data.edges.T, data.pairs.T
-    joined, meets = (np.where(part[p] == part[q], 1.0, 0.2) for p, q in ((a, b), (i, k)))
+    z = tiny().soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1))
+    gap = np.abs(z[0] - z[1]) > GAP * z.max(axis=0)
+    assert 0 < gap[part[i] != part[k]].sum() < (part[i] != part[k]).sum()
+    joined = np.where(part[a] == part[b], 1.0, 0.2)
+    meets = np.where((part[i] != part[k]) & gap, 0.2, 1.0)
     options = EnergyOptions(across=0.2, arap_scene=0.0)
     # wherever bending begins, it does so at superpixels that both bend
     factor = {
