@@ -61,9 +61,6 @@ class Weights(Section):
 
 GAP = 0.1
 """Relative gap in depth, at the start, from which two components do not touch."""
-HOLD = 10.0
-"""Factor of E_prior between two superpixels whose flow determines no depth, where it holds the
-relief of the start."""
 BENDING = {"cont": 500 / 3, "orient": 800.0, "prior": 400 / 3}
 """Factors of terms between superpixels that bend; orient is for N = 1,000: on the same relief
 1 - cos between neighbours falls as 1 / N. Fitted on kinect_paper, sheet and rgbd."""

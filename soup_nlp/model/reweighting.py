@@ -11,7 +11,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.model.energy_options import BENDING, BENDING_TURN_PX, GAP, HOLD, EnergyOptions
+from soup_nlp.model.energy_options import BENDING, BENDING_TURN_PX, GAP, EnergyOptions
 from soup_nlp.model.oracle import relief
 
 OF_EDGES: tuple[str, ...] = ("edges", "edge_weight", "edge_unit", "rotation_scale")
@@ -92,7 +92,7 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
         edge_weight=joined * data.edge_weight,
         prior_weight=bending("prior", data.edges)
         * (1 - by_prior)
-        * np.where(held, HOLD, joined)
+        * np.where(held, 1.0, joined)
         * prior,
         prior_relief=np.where(held, relief(soup, data), 0.0),
         depth_weight=depth,
