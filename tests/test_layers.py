@@ -53,9 +53,9 @@ COMMON = {"arrays", "errors"}
 TOP = {"", "__main__", *COMMON}
 """All modules beside the rooms."""
 
-NUMBERS_ONLY = ("model.oracle", "model.energy_data", "model.layout", "model.reweighting")
-"""Modules that must not reach casadi, not even through others: the oracle shares nothing with the
-symbolic model."""
+NUMBERS_ONLY = ("model.formulas", "model.energy_data", "model.layout", "model.reweighting")
+"""Modules that must not reach casadi, not even through others: the terms in numpy share nothing
+with those in symbols."""
 
 
 def modules() -> dict[str, Path]:

@@ -54,7 +54,7 @@ def test_the_recipe_of_a_term_shows_the_code():
     recipe = (ROOT / "docs" / "adding.md").read_text().split("\n## ")[1]
     source = "".join(path.read_text() for path in (ROOT / "soup_nlp" / "model").glob("*.py"))
     shown = re.findall(r"```python\n(.*?)\n *```", recipe, re.DOTALL)
-    assert len(shown) == 4
+    assert len(shown) == 5
     for block in map(textwrap.dedent, shown):
         assert block in source or textwrap.indent(block, "    ") in source
 

@@ -83,7 +83,7 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
 
     def prior() -> Float:
         reach = norm(e["anchor_ray"][i] - e["anchor_ray"][k], axis=-1)
-        return np.abs((rho[i] - rho[k]) / near(e["edges"]) - e["prior_relief"]) / reach
+        return np.abs((rho[i] - rho[k]) / near(e["edges"]) - e.get("prior_relief", 0.0)) / reach
 
     def depth() -> Float:
         return np.abs(np.log(A[i, 2]) - np.log(A[k, 2]) - e["depth_change"])

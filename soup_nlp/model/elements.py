@@ -1,4 +1,4 @@
-"""The terms of the energy as kinds of elements: their norms, data columns and views."""
+"""The terms of the energy: one object each, by which program, oracle and refinement find it."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -7,10 +7,11 @@ from typing import NamedTuple, Self
 import casadi as ca
 import numpy as np
 
-from soup_nlp.arrays import Float, Int
-from soup_nlp.model import terms
-from soup_nlp.model.energy_data import PAPER_TERMS, EnergyData
+from soup_nlp.arrays import AnyFloat, Float, Int
+from soup_nlp.model import formulas, terms
+from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
+from soup_nlp.model.formulas import Ends, GraphName
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.norms import Norm
 from soup_nlp.model.superpixel import View
@@ -63,6 +64,34 @@ class Element:
         return replace(self, columns=columns)
 
 
+@dataclass(frozen=True)
+class Term:
+    """A term of the energy: the sum over its elements of factor x weight x truncated norms.
+
+    Attributes:
+        name: Also the field of `Weights` with its factor.
+        table: Its elements: superpixels, data with truncations, and the formula in symbols.
+        weight: Field of `EnergyData` whose absolute value multiplies its elements.
+        graph: Graph whose rows they are; None for the pixels of superpixels.
+        cost: (b, L, L) the formula in numpy without weight, truncated, for rows of the graph.
+        given: Whether its data is missing, all weights 0, for most pairs.
+        optional: Whether a factor of 0 leaves it out.
+    """
+
+    name: str
+    table: Callable[[EnergyData, Weights], Element]
+    weight: str
+    graph: GraphName | None = None
+    cost: Callable[[Ends, Weights], AnyFloat] | None = None
+    given: bool = False
+    optional: bool = True
+
+
+def present(data: EnergyData) -> tuple[str, ...]:
+    """Names of the terms that the energy of a pair has."""
+    return tuple(k for k, t in TERMS.items() if not t.given or getattr(data, t.weight).any())
+
+
 def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]:
     """The terms as element kinds, with the columns that the layout's views need.
 
@@ -72,10 +101,10 @@ def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]
         layout: Whose variables the views are made of.
 
     Returns:
-        The paper's terms, and those of `data.terms` that have a factor.
+        The paper's terms, and others that are present and have a factor.
     """
-    used = [k for k in data.terms if k in PAPER_TERMS or getattr(w, k) > 0]
-    return {name: ELEMENTS[name](data, w).viewed(layout) for name in used}
+    used = [TERMS[k] for k in present(data) if not TERMS[k].optional or getattr(w, k) > 0]
+    return {term.name: term.table(data, w).viewed(layout) for term in used}
 
 
 def _truncations(count: int, **sigma: float) -> dict[str, Float]:
@@ -189,13 +218,18 @@ def _orient(data: EnergyData, w: Weights) -> Element:
     return Element(data.pairs, columns, Norms(terms.orientation))
 
 
-ELEMENTS: Mapping[str, Callable[[EnergyData, Weights], Element]] = {
-    "arap": _arap,
-    "proj": _proj,
-    "cont": _cont,
-    "orient": _orient,
-    "prior": _prior,
-    "depth": _depth,
-    "order": _order,
+PROJ = Term("proj", _proj, "pixel_weight", optional=False)
+"""The one term of single superpixels: `formulas.reprojection`."""
+TERMS: Mapping[str, Term] = {
+    term.name: term
+    for term in (
+        Term("arap", _arap, "edge_weight", "edges", formulas.arap, optional=False),
+        PROJ,
+        Term("cont", _cont, "pair_weight", "pairs", formulas.continuity, optional=False),
+        Term("orient", _orient, "orient_weight", "pairs", formulas.orientation, optional=False),
+        Term("prior", _prior, "prior_weight", "edges", formulas.prior),
+        Term("depth", _depth, "depth_weight", "edges", formulas.depth, given=True),
+        Term("order", _order, "order_weight", "pairs", formulas.order, given=True),
+    )
 }
-"""Elements of every term of `energy_data.TERMS`, without the columns of a layout."""
+"""All terms, in the order of printing."""

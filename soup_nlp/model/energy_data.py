@@ -10,13 +10,6 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 
-PAPER_TERMS = ("arap", "proj", "cont", "orient")
-"""The paper's terms, in its order."""
-GIVEN_TERMS = {"depth": "depth_weight", "order": "order_weight"}
-"""Terms of data that few pairs have, and the weights in `EnergyData` that are 0 without them."""
-TERMS = (*PAPER_TERMS, "prior", *GIVEN_TERMS)
-"""All terms of the energy. A term is a key of `Weights` (its factor), of `oracle.PAIR_TERMS` (its
-value) and of `elements.ELEMENTS` (its kernel)."""
 HINGE = 0.01
 """Width of the corner of the hinge of E_order, relative inverse depth."""
 
@@ -100,12 +93,6 @@ class EnergyData:
         )
 
     __repr__ = __str__
-
-    @property
-    def terms(self) -> tuple[str, ...]:
-        """Terms that the energy of this pair has."""
-        absent = {k for k, weight in GIVEN_TERMS.items() if not getattr(self, weight).any()}
-        return tuple(k for k in TERMS if k not in absent)
 
     def visibility_ray(self, depth_ratio: float) -> Float:
         """(N, V, 3) rays v with `-n . v >= c` for visibility: the anchor, then r_rim - r_a / ratio.

@@ -12,7 +12,7 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import BENDING, BENDING_TURN_PX, GAP, EnergyOptions
-from soup_nlp.model.oracle import relief
+from soup_nlp.model.formulas import relief
 
 OF_EDGES: tuple[str, ...] = ("edges", "edge_weight", "edge_unit", "rotation_scale")
 OF_EDGES += ("prior_weight", "prior_relief", "depth_weight", "depth_change")

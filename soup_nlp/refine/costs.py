@@ -7,9 +7,10 @@ same energy as a pairwise MRF, and its terms are those of `model.oracle`.
 import numpy as np
 
 from soup_nlp.arrays import AnyFloat, Float, Int, Mask
+from soup_nlp.model.elements import TERMS
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.oracle import PAIR_TERMS, Ends, GraphName, States, reprojection
+from soup_nlp.model.formulas import Ends, GraphName, States, reprojection
 from soup_nlp.refine.particles import Particles
 
 BLOCK_BYTES = 1 << 18  # one of the half dozen buffers of a block of edges
@@ -91,7 +92,7 @@ class PairCosts:
             present = np.flatnonzero(rows >= 0)
             terms = [
                 (term, getattr(self.weights, name) * np.abs(getattr(data, term.weight)))
-                for name, term in PAIR_TERMS.items()
+                for name, term in TERMS.items()
                 if term.graph == graph
             ]
             for a in range(0, len(present), step):
@@ -99,5 +100,6 @@ class PairCosts:
                 ends = Ends(states, data, graph, unit, rows[at])
                 for term, weight in terms:
                     if weight[rows[at]].any():
+                        assert term.cost
                         out[at] += ends.column(weight) * term.cost(ends, self.weights)
         return out

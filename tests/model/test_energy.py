@@ -27,6 +27,7 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
+from soup_nlp.model.elements import present
 from soup_nlp.model.energy_data import (
     HINGE,
     EnergyData,
@@ -44,7 +45,7 @@ from soup_nlp.start.choice import limited_noise
 
 def energies(soup: Soup, data: EnergyData, weights: Weights) -> np.ndarray:
     e = oracle.energy(soup, data, weights)
-    return np.array([e[k] for k in data.terms])
+    return np.array([e[k] for k in present(data)])
 
 
 @pytest.mark.parametrize("units", UNITS)

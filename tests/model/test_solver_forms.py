@@ -9,7 +9,7 @@ from helpers_model import GAUGES, PAPER, UNITS, WORLDS, form, tiny, weights_for,
 
 from soup_nlp.geometry import rotation
 from soup_nlp.model import oracle
-from soup_nlp.model.energy_data import TERMS
+from soup_nlp.model.elements import TERMS
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.norms import Norm, smooth_min, solver_form
 
