@@ -12,6 +12,8 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.norms import Norm
+from soup_nlp.refine.costs import PairCosts
+from soup_nlp.refine.particles import Particles
 from soup_nlp.schema.section import NonNegative
 
 
@@ -59,3 +61,9 @@ def test_a_new_term_is_one_object(monkeypatch, tmp_path):
     builder.import_nl(str(file.path), {})
     f = ca.Function("f", [ca.vertcat(*builder.x)], [builder.f])
     assert float(f(nlp.x0[file.variables])) == pytest.approx(nlp.value(nlp.x0), rel=1e-9)
+    # the refinement's tables have it too
+    p = Particles.of(tiny.soup)
+    tables = PairCosts(tiny.data, weights).tables(p)
+    monkeypatch.delitem(TERMS, "level")
+    added = tables - PairCosts(tiny.data, weights).tables(p)
+    assert added[:, 0, 0].sum() == pytest.approx(expected, rel=1e-9)
