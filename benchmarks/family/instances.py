@@ -28,7 +28,7 @@ from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.pipeline.case import solver_options
 from soup_nlp.pipeline.record import Case
-from soup_nlp.start.choice import limited_noise
+from soup_nlp.start.labelling import limited_noise
 from soup_nlp.start.propose import Start
 
 VERSION = 4

@@ -24,10 +24,10 @@ from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
-from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.start.given_depth import Given
 from soup_nlp.start.ground import STANDS
+from soup_nlp.start.labelling import LEAST_NOISE
 from soup_nlp.start.pace import displacement, log_pace
 from soup_nlp.start.propose import Start
 

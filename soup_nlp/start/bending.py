@@ -18,17 +18,16 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.choice import Choice, dominant
 from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, essential_motion, refine_near
-from soup_nlp.start.merge import candidates
+from soup_nlp.start.labelling import SHARED, Labelling, candidates, dominant
 from soup_nlp.start.views import FlowFit, Views
 
-SYSTEMATIC, LEAST_PX, MOST_PX = 4.0, 0.01, 0.07
-"""Systematic error of a dense flow, in units of its noise, and its limits in pixels."""
 REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
 with the diameter of the superpixel."""
+RELIEF = 0.5
+"""Standard deviation of log depth within a scene."""
 LEAST_GAP, TURN_PX, TURN_SHARE = 3.0, 0.03, 9e-5
 """Least gain of depth over a turn alone in explaining the flow: in units of the flow's noise, and
 in pixels, or as a share of the longer side of a small image. Scenes before a camera at rest gain up
@@ -46,12 +45,7 @@ def reference_noise(residual: Float) -> float:
     return float(np.median(residual) * np.sqrt(len(residual) / REFERENCE))
 
 
-def systematic_error(noise: float) -> float:
-    """Error, pixels, that large parts of a flow may have in common."""
-    return float(np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX))
-
-
-def turn_alone(flow: FlowFit, choice: Choice) -> Float | None:
+def turn_alone(flow: FlowFit, choice: Labelling) -> Float | None:
     """The camera's (3, 3) rotation, if a turn explains the flow of the main motion without depth.
 
     It does if the main rigid motion, with depths, lowers the error by no more than `LEAST_GAP`
@@ -262,9 +256,9 @@ def torn(flow: FlowFit, surface: Int, bends: Mask) -> Mask:
     return out
 
 
-NOISES = 0.4
-"""Median excess of the error up to which a surface is rigid, beside the systematic error, in units
-of the noise."""
+NOISES, LEAST_EXCESS = 1.7, 0.09
+"""Median excess of the error, in units of the noise and at least in pixels, from which a surface
+may bend."""
 LEAST_LEFT = 15
 """Least number of superpixels of a piece split from a rigid surface: large ones mix flows."""
 SURELY = 0.5
@@ -275,9 +269,11 @@ so that pieces it does not explain are no errors of the flow."""
 def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     """The best rigid motion of each surface (N,) that does not bend, and which surfaces bend.
 
-    A surface bends if under every rigid motion the median excess of its superpixels' error over the
-    residual of an affine flow of their own is above the flow's systematic error plus `NOISES` times
-    its noise. Pieces that the best motion does not explain are surfaces of their own if they have
+    A surface bends if the best rigid motion leaves a median excess over the residual of affine
+    flows that noise does not explain, or that tells nothing of depth: an error shared along the
+    epipolar lines, `SHARED` times as large, would cause as much relief as depth itself does, with
+    the deviation `RELIEF` of log depth. What depth explains is the excess of a turn alone.
+    Pieces that the best motion does not explain are surfaces of their own if they have
     `LEAST_SHARE`, and `LEAST_LEFT` superpixels: where the flow jumps little along its outline, a
     bending surface is joined to its surroundings.
 
@@ -287,7 +283,6 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     """
     seg, views, usable = flow.seg, flow.views, flow.views.usable
     noise = reference_noise(flow.residual)
-    most = systematic_error(noise) + NOISES * noise
     motions = dominant(flow)
     label = np.argmin(views.fit(motions).penalised(), axis=1)
     whole = ~seg.across(surface)
@@ -298,7 +293,7 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
         members = left.pop()
         at = members[usable[members]]
         present = [motions[c] for c in np.unique(label[at])]
-        tried = candidates(flow, at, motions[0], present, noise)
+        tried = candidates(flow, at, motions[0], present, max(noise, LEAST_SCALE))
         # RANSAC has an inlier distance, within which a compromise with the bending part has more
         # inliers than the motion of the least median error
         matches, median = views.subset(at).matches(FIT_PIXELS), []
@@ -306,6 +301,8 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
             median = [refine_near(motion, matches, max(noise, LEAST_SCALE))]
         excess = views.subset(at).fit(tried + median).cost - flow.residual[at, None]
         middle = np.median(excess, axis=0)
+        gain = np.median(fit_turn(views.subset(at), ANY_TURN)[1] - flow.residual[at])
+        most = max(LEAST_EXCESS, min(RELIEF / SHARED * gain, NOISES * noise))
         # where many motions explain half of a surface badly, the one of least median is chance
         chance = (np.arange(len(middle)) >= len(tried)) & (middle > SURELY * most)
         best = int(np.argmin(np.where(chance, np.inf, middle)))

@@ -26,8 +26,8 @@ LEVEL = 0.92
 ON, BELOW = 0.05, 0.2
 """Relative differences of inverse depth: up to the first a superpixel lies on the ground, from the
 second on it lies below."""
-LEAST_ON, MOST_BELOW = 0.05, 0.05
-"""Of the area with known depth, the least share on the ground and the largest share below it."""
+LEAST_ON = 0.05
+"""Least share on the ground of the area with known depth; not more may lie below it."""
 STANDS = 0.1
 """Log ratio to the depth of the ground up to which a superpixel lies on it, and up to which a
 region stands on it. Regions with the right depth have at most 0.16."""
@@ -78,28 +78,27 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
     plane_mu = ray @ best
     below = (plane_mu > 0) & (mu < (1 - BELOW) * plane_mu)
     total, area_on = weight[at].sum(), weight[at][on(best)].sum()
-    if area_on < LEAST_ON * total or weight[reliable & below].sum() > MOST_BELOW * total:
+    if area_on < LEAST_ON * total or weight[reliable & below].sum() > area_on:
         return none
     return np.maximum(plane_mu, 0.0)
 
 
-def on_ground(flow: FlowFit, soup: Soup, reliable: Mask, component: Int) -> Soup:
-    """The soup without unreliable or independently moving superpixels below the ground.
+def on_ground(flow: FlowFit, soup: Soup, floor: Float, component: Int) -> tuple[Soup, Mask]:
+    """The soup with everything below the ground lifted to it, and (N,) True where that is.
 
-    They are lifted to it. Those of the scene keep the translation they share.
+    Superpixels of the scene keep the translation they share: the flow there is wrong.
 
     Args:
         flow: The flow of every superpixel.
         soup: Start, its components scaled.
-        reliable: (N,) True where the depth is reliable.
+        floor: (N,) inverse depth of the ground, see `ground`.
         component: (N,) group that moves as one.
     """
     mu, scene = 1 / soup.depth_at(flow.views.anchor), component == SCENE
-    floor = ground(flow, mu, reliable & scene)
-    lifted = (mu < (1 - BELOW) * floor) & ~(reliable & scene)
+    lifted = mu < (1 - BELOW) * floor
     factor = np.where(lifted, mu / np.maximum(floor, 1e-12), 1.0)
     t = np.where((lifted & scene)[:, None], soup.t / factor[:, None], soup.t)
-    return replace(soup, lam=soup.lam * factor, t=t)
+    return replace(soup, lam=soup.lam * factor, t=t), lifted
 
 
 def off_ground(flow: FlowFit, soup: Soup, component: Int, reliable: Mask) -> Float:

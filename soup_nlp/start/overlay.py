@@ -8,8 +8,8 @@ explains that. The flow of a fixed region contradicts every depth.
 import numpy as np
 
 from soup_nlp.arrays import Float, Mask
-from soup_nlp.start.choice import PIECE_SIZE, dominant
 from soup_nlp.start.components import connected_labels
+from soup_nlp.start.labelling import PIECE_SIZE, dominant
 from soup_nlp.start.views import FlowFit
 
 STILL_PX = 1.0

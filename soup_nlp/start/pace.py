@@ -1,56 +1,14 @@
-"""Components that their scales by contact make too fast come nearer.
-
-What hangs in the air covers a surface behind it and touches nothing in front of it.
-"""
-
-from dataclasses import replace
+"""How far components move, and the order of those that contact would make too fast."""
 
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import FIXED, SCENE, TOO_FAST
+from soup_nlp.start.components import SCENE, TOO_FAST
 from soup_nlp.start.views import FlowFit
 
-UNKNOWN = np.log(100.0)
-"""If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
-PACE, UNCARRIED = 0.7, 0.2
-"""Standard deviation of the log displacement of components that stand on what is below them,
-relative to the scene, and share of the components that do not: they hang in the air."""
 LEAST_DISPLACEMENT = 1e-12
 """Displacements count as at least this, so that their ratio is finite."""
-
-
-def nearer_where_fast(flow: FlowFit, soup: Soup, label: Int, tie: Int) -> tuple[Soup, Int]:
-    """The soup and ties (N,) with components nearer that their scales make too fast.
-
-    Contact places what hangs in the air on the surface behind it, too far, so that it moves too far
-    as well. Its depth is then between that by contact and that at
-    which it moves as far as the scene. The probability q that contact is wrong follows from the log
-    pace x (`log_pace`), which is normal where contact is right and uniform up to `UNKNOWN` where it
-    is wrong:
-
-        q = UNCARRIED / UNKNOWN / (UNCARRIED / UNKNOWN + (1 - UNCARRIED) N(x; 0, PACE^2))
-
-    The median of the log factor is 0 for q up to 1/2, and
-    x (q - 1/2) / q beyond. Beyond `UNKNOWN` the camera is taken to be at rest.
-
-    Args:
-        flow: The flow of every superpixel.
-        soup: Start, its components scaled.
-        label: (N,) index of the component.
-        tie: (N,) origin of its scale, an index of `TIES`.
-    """
-    pace = log_pace(displacement(soup, flow.views.anchor, label), label)[label]
-    right = np.exp(-0.5 * (pace / PACE) ** 2) / (PACE * np.sqrt(2 * np.pi))
-    wrong = UNCARRIED / UNKNOWN
-    too_fast = wrong > (1 - UNCARRIED) * right
-    q = wrong / (wrong + (1 - UNCARRIED) * right)
-    placed = np.isin(tie, (FIXED, TOO_FAST)) | (label == SCENE)
-    may = (pace > 0) & (pace < UNKNOWN) & ~placed
-    nearer = np.where(may, np.maximum(q - 0.5, 0.0) / q * pace, 0.0)
-    tie = np.where(may & too_fast, TOO_FAST, tie)
-    return replace(soup, lam=soup.lam * np.exp(-nearer)), tie
 
 
 def order_in_front(flow: FlowFit, soup: Soup, label: Int, tie: Int) -> Float | None:

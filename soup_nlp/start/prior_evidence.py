@@ -21,9 +21,9 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start.bending import displaced, fit_robustly, trimmed_mean
-from soup_nlp.start.choice import CLIP
 from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.labelling import CLIP
 from soup_nlp.start.propose import Start
 from soup_nlp.start.settle import RELIEF, common_error, most_probable
 from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit

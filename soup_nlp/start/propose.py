@@ -15,21 +15,20 @@ from soup_nlp.start.bending import (
     torn,
     turn_alone,
 )
-from soup_nlp.start.choice import CLIP, LEAST_NOISE, Choice, limited_noise, rigid_choice
 from soup_nlp.start.components import (
     SCENE,
-    borrow,
     connected_labels,
     connected_pieces,
-    contact_scales,
     numbered,
 )
+from soup_nlp.start.continuation import continued
 from soup_nlp.start.epipolar import Motion, stacked
-from soup_nlp.start.ground import on_ground
+from soup_nlp.start.ground import ground, on_ground
 from soup_nlp.start.homographies import unorganised
-from soup_nlp.start.merge import SMALL, earned, gather, unexplained, unmoved
+from soup_nlp.start.labelling import LEAST_NOISE, Labelling, labelled, limited_noise
 from soup_nlp.start.overlay import fixed_to_camera
-from soup_nlp.start.pace import nearer_where_fast, order_in_front
+from soup_nlp.start.pace import order_in_front
+from soup_nlp.start.scales import scaled
 from soup_nlp.start.settle import settle
 from soup_nlp.start.views import LEAST_PARALLAX_PX, USABLE, FlowFit, Views
 
@@ -146,7 +145,7 @@ def propose(flow: FlowFit) -> Start:
     jumping = torn(flow, surface, bends)
     # the flow of bending regions is no evidence of the motions of rigid ones
     rigid = flow.without(bends)
-    choice = None if bends.all() else gather(rigid, rigid_choice(rigid, motions))
+    choice = None if bends.all() else labelled(rigid, motions)
     turn = None if choice is None else turn_alone(rigid, choice)
     if choice is None or turn is not None:
         soup, error = constant_depth(flow.views, turn)
@@ -157,8 +156,8 @@ def propose(flow: FlowFit) -> Start:
         return start if turn is None else replace(start, at_rest=True, part=parts_at_rest(flow))
     if not bends.any():
         surface = connected_labels(flow.jump < o.discontinuity_px, seg)
-    choice, wrong = earned(rigid, choice)
     choice = settle(rigid, choice)
+    wrong = choice.unexplained & rigid.views.usable
     soup, weak = _with_depth(rigid, choice, wrong)
     label = component = choice.label
     error, parallax = choice.fit.cost[:, 0], choice.parallax
@@ -175,12 +174,11 @@ def propose(flow: FlowFit) -> Start:
     # the scene is the largest component
     scene = np.argmax(np.bincount(component, ~fixed))
     component = numbered(np.where(component == scene, -1, component))
-    scale, tie = contact_scales(flow, soup, component, fixed)
-    soup = replace(soup, lam=soup.lam * scale)
-    soup, tie = nearer_where_fast(flow, soup, component, tie)
-    soup = on_ground(flow, soup, reliable, component)
+    floor = ground(flow, 1 / soup.depth_at(views.anchor), reliable & (component == SCENE))
+    scale, tie = scaled(flow, soup, component, fixed, floor)
+    soup, lifted = on_ground(flow, replace(soup, lam=soup.lam * scale), floor, component)
+    weak, wrong = weak | lifted, wrong | lifted
     noise = limited_noise(error[~bends])
-    mixed = unmoved(flow, choice, component) & ~(fixed | bends)
     return Start(
         soup=soup.normalised(),
         error=error,
@@ -188,35 +186,40 @@ def propose(flow: FlowFit) -> Start:
         borrowed=weak,
         motion=label,
         component=component,
-        part=moving_parts(rigid, np.where(mixed, SCENE, component), fixed | bends),
+        part=component,
         motions=choice.motions,
         surface=surface,
         tie=tie,
         bends=bends,
-        unexplained=jumping | unexplained(rigid, error, component, noise),
+        unexplained=jumping | wrong & ~bends,
         wrong=wrong & ~bends,
         noise=noise,
         order=order_in_front(flow, soup, component, tie),
     )
 
 
-def _with_depth(flow: FlowFit, choice: Choice, wrong: Mask) -> tuple[Soup, Mask]:
+def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Mask]:
     """Planes under the chosen motions, and (N,) True where they are borrowed from neighbours.
 
     Where the motion does not explain the flow, `wrong` (N,) is True.
     """
     fit, parallax, views = choice.fit, choice.parallax, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
-    weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | (fit.cost[:, 0] > CLIP) | flow.poor | wrong
+    weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | flow.poor | wrong
     if weak.all():
         # no depth is known: all depths are one, with translations that move the image as before
         length = np.where(mu > 0, mu, 0.0)
         mu, slope = np.ones(len(mu)), np.zeros((len(mu), 2))
     else:
         length = np.ones(len(mu))
-        mu, slope = borrow(mu, slope, choice.label, weak, flow.seg)
+        mu = continued(flow.seg, mu, choice.label, ~weak)
+        slope = np.where(weak[:, None], 0.0, slope)
     R, t = stacked(choice.motions)
     return views.soup(mu, slope, R[choice.label], t[choice.label] * length[:, None]), weak
+
+
+SMALL = 0.008
+"""Largest share of the superpixels of a piece that may be a mixture of the flows around it."""
 
 
 def parts_at_rest(flow: FlowFit) -> Int:
@@ -233,19 +236,3 @@ def _usable(flow: FlowFit, piece: Int) -> Mask:
     """(N,) True in pieces (N,) whose flow has a mean confidence of at least `USABLE`."""
     total = np.bincount(piece, flow.views.weight.mean(axis=1))
     return (total / np.maximum(np.bincount(piece), 1) >= USABLE)[piece]
-
-
-def moving_parts(flow: FlowFit, component: Int, kept: Mask) -> Int:
-    """(N,) component of every superpixel, the scene in pieces without usable flow.
-
-    A part that leaves the image or is hidden has the same wrong flow over several superpixels. As a
-    component of its own it gets a better depth than from its neighbours, but it need not move.
-    Beside a piece that does move it is taken to be part of that piece. Components that are `kept`
-    (N,) stay.
-    """
-    across = flow.seg.across(component)
-    piece = connected_labels(~across, flow.seg)
-    moves = kept | ((component != SCENE) & _usable(flow, piece))
-    ends = flow.seg.pairs[across]
-    beside = np.isin(piece, piece[ends[moves[ends[:, ::-1]]]])
-    return np.where(moves | beside, component, SCENE)

@@ -12,19 +12,18 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float
-from soup_nlp.start.choice import PIECE_SIZE, Choice, limited_noise
+from soup_nlp.start.bending import RELIEF
 from soup_nlp.start.epipolar import STEPS, Matches, Motion, around, triangulate
+from soup_nlp.start.labelling import PIECE_SIZE, SHARED, Labelling
 from soup_nlp.start.views import FlowFit
 
 SYSTEMATIC, MOST_SYSTEMATIC_PX = 1.5, 0.15
 """Error of the flow that is the same over large parts of the image, in units of its noise, and its
 limit in pixels: more noise than that averages out."""
-RELIEF = 0.5
-"""Standard deviation of log depth within a scene."""
 MOST_RELIEF = 3.0
 """Limit of a log depth relative to the median: points at infinity or behind the camera."""
 EXACT_PX = 0.005
-"""Median error of rigid motions below which the flow is exact and leaves no motion open, pixels."""
+"""Shared error below which the flow is exact and leaves no motion open, pixels."""
 CHANGE = np.array([0.01] * 3 + [0.1] * 2)
 """Usual change of rotation (radians) and direction of the translation."""
 CLIP_PX = 0.3
@@ -36,17 +35,21 @@ def common_error(noise: float) -> float:
     return min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX)
 
 
-def settle(flow: FlowFit, choice: Choice) -> Choice:
-    """The choice with the most probable motion of every rigid component."""
-    views, usable, motions = flow.views, flow.views.usable, list(choice.motions)
-    if not usable.any() or np.median(choice.error[usable]) < EXACT_PX:
-        return choice
-    error = common_error(limited_noise(flow.residual))
+def settle(flow: FlowFit, choice: Labelling) -> Labelling:
+    """The labelling with the most probable motion of every rigid component.
+
+    The error that the flow of a component shares follows from what its motion leaves unexplained,
+    across the epipolar lines: along them, depth would explain it.
+    """
+    motions = list(choice.motions)
     for c, motion in enumerate(motions):
-        at = np.flatnonzero((choice.label == c) & usable)
-        if len(at) >= PIECE_SIZE:
+        at = np.flatnonzero((choice.label == c) & flow.views.usable)
+        if len(at) < PIECE_SIZE:
+            continue
+        error = SHARED * float(np.median(choice.excess[at]))
+        if error > EXACT_PX:
             motions[c] = most_probable([motion], flow.anchor_matches(at), error)
-    return Choice.of(views, motions, choice.label, choice.noise)
+    return Labelling.of(flow, motions, choice.label, choice.shared)
 
 
 def most_probable(

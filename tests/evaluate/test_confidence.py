@@ -36,9 +36,9 @@ from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.selected_inverse import BlockCholesky, layers
-from soup_nlp.start.choice import LEAST_NOISE
 from soup_nlp.start.components import TIES
 from soup_nlp.start.ground import STANDS
+from soup_nlp.start.labelling import LEAST_NOISE
 
 FORM = Formulation()
 

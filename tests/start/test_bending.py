@@ -33,8 +33,7 @@ from soup_nlp.start.bending import (
     torn,
     turn_alone,
 )
-from soup_nlp.start.choice import LEAST_NOISE, dominant, rigid_choice
-from soup_nlp.start.merge import gather
+from soup_nlp.start.labelling import LEAST_NOISE, dominant
 from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow

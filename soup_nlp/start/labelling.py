@@ -1,0 +1,240 @@
+"""One labelling: every superpixel takes one of few rigid motions, each at a price.
+
+The labels l minimise, with TRW-S, the energy
+
+    sum_i c_i rho(e_i(l_i)) + sum_ij w_ij [l_i != l_j] + PRICE * (number of motions that are used)
+    rho(e) = min(max(e / s - 1, 0), MOST)
+
+where e is the error that a motion leaves beyond that of an affine flow, c the confidence of the
+flow, and w the price of a change of motion where the flow is continuous. Large parts of a dense
+flow share an error s. It is no evidence of another motion, however many superpixels have it, so
+that errors up to s cost nothing.
+
+Motions are proposed from the whole image, around single superpixels and for pieces that no motion
+explains. Those that do not pay are removed, and the others are fitted to their superpixels, as in
+PEARL (H. Isack, Y. Boykov, IJCV 97, 2012) and Progressive-X (D. Barath, J. Matas, ICCV 2019).
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.geometry.plane import PlaneFit
+from soup_nlp.mrf.trws import solve_trws
+from soup_nlp.start.components import connected_labels, connected_pieces
+from soup_nlp.start.continuation import belonging
+from soup_nlp.start.epipolar import (
+    SIDEWAYS,
+    Motion,
+    essential_motion,
+    estimate,
+    fit_translation,
+    refine_near,
+    repeated,
+)
+from soup_nlp.start.views import FlowFit
+
+CLIP = 3.0
+"""Errors are clipped at this many pixels where motions are compared."""
+LEAST_NOISE, MOST_NOISE = 0.05, 0.6
+"""Limits of the flow's noise, pixels."""
+SHARED, LEAST_SHARED = 3.0, 0.03
+"""Error that the flow shares, in units of the median error under the best motions, and its least,
+pixels."""
+MOST, CHANGE, PRICE = 8.0, 6.0, 15.0
+"""Largest cost of a superpixel, cost of one that differs from all its neighbours, and price of a
+motion, which must explain about `PIECE_SIZE` superpixels that no other motion explains."""
+DOMINANT, LOCAL, PIECES, ROUNDS = 5, 12, 6, 3
+"""Largest numbers of proposals from the whole image, around superpixels and for pieces that no
+motion explains, and of rounds of proposals."""
+PIECE_SIZE = 4
+"""Least number of superpixels that determine a motion."""
+UNEXPLAINED = 0.25
+"""Share of `MOST` from which on a motion does not explain a superpixel."""
+PIXELS = 1500
+"""Largest number of pixels to which a motion is fitted."""
+
+
+def limited_noise(error: Float) -> float:
+    """Noise of the flow, pixels: the median of the superpixels' errors (N,), within limits."""
+    return float(np.clip(np.median(error), LEAST_NOISE, MOST_NOISE))
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """Motion and plane of every superpixel.
+
+    Attributes:
+        motions: Motions, the most frequent first.
+        label: (N,) index of the motion of every superpixel.
+        fit: Planes (N, 1) under these motions.
+        excess: (N,) error beyond that of an affine flow, pixels.
+        shared: Error that large parts of the flow share, pixels.
+    """
+
+    motions: list[Motion]
+    label: Int
+    fit: PlaneFit
+    excess: Float
+    shared: float
+
+    @classmethod
+    def of(cls, flow: FlowFit, motions: list[Motion], label: Int, shared: float) -> Self:
+        """Motions by indices (N,), which are numbered by frequency, and their planes."""
+        used, inverse, count = np.unique(label, return_inverse=True, return_counts=True)
+        order = np.argsort(-count, kind="stable")
+        motions, label = [motions[c] for c in used[order]], np.argsort(order)[inverse.ravel()]
+        fit = flow.views.fit(motions, label)
+        excess = np.maximum(fit.penalised()[:, 0] - flow.residual, 0.0)
+        return cls(motions, label, fit, excess, shared)
+
+    @property
+    def parallax(self) -> Float:
+        """(N,) pixels that each translation moves the anchor."""
+        return self.fit.parallax[:, 0] * np.abs(self.fit.inverse_depth[:, 0])
+
+    @property
+    def unexplained(self) -> Mask:
+        """(N,) True where the motion does not explain the flow."""
+        return _price(self.excess, self.shared) > UNEXPLAINED * MOST
+
+
+def labelled(flow: FlowFit, motions: list[Motion]) -> Labelling:
+    """The labelling of least energy among the given motions and those that are proposed here.
+
+    Superpixels without usable flow take the motion of the surface that they continue.
+    """
+    views, seen = flow.views, flow.views.usable & ~flow.poor
+    if not seen.any():
+        return Labelling.of(flow, motions[:1], np.zeros(len(flow.seg), np.int64), LEAST_SHARED)
+    noise = limited_noise(flow.residual[seen])
+    motions = motions + _around(flow, seen, noise)
+    for left in reversed(range(ROUNDS + 1)):
+        error = views.fit(motions).penalised() - flow.residual[:, None]
+        excess = np.maximum(error, 0.0)
+        shared = max(LEAST_SHARED, SHARED * float(np.median(excess.min(axis=1)[seen])))
+        cost = views.weight.mean(axis=1)[:, None] * _price(excess, shared)
+        used, label = _paying(flow, cost)
+        if left:
+            bad = seen & (cost[np.arange(len(cost)), np.array(used)[label]] > UNEXPLAINED * MOST)
+            kept = [motions[c] for c in used]
+            motions = _refitted(flow, kept, label, seen, bad, shared / SHARED)
+    label = _earned(flow, cost[:, used], label)
+    label = belonging(flow.seg, label, seen)
+    return Labelling.of(flow, [motions[c] for c in used], label, shared)
+
+
+def _price(excess: Float, shared: float) -> Float:
+    return np.clip(excess / shared - 1.0, 0.0, MOST)
+
+
+def dominant(flow: FlowFit) -> list[Motion]:
+    """Motions that many pixels share, the most frequent first; at least one."""
+    seed = flow.options.seed
+    matches = flow.views.matches()
+    good = np.flatnonzero(matches.weight > 0.3 * matches.weight.max())
+    rng = np.random.default_rng(seed)
+    pick = good if len(good) <= 6000 else rng.choice(good, 6000, replace=False)
+    motions = repeated(matches.at(pick), DOMINANT, flow.options.threshold_px, seed)
+    return motions or [SIDEWAYS]
+
+
+def _around(flow: FlowFit, seen: Mask, noise: float) -> list[Motion]:
+    """Motions of the neighbourhoods of a few superpixels."""
+    seed, at = flow.options.seed, np.flatnonzero(seen)
+    chosen = np.random.default_rng(seed).choice(at, min(len(at), LOCAL), replace=False)
+    near = (flow.views.subset(np.append(i, flow.seg.knn[i])).matches(PIXELS) for i in chosen)
+    found = ((essential_motion(m, max(3 * noise, 0.3), seed), m) for m in near)
+    return [refine_near(motion, m, noise) for motion, m in found if motion is not None]
+
+
+def candidates(
+    flow: FlowFit, at: Int, main: Motion, present: list[Motion], scale: float
+) -> list[Motion]:
+    """Candidate motions for superpixels `at`: the present ones refined, a translation with the
+    rotation of the main motion, also refined, and the motion of their own essential matrix.
+
+    `scale` is the error of the flow across epipolar lines, pixels.
+    """
+    noise = limited_noise(flow.residual[at])
+    matches = flow.views.subset(at).matches(PIXELS)
+    shift = fit_translation(main.R, matches, max(noise, 0.1))
+    own = estimate(matches, max(3 * noise, 0.3), flow.options.seed)
+    refined = [refine_near(m, matches, scale) for m in (*present, shift)]
+    return [*refined, shift, *([] if own is None else [own])]
+
+
+def _refitted(
+    flow: FlowFit, motions: list[Motion], label: Int, seen: Mask, bad: Mask, scale: float
+) -> list[Motion]:
+    """Motions with candidates for the superpixels of each, and for pieces that none explains."""
+    main = motions[int(np.argmax(np.bincount(label[seen], minlength=len(motions))))]
+    piece = connected_pieces(bad, flow.seg)
+    sizes = np.bincount(piece[bad], minlength=1)
+    groups = [np.flatnonzero((label == c) & seen) for c in range(len(motions))]
+    present: list[list[Motion]] = [[m] for m in motions]
+    for c in np.argsort(-sizes)[:PIECES]:
+        groups.append(np.flatnonzero(piece == c))
+        present.append([])
+    out = list(motions)
+    for at, own in zip(groups, present):
+        if len(at) >= PIECE_SIZE:
+            out += candidates(flow, at, main, own, scale)
+    return out
+
+
+def _paying(flow: FlowFit, cost: Float) -> tuple[list[int], Int]:
+    """Columns of the costs (N, M) that pay their price, and (N,) the index among them of each.
+
+    Motions are first added greedily while costs alone pay for them. Then that which saves least
+    over the second best ones is removed, until all pay.
+    """
+    used = [int(np.argmin(cost.sum(axis=0)))]
+    while True:
+        best = cost[:, used].min(axis=1, keepdims=True)
+        saved = np.maximum(best - cost, 0.0).sum(axis=0)
+        if saved.max() < PRICE:
+            break
+        used.append(int(np.argmax(saved)))
+    while True:
+        mine = cost[:, used]
+        label = smooth(flow, mine)
+        if len(used) == 1:
+            return used, label
+        rows = np.arange(len(mine))
+        others = mine.copy()
+        others[rows, label] = np.inf
+        saved = np.bincount(label, others.min(axis=1) - mine[rows, label], len(used))
+        if saved.min() >= PRICE:
+            return used, label
+        del used[int(np.argmin(saved))]
+
+
+def _earned(flow: FlowFit, cost: Float, label: Int) -> Int:
+    """(N,) labels, where connected pieces that save less than `PRICE` over the main one take it."""
+    main, rows = int(np.argmax(np.bincount(label))), np.arange(len(label))
+    piece = connected_labels(~flow.seg.across(label), flow.seg)
+    saved = np.bincount(piece, cost[:, main] - cost[rows, label])
+    return np.where(saved[piece] < PRICE, main, label)
+
+
+def smooth(flow: FlowFit, cost: Float) -> Int:
+    """(N,) labels that minimise costs (N, M) plus `CHANGE` where neighbours differ, by TRW-S.
+
+    The weight of a neighbour is its share of the outlines times its affinity.
+    """
+    (n, m), seg = cost.shape, flow.seg
+    if m == 1 or not len(seg.pairs):
+        return np.argmin(cost, axis=1)
+    i, k = seg.pairs.T
+    length = seg.boundary_length.astype(float)
+    outline = np.bincount(i, length, n) + np.bincount(k, length, n)
+    weight = CHANGE * flow_affinity(flow) * length * (1 / outline[i] + 1 / outline[k])
+    return solve_trws(cost, seg.pairs, weight[:, None, None] * (1 - np.eye(m)), max_iter=30).labels
+
+
+def flow_affinity(flow: FlowFit) -> Float:
+    """(P,) affinity of two neighbours: 1 where their flow is continuous, towards 0 at jumps."""
+    return np.exp(-2 * flow.jump / flow.options.discontinuity_px)

@@ -1,0 +1,152 @@
+"""One problem of scales: the log scales of all components are the minimum of one linear program.
+
+Each rigid component has a scale that its flow does not tell. With z the depths of both sides of a
+pair of neighbours and x the log scales, the program adds up
+
+* contact: the pinball loss of `x_a - x_b - log(z_b / z_a)` over the outline of a component, with
+  the quantile `STANDS` below it, where it stands, and `HIDES` elsewhere, where it hides what is
+  behind it;
+* pace: what a component moves farther than the scene, and a little of what it moves less;
+* ground: how far a component reaches below the ground of the scene;
+* order: how far a component in front is from being nearer by `STEP`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.optimize import linprog
+
+from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.components import FIXED, SCENE, TIES, outlines
+from soup_nlp.start.pace import displacement, log_pace
+from soup_nlp.start.views import FlowFit
+
+STANDS, HIDES = 0.4, 0.2
+"""Quantiles of the depth ratios along the outline of a component, below it and elsewhere."""
+BELOW_WEIGHT = 3.0
+"""Weight of the contact below a component, relative to the rest of its outline."""
+FASTER, SLOWER = 0.8, 0.05
+"""Price of a log unit by which a component moves farther or less far than the scene."""
+FREE = 1.0
+"""Log units by which a component that stands on something may move farther than the scene."""
+UNDER = 2.0
+"""Price of a log unit by which a component lies below the ground."""
+ORDER, STEP = 2.0, 0.35
+"""Price of a log unit by which the step along an outline falls short, and the step: a guess; true
+steps along such outlines have medians of 0.2 to 1.9."""
+UNKNOWN = np.log(100.0)
+"""If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
+MOST = 6.0
+"""Largest log scale."""
+
+
+class Rows(NamedTuple):
+    """Rows `w_up max(r, 0) + w_down max(-r, 0)`, r = x_a - x_b - value, of a kind of `TIES`."""
+
+    a: Int
+    b: Int
+    value: Float
+    up: Float
+    down: Float
+    tie: Int
+
+
+def rows(a: Int, b: Int, value: Float, up: Float, down: Float, tie: str) -> Rows:
+    """Rows of one kind; weights may be numbers."""
+    wide = (np.broadcast_to(v, len(a)) for v in (up, down, TIES.index(tie)))
+    return Rows(a, np.broadcast_to(b, len(a)), value, *wide)
+
+
+def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
+    """(C,) log scales of least cost, those `still` at 0, and (C,) the kind of row behind each.
+
+    A row decides if it is exact at the minimum; among several the one of the largest weight.
+    """
+    r = Rows(*(np.concatenate(v) for v in zip(*parts)))
+    m, each = len(r.a), np.arange(len(r.a))
+    one = np.ones(m)
+    columns = np.concatenate([r.a, r.b, count + each, count + m + each])
+    A = sparse.coo_matrix(
+        (np.concatenate([one, -one, -one, one]), (np.tile(each, 4), columns)), (m, count + 2 * m)
+    )
+    bounds = np.tile([-MOST, MOST], (count, 1))
+    bounds[still] = 0.0
+    slack = np.tile([0.0, np.inf], (2 * m, 1))
+    cost = np.concatenate([np.zeros(count), r.up, r.down])
+    x = linprog(cost, A_eq=A.tocsr(), b_eq=r.value, bounds=np.vstack([bounds, slack])).x[:count]
+    exact = np.abs(x[r.a] - x[r.b] - r.value) < 1e-7
+    tie = np.full(count, TIES.index("nothing"))
+    for end in (r.a, r.b):
+        for row in np.flatnonzero(exact)[np.argsort((r.up + r.down)[exact], kind="stable")]:
+            tie[end[row]] = r.tie[row]
+    tie[still] = TIES.index("reference")
+    return x, tie
+
+
+def supported(flow: FlowFit, label: Int) -> Float:
+    """(C,) share of the lower end of every component (N,) where what it stands on is visible.
+
+    It is not where the lower image border cuts the component off, nor beside superpixels without
+    usable flow, which may belong to it.
+    """
+    around, count = outlines(label, flow.seg), int(label.max()) + 1
+    usable = flow.views.usable[around.neighbour]
+    seen, hidden = (
+        np.bincount(around.component[at], around.contact[at], count)
+        for at in (around.below & usable, around.below & ~usable)
+    )
+    cut_off = np.bincount(label[flow.seg.labels[-1]], minlength=count)
+    return np.asarray(seen / np.maximum(seen + hidden + cut_off, 1.0))
+
+
+def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask, support: Float) -> list[Rows]:
+    """Rows of contact between components (N,); none stands on one that is fixed (N,)."""
+    seg = flow.seg
+    across = seg.across(label)
+    zi, zk = soup.depth_across(seg.pairs[across], flow.middle[across])
+    ratio = np.log(np.concatenate([zk / zi, zi / zk]))
+    around = outlines(label, seg)
+    count = int(label.max()) + 1
+    out = []
+    for below in (True, False):
+        mine = (around.below & flow.options.upright) == below
+        mine &= (around.component != SCENE) & ~fixed[around.neighbour]
+        a, b, length = around.component[mine], around.other[mine], around.contact[mine]
+        weight = length / np.bincount(a, length, count)[a]
+        weight = weight * (BELOW_WEIGHT * support[a] if below else 1.0)
+        share, tie = (STANDS, "contact below") if below else (HIDES, "outline")
+        out.append(rows(a, b, ratio[mine], weight * (1 - share), weight * share, tie))
+    return out
+
+
+def pace(flow: FlowFit, soup: Soup, label: Int, support: Float) -> Rows:
+    """Rows of the displacement of components (N,)."""
+    far = log_pace(displacement(soup, flow.views.anchor, label), label)
+    c = np.flatnonzero((np.abs(far) < UNKNOWN) & (np.arange(len(far)) != SCENE))
+    usual = FREE * support[c]
+    return rows(c, np.array(SCENE), usual - far[c], FASTER, SLOWER, "too fast")
+
+
+def above(flow: FlowFit, soup: Soup, label: Int, floor: Float) -> Rows:
+    """Rows of the ground, whose inverse depth is floor (N,), 0 where there is none."""
+    mu, size = 1 / soup.depth_at(flow.views.anchor), flow.seg.sizes
+    at = np.flatnonzero((floor > 0) & (label != SCENE))
+    weight = size[at] / np.bincount(label, size)[label[at]]
+    return rows(
+        label[at], np.array(SCENE), np.log(mu[at] / floor[at]), UNDER * weight, 0.0, "ground"
+    )
+
+
+def scaled(flow: FlowFit, soup: Soup, label: Int, fixed: Mask, floor: Float) -> tuple[Float, Int]:
+    """(N,) scale of the component (N,) of every superpixel, and (N,) what decides it."""
+    count = int(label.max()) + 1
+    if count == 1 or not len(flow.seg.pairs):
+        return np.ones(len(soup)), np.full(len(soup), TIES.index("reference"))
+    support = supported(flow, label)
+    parts = contact(flow, soup, label, fixed, support)
+    parts += [pace(flow, soup, label, support), above(flow, soup, label, floor)]
+    x, tie = minimum(count, parts, np.array([SCENE]))
+    tie = np.where(fixed, FIXED, tie[label])
+    return np.exp(x)[label], tie
