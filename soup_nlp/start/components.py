@@ -41,6 +41,7 @@ TIES = (
     "contact below",
     "outline",
     "nothing",
+    "ground",
     "fixed in the image",
     "given depth",
     "occlusion",
@@ -48,7 +49,7 @@ TIES = (
 )
 """What gives a component its scale. reference: it is the scene and defines the scale.
 contact below: it stands on its lower neighbours. outline: it touches its neighbours. nothing: it
-has no neighbour with a scale. fixed in the image: it stands
+has no neighbour with a scale. ground: it would lie below the ground. fixed in the image: it stands
 still there, though the camera moves, and is placed by its outline. given depth: a depth prior gives
 it. occlusion: it covers its background, and is placed in front of the background by a guess. too
 fast: contact is probably wrong, because it would make the component move much farther than the

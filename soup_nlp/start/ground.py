@@ -26,8 +26,9 @@ LEVEL = 0.92
 ON, BELOW = 0.05, 0.2
 """Relative differences of inverse depth: up to the first a superpixel lies on the ground, from the
 second on it lies below."""
-LEAST_ON = 0.05
-"""Least share on the ground of the area with known depth; not more may lie below it."""
+LEAST_ON, MOST_BELOW = 0.05, 0.05
+"""Of the area with known depth, the least share on the ground and the largest share of another
+surface below it. Of wrong flow less must lie below it than on it."""
 STANDS = 0.1
 """Log ratio to the depth of the ground up to which a superpixel lies on it, and up to which a
 region stands on it. Regions with the right depth have at most 0.16."""
@@ -77,25 +78,45 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
         best = np.linalg.lstsq(ray[inliers] * root[:, None], mu[inliers] * root)[0]
     plane_mu = ray @ best
     below = (plane_mu > 0) & (mu < (1 - BELOW) * plane_mu)
-    total, area_on = weight[at].sum(), weight[at][on(best)].sum()
-    if area_on < LEAST_ON * total or weight[reliable & below].sum() > area_on:
+    total, area_on, under = weight[at].sum(), weight[at][on(best)].sum(), reliable & below
+    most = MOST_BELOW * total if _level(mu, plane_mu, under, weight) else area_on
+    if area_on < LEAST_ON * total or weight[under].sum() > most:
         return none
     return np.maximum(plane_mu, 0.0)
 
 
-def on_ground(flow: FlowFit, soup: Soup, floor: Float, component: Int) -> tuple[Soup, Mask]:
-    """The soup with everything below the ground lifted to it, and (N,) True where that is.
+def _level(mu: Float, floor: Float, under: Mask, weight: Float) -> bool:
+    """Whether most of what lies under a plane (N,) has one distance from it.
 
-    Superpixels of the scene keep the translation they share: the flow there is wrong.
+    It is then real, as the floor beside a table. Wrong flow leaves any depth.
+    """
+    if not under.any():
+        return False
+    ratio = mu[under] / floor[under]
+    near = np.abs(ratio / quantile(ratio, weight[under], 0.5) - 1) < BELOW
+    return bool(weight[under][near].sum() > 0.5 * weight[under].sum())
+
+
+def on_ground(
+    flow: FlowFit, soup: Soup, floor: Float, reliable: Mask, component: Int
+) -> tuple[Soup, Mask]:
+    """The soup with what is below the ground lifted to it, and (N,) True where that is.
+
+    Superpixels of the scene keep the translation they share: their flow is wrong. Where most of
+    what is reliable below the ground is another surface, that is kept.
 
     Args:
         flow: The flow of every superpixel.
         soup: Start, its components scaled.
         floor: (N,) inverse depth of the ground, see `ground`.
+        reliable: (N,) True where the depth is reliable.
         component: (N,) group that moves as one.
     """
     mu, scene = 1 / soup.depth_at(flow.views.anchor), component == SCENE
     lifted = mu < (1 - BELOW) * floor
+    under = lifted & reliable & scene
+    if _level(mu, floor, under, flow.seg.sizes.astype(float)):
+        lifted &= ~under
     factor = np.where(lifted, mu / np.maximum(floor, 1e-12), 1.0)
     t = np.where((lifted & scene)[:, None], soup.t / factor[:, None], soup.t)
     return replace(soup, lam=soup.lam * factor, t=t), lifted

@@ -176,7 +176,8 @@ def propose(flow: FlowFit) -> Start:
     component = numbered(np.where(component == scene, -1, component))
     floor = ground(flow, 1 / soup.depth_at(views.anchor), reliable & (component == SCENE))
     scale, tie = scaled(flow, soup, component, fixed, floor)
-    soup, lifted = on_ground(flow, replace(soup, lam=soup.lam * scale), floor, component)
+    soup = replace(soup, lam=soup.lam * scale)
+    soup, lifted = on_ground(flow, soup, floor, reliable, component)
     weak, wrong = weak | lifted, wrong | lifted
     noise = limited_noise(error[~bends])
     return Start(

@@ -53,7 +53,7 @@ class Rows(NamedTuple):
     tie: Int
 
 
-def rows(a: Int, b: Int, value: Float, up: Float, down: Float, tie: str) -> Rows:
+def rows(a: Int, b: Int, value: Float, up: Float | float, down: Float | float, tie: str) -> Rows:
     """Rows of one kind; weights may be numbers."""
     wide = (np.broadcast_to(v, len(a)) for v in (up, down, TIES.index(tie)))
     return Rows(a, np.broadcast_to(b, len(a)), value, *wide)

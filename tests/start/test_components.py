@@ -1,10 +1,10 @@
-"""Scales of components by contact; weights of the energy across components and occlusions."""
+"""Components in the energy: none gains by receding, what swings keeps off the wall."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_start import facing, flow_of, squares
+from helpers_start import facing, squares
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
@@ -14,8 +14,7 @@ from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.pipeline.run import run
-from soup_nlp.start.components import TOO_FAST, contact_scales
-from soup_nlp.start.pace import nearer_where_fast, order_in_front
+from soup_nlp.start.components import TOO_FAST
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 
@@ -47,93 +46,6 @@ def test_a_component_gains_little_by_receding(world, factor):
     assert (near <= 2 * gap * (1 + 1e-12)).all()
     receded = oracle.values("arap", away, data, weights)[across]
     assert (receded >= 2**-0.25 * gap * (1 - 1e-12)).all()
-
-
-def placed(z, component, far=0.01, **options):
-    """Flow, soup and ties of fronto-parallel squares at depths z (r, c), and their scales found.
-
-    In its own unit of length the component moves by `far` where the scene moves by 1; everything
-    else is at its true depth.
-    """
-    flow = flow_of(squares(*np.shape(z)), K=K, **options)
-    label = np.ravel(component).astype(np.int64)
-    moved = np.where(np.ravel(component), far, 1.0)[:, None] * [1.0, 0.0, 0.0]
-    soup = facing(np.ravel(z), moved)
-    scale, tie = contact_scales(flow, soup, label, np.zeros(len(soup), bool))
-    found, tie = nearer_where_fast(flow, replace(soup, lam=soup.lam * scale), label, tie)
-    return flow, found, tie, (found.lam / soup.lam).reshape(np.shape(z))
-
-
-def scales(*args, **options):
-    """Scales (r, c) that are found, see `placed`."""
-    return placed(*args, **options)[-1]
-
-
-def thrice(cells):
-    """Every entry as 3 x 3 superpixels, so that every boundary has inner neighbours."""
-    return np.repeat(np.repeat(cells, 3, axis=0), 3, axis=1)
-
-
-TOWER = [[8.0, 8, 8], [8, 1, 8], [8, 1, 8], [8, 1, 8], [2, 2, 2]]
-TOWER_OF = [[0, 0, 0], [0, 2, 0], [0, 2, 0], [0, 1, 0], [0, 0, 0]]
-CORNER = [[0, 0, 0], [0, 1, 0], [0, 0, 0]]
-CONTACTS = {
-    # a component cut off by the lower image border, without a visible support, does not wait
-    "cut off": (
-        [[8.0] * 5, [8, 1, 1, 8, 8], [8, 8, 1, 2, 2], *[[2, 2, 1, 2, 2]] * 2],
-        [[0, 0, 0, 0, 0], [0, 2, 2, 0, 0], *[[0, 0, 1, 0, 0]] * 3],
-        2.0,
-    ),
-    # the component below the arch touches nothing else: neither of them can wait
-    "arch": (
-        [[4.0] * 5, [4, 1, 1, 1, 4], [4, 1, 1, 1, 4]],
-        [[0, 0, 0, 0, 0], [0, 2, 2, 2, 0], [0, 2, 1, 2, 0]],
-        4.0,
-    ),
-    # before a wall, on the ground, half behind a near object
-    "ground": ([[1.0, 4, 4], [1, 1, 4], [1, 2.0, 2.0]], CORNER, 2.0),
-    # the lower edge of the image cuts it off: a low quantile of the depth ratios around it
-    "outline": ([[4.0, 6, 4], [3, 1, 3.5]], [[0, 0, 0], [0, 1, 0]], 3.5),
-}
-
-
-@pytest.mark.parametrize(("z", "component", "scale"), CONTACTS.values(), ids=CONTACTS)
-def test_a_component_has_the_depth_of_what_it_touches(z, component, scale):
-    component = thrice(component)
-    scale_found = scales(thrice(z), component)
-    np.testing.assert_allclose(scale_found, np.where(component > 0, scale, 1.0), rtol=1e-12)
-
-
-def test_without_a_vertical_the_longest_contact_comes_first():
-    # the vertical is not known: the tall component touches the wall first
-    component = thrice(TOWER_OF)
-    scale_found = scales(thrice(TOWER), component, upright=False)
-    np.testing.assert_allclose(scale_found[component == 2], 8.0, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("pace", "share"),
-    # the share of the log pace by which a component comes nearer that stands on the ground: none
-    # while contact is more probably right, nearly half when it is surely wrong, none at rest
-    [(-2.0, 0.0), (1.4, 0.0), (1.6, 0.115), (2.0, 0.411), (3.0, 0.499), (5.0, 0.0)],
-)
-def test_components_come_nearer_where_contact_makes_them_too_fast(pace, share):
-    component = thrice([[0, 0, 0], [0, 1, 0], [0, 0, 0]])
-    z = np.where(component == 1, 1.0, thrice([[8.0] * 3, [8.0] * 3, [2.0] * 3]))
-    flow, soup, tie, found = placed(z, component, np.exp(pace) / 2)
-    nearer = np.where(component == 1, share * pace, 0.0)
-    np.testing.assert_allclose(np.log(found), np.where(component, np.log(2), 0) - nearer, atol=0.02)
-    np.testing.assert_array_equal(tie == TOO_FAST, np.ravel(nearer > 0))
-    # what is placed in front covers everything that it touches; nothing else has an order
-    order = order_in_front(flow, soup, np.ravel(component), tie)
-    if not share:
-        assert order is None
-        return
-    ends = np.ravel(component)[flow.seg.pairs]
-    np.testing.assert_array_equal(order, ends[:, 1] - ends[:, 0])
-    # it comes nearer once
-    again = nearer_where_fast(flow, soup, np.ravel(component), tie)
-    np.testing.assert_array_equal(again[0].lam, soup.lam)
 
 
 @pytest.mark.slow

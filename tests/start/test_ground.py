@@ -40,7 +40,11 @@ def moving(Z: np.ndarray) -> Soup:
 
 
 def lift(flow, Z, reliable, component):
-    return on_ground(flow, moving(Z), reliable, component * ALL)
+    scene = component * ALL == SCENE
+    floor = ground(flow, 1 / Z, reliable & scene)
+    soup, lifted = on_ground(flow, moving(Z), floor, reliable, component * ALL)
+    np.testing.assert_array_equal(lifted, ~np.isclose(soup.depth_at(flow.views.anchor), Z))
+    return soup
 
 
 def test_unknown_depth_comes_up_to_the_road(flow):
@@ -75,6 +79,16 @@ def test_reliable_depth_stays_below(flow):
     depth = np.where(ditch, 1.5 * Z, Z)
     soup = lift(flow, depth, ALL, SCENE)
     np.testing.assert_allclose(soup.depth_at(ray), depth, rtol=1e-12)
+
+
+def test_wrong_flow_below_the_road_is_lifted(flow):
+    """Its depth is reliable, but differs from one superpixel to the next."""
+    ray, Z = flow.views.anchor, street(flow)
+    wrong = (ray[:, 1] > 0.25) & (np.abs(ray[:, 0]) < 0.2)
+    assert 0.05 < wrong.mean() < 0.2
+    far = np.random.default_rng(0).uniform(1.5, 20, len(Z))
+    soup = lift(flow, np.where(wrong, far * Z, Z), ALL, SCENE)
+    np.testing.assert_allclose(soup.depth_at(ray), Z, rtol=1e-9)
 
 
 @pytest.mark.parametrize("car", [0.8, 1.0, 2.0])

@@ -1,4 +1,4 @@
-"""The labelling: regions get one motion each, what does not pay goes, what is not seen continues."""
+"""The labelling: regions get one motion, what does not pay goes, what is not seen continues."""
 
 from dataclasses import replace
 

@@ -1,0 +1,106 @@
+"""The linear program of scales: its minimum, and what decides a scale."""
+
+import numpy as np
+import pytest
+from helpers_start import facing, flow_of, squares
+
+from soup_nlp.geometry import camera
+from soup_nlp.start.components import TIES, TOO_FAST
+from soup_nlp.start.pace import order_in_front
+from soup_nlp.start.scales import Rows, minimum, rows, scaled, supported
+
+K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
+HANGS = [[0] * 5, [0, 0, 1, 0, 0], [0] * 5, [0] * 5]
+STANDS = [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0] * 5]
+CUT_OFF = [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 0, 0]]
+
+
+def found(z, component, far=0.5, floor=0.0, **options):
+    """Log scale and tie of component 1, whose planes are at depth 1 in its own unit.
+
+    There it moves by `far` where the scene moves by 1.
+    """
+    label = np.ravel(component)
+    flow = flow_of(squares(*np.shape(component)), K=K, **options)
+    moved = np.where(label, far, 1.0)[:, None] * [1.0, 0.0, 0.0]
+    soup = facing(np.where(label == 1, 1.0, np.ravel(z)), moved)
+    none = np.zeros(len(soup), bool)
+    scale, tie = scaled(flow, soup, label, none, np.full(len(soup), floor))
+    assert (scale[label == 0] == 1).all()
+    assert (tie[label == 0] == TIES.index("reference")).all()
+    return float(np.log(scale[label == 1][0])), TIES[tie[label == 1][0]]
+
+
+def cost(x, r: Rows) -> float:
+    off = x[r.a] - x[r.b] - r.value
+    return float(np.sum(r.up * np.maximum(off, 0) + r.down * np.maximum(-off, 0)))
+
+
+def test_the_minimum_is_one():
+    rng = np.random.default_rng(0)
+    a, b = rng.integers(0, 4, (2, 40))
+    value, up, down = rng.normal(size=40), rng.random(40), rng.random(40)
+    r = rows(a, b, value, up, down, "outline")
+    x, tie = minimum(4, [r], np.array([0]))
+    assert x[0] == 0
+    assert tie[0] == TIES.index("reference")
+    assert (tie[1:] == TIES.index("outline")).all()
+    for step in (1e-3, 0.1, 1.0):
+        for _ in range(50):
+            other = x + step * rng.normal(size=4) * [0, 1, 1, 1]
+            assert cost(other, r) >= cost(x, r) - 1e-9
+
+
+def test_a_row_is_a_weighted_quantile():
+    value = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    zero, one = np.zeros(5, int), np.ones(5, int)
+    for share, expected in ((0.1, 1.0), (0.5, 3.0), (0.7, 4.0)):
+        x, _ = minimum(2, [rows(one, zero, value, 1 - share, share, "outline")], np.array([0]))
+        np.testing.assert_allclose(x[1], expected, atol=1e-9)
+
+
+def test_what_stands_on_the_ground_has_its_depth():
+    z = np.array([[8.0] * 5, [8.0] * 5, [8.0] * 5, [2.0] * 5])
+    log_scale, tie = found(z, STANDS)
+    assert tie == "contact below"
+    np.testing.assert_allclose(log_scale, np.log(2), rtol=1e-6)
+
+
+def test_what_is_before_a_wall_is_not_behind_it():
+    z = np.array([[4.0] * 5, [4.0] * 5, [4.0] * 5])
+    log_scale, tie = found(z, HANGS[:3], upright=False)
+    assert tie == "outline"
+    np.testing.assert_allclose(log_scale, np.log(4), rtol=1e-6)
+
+
+def test_where_the_lower_end_is_hidden_the_pace_of_the_scene_decides():
+    """It touches the wall, where it would move eight times as far as the scene."""
+    wall = np.full((4, 5), 8.0)
+    flow, label = flow_of(squares(4, 5), K=K), np.ravel(CUT_OFF)
+    assert supported(flow, label)[1] == 0
+    log_scale, tie = found(wall, CUT_OFF, far=1.0)
+    assert tie == "too fast"
+    np.testing.assert_allclose(log_scale, 0.0, atol=1e-6)
+    # what stands on something may be somewhat faster
+    assert supported(flow_of(squares(4, 5), K=K), np.ravel(HANGS))[1] == 1
+    log_scale, tie = found(wall, HANGS, far=1e-3)
+    assert tie == "contact below"
+    np.testing.assert_allclose(log_scale, np.log(8), rtol=1e-6)
+
+
+def test_what_is_too_fast_covers_all_that_it_touches():
+    label = np.ravel(CUT_OFF)
+    flow = flow_of(squares(4, 5), K=K)
+    soup, tie = facing(np.where(label, 1.0, 8.0), np.ones(3)), np.where(label, TOO_FAST, 0)
+    ends = label[flow.seg.pairs]
+    order = order_in_front(flow, soup, label, tie)
+    np.testing.assert_array_equal(order, ends[:, 1] - ends[:, 0])
+    assert order_in_front(flow, soup, label, 0 * tie) is None
+
+
+@pytest.mark.parametrize(("floor", "expected"), [(0.0, np.log(8)), (0.25, np.log(4))])
+def test_nothing_is_below_the_ground(floor, expected):
+    """The ground is at depth 4 everywhere, or unknown."""
+    log_scale, tie = found(np.full((4, 5), 8.0), HANGS, far=1e-3, floor=floor)
+    assert tie == ("ground" if floor else "contact below")
+    np.testing.assert_allclose(log_scale, expected, rtol=1e-6)
