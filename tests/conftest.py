@@ -80,7 +80,7 @@ def room(seed: int) -> Case:
 @pytest.fixture(scope="session")
 def small_room() -> Case:
     """A room in which something moves by itself."""
-    return room(3)
+    return room(0)
 
 
 @pytest.fixture(scope="session")

@@ -31,6 +31,7 @@ ORIGINS = {
     "contact below": ("contact", "its scale from what it stands on"),
     "outline": ("outline", "its scale from what is around it"),
     "nothing": ("free", "its scale unknown: nothing that has a scale touches it"),
+    "ground": ("contact", "lifted to the ground"),
     "fixed in the image": ("outline", "still in the image though the camera moves"),
     "given depth": ("given", "its scale from the given depth"),
     "occlusion": ("covering", "placed by a guess in front of what it covers"),

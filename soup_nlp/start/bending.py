@@ -256,9 +256,9 @@ def torn(flow: FlowFit, surface: Int, bends: Mask) -> Mask:
     return out
 
 
-NOISES, LEAST_EXCESS = 1.7, 0.09
-"""Median excess of the error, in units of the noise and at least in pixels, from which a surface
-may bend."""
+NOISES, SYSTEMATIC, LEAST_PX, MOST_PX = 1.7, 4.0, 0.01, 0.1
+"""Median excess of the error, in units of the noise, from which a surface may bend; below
+`SYSTEMATIC` noises, within these limits in pixels, it never does."""
 LEAST_LEFT = 15
 """Least number of superpixels of a piece split from a rigid surface: large ones mix flows."""
 SURELY = 0.5
@@ -302,7 +302,8 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
         excess = views.subset(at).fit(tried + median).cost - flow.residual[at, None]
         middle = np.median(excess, axis=0)
         gain = np.median(fit_turn(views.subset(at), ANY_TURN)[1] - flow.residual[at])
-        most = max(LEAST_EXCESS, min(RELIEF / SHARED * gain, NOISES * noise))
+        least = np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX)
+        most = max(float(least), min(RELIEF / SHARED * gain, NOISES * noise))
         # where many motions explain half of a surface badly, the one of least median is chance
         chance = (np.arange(len(middle)) >= len(tried)) & (middle > SURELY * most)
         best = int(np.argmin(np.where(chance, np.inf, middle)))

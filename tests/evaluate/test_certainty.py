@@ -72,6 +72,7 @@ SAID = {
     "contact below": "with the scale of a contact",
     "outline": "with the scale of an outline",
     "nothing": "without contact to anything that has a scale",
+    "ground": "with the scale of a contact",
     "fixed in the image": "with the scale of an outline",
     "given depth": "by the given depth",
     "occlusion": "in front of what it covers",

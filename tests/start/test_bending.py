@@ -104,7 +104,7 @@ def test_sheet_bends_and_can_be_told_not_to():
 
 @pytest.mark.parametrize("count", [60, 600])
 @pytest.mark.parametrize(
-    ("scene", "least", "most"), [("sheet", 0.9, 1), ("banner", 0.2, 0.4), ("street", 0, 0)]
+    ("scene", "least", "most"), [("sheet", 0.9, 1), ("banner", 0.2, 0.45), ("street", 0, 0)]
 )
 def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least, most, count):
     wide = "input.width=512", "input.height=218"
@@ -121,7 +121,7 @@ def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least,
 def test_a_rigid_room_does_not_bend_with_its_banner(seed, least):
     banner = problem("banner", f"input.seed={seed}")
     start = prepare(banner, pair=banner.load_pair()).start
-    assert least < start.bends.mean() < 0.4
+    assert least < start.bends.mean() < 0.45
 
 
 def test_a_bending_region_whose_flow_jumps_is_torn():
