@@ -57,8 +57,8 @@ class Start:
             the rigid part is small or has no parallax, or the camera is at rest, the whole image is
             one such component.
         unexplained: (N,) True where the depth is a guess because the motion leaves a large error,
-            see `merge.unexplained`, or because a region bends although its flow jumps, see `torn`.
-        wrong: (N,) True where no accepted motion (`earned`) explains the flow, which then counts as
+            or because a region bends although its flow jumps, see `torn`.
+        wrong: (N,) True where the motion does not explain the flow, which then counts as
             wrong.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Noise of the flow, pixels, see `limited_noise`.

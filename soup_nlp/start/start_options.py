@@ -15,8 +15,6 @@ class StartOptions(Section):
     """Sampled pixels per superpixel."""
     threshold_px: NonNegative = 1.0
     """Inlier distance of a motion, pixels."""
-    smoothness: NonNegative = 0.5
-    """Price of different motions of two neighbours with continuous flow, pixels."""
     bending: bool = True
     """Whether surfaces may bend; if false, everything is rigid."""
     discontinuity_px: NonNegative = 1.0
