@@ -2,7 +2,7 @@
 
 The labels l minimise, with TRW-S, the energy
 
-    sum_i c_i rho(e_i(l_i)) + sum_ij w_ij [l_i != l_j] + PRICE * (number of motions that are used)
+    sum_i c_i rho(e_i(l_i)) + sum_ij w_ij [l_i != l_j] + price * (number of motions that are used)
     rho(e) = min(max(e / s - 1, 0), MOST)
 
 where e is the error that a motion leaves beyond that of an affine flow, c the confidence of the
@@ -43,9 +43,10 @@ LEAST_NOISE, MOST_NOISE = 0.05, 0.6
 SHARED, LEAST_SHARED = 3.0, 0.03
 """Error that the flow shares, in units of the median error under the best motions, and its least,
 pixels."""
-MOST, CHANGE, PRICE = 8.0, 6.0, 15.0
-"""Largest cost of a superpixel, cost of one that differs from all its neighbours, and price of a
-motion, which must explain about `PIECE_SIZE` superpixels that no other motion explains."""
+MOST, CHANGE, PRICE = 8.0, 6.0, 0.04
+"""Largest cost of a superpixel, half the cost of one that differs from all its neighbours, and
+price of a motion by the number of superpixels: half a percent of them, if no other motion explains
+them, and at least one, pay for it."""
 DOMINANT, LOCAL, PIECES, ROUNDS = 5, 12, 6, 3
 """Largest numbers of proposals from the whole image, around superpixels and for pieces that no
 motion explains, and of rounds of proposals."""
@@ -126,6 +127,11 @@ def labelled(flow: FlowFit, motions: list[Motion]) -> Labelling:
     return Labelling.of(flow, [motions[c] for c in used], label, shared)
 
 
+def price_of_motion(count: int) -> float:
+    """Price of a motion in an image of `count` superpixels."""
+    return max(MOST, PRICE * count)
+
+
 def _price(excess: Float, shared: float) -> Float:
     return np.clip(excess / shared - 1.0, 0.0, MOST)
 
@@ -191,11 +197,11 @@ def _paying(flow: FlowFit, cost: Float) -> tuple[list[int], Int]:
     Motions are first added greedily while costs alone pay for them. Then that which saves least
     over the second best ones is removed, until all pay.
     """
-    used = [int(np.argmin(cost.sum(axis=0)))]
+    used, least = [int(np.argmin(cost.sum(axis=0)))], price_of_motion(len(cost))
     while True:
         best = cost[:, used].min(axis=1, keepdims=True)
         saved = np.maximum(best - cost, 0.0).sum(axis=0)
-        if saved.max() < PRICE:
+        if saved.max() < least:
             break
         used.append(int(np.argmax(saved)))
     while True:
@@ -207,17 +213,17 @@ def _paying(flow: FlowFit, cost: Float) -> tuple[list[int], Int]:
         others = mine.copy()
         others[rows, label] = np.inf
         saved = np.bincount(label, others.min(axis=1) - mine[rows, label], len(used))
-        if saved.min() >= PRICE:
+        if saved.min() >= least:
             return used, label
         del used[int(np.argmin(saved))]
 
 
 def _earned(flow: FlowFit, cost: Float, label: Int) -> Int:
-    """(N,) labels, where connected pieces that save less than `PRICE` over the main one take it."""
+    """(N,) labels, where connected pieces that save less than a price over the main one take it."""
     main, rows = int(np.argmax(np.bincount(label))), np.arange(len(label))
     piece = connected_labels(~flow.seg.across(label), flow.seg)
     saved = np.bincount(piece, cost[:, main] - cost[rows, label])
-    return np.where(saved[piece] < PRICE, main, label)
+    return np.where(saved[piece] < price_of_motion(len(label)), main, label)
 
 
 def smooth(flow: FlowFit, cost: Float) -> Int:

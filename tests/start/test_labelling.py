@@ -13,7 +13,14 @@ from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start import labelling
 from soup_nlp.start.continuation import belonging, continued, harmonic, likeness
 from soup_nlp.start.epipolar import SIDEWAYS, Motion
-from soup_nlp.start.labelling import CHANGE, MOST, PRICE, flow_affinity, labelled, smooth
+from soup_nlp.start.labelling import (
+    CHANGE,
+    MOST,
+    flow_affinity,
+    labelled,
+    price_of_motion,
+    smooth,
+)
 from soup_nlp.start.propose import propose
 
 
@@ -61,7 +68,7 @@ def test_a_motion_stays_if_it_saves_its_price(pays, saved):
     seg = squares(10, 10)
     own = np.isin(np.arange(100) // 10, (0, 1)) & (np.arange(100) % 10 < 4)
     cost = np.zeros((100, 3))
-    cost[own, 0] = saved * PRICE / own.sum()
+    cost[own, 0] = saved * price_of_motion(100) / own.sum()
     cost[~own, 1] = MOST
     cost[:, 2] = 0.5 * MOST
     still = fitted_like(seg)
