@@ -114,7 +114,7 @@ def test_neighbours_agree_unless_the_flow_jumps(world):
 
 
 def test_what_is_not_seen_has_no_motion_of_its_own(world):
-    """Superpixels of the wedge without confident flow take its motion, or the room's beside it."""
+    """Superpixels of the wedge without flow have its motion, and continue its surface."""
     pair, flow, component, (room, wedge) = world
     seg = flow.seg
     inner = component == 1
@@ -123,7 +123,7 @@ def test_what_is_not_seen_has_no_motion_of_its_own(world):
     hidden = np.flatnonzero(inner)[:3]
     assert len(hidden) == 3
     uv = pair.flow.uv + np.where(np.isin(seg.labels, hidden)[..., None], 7.0, 0.0)
-    confidence = np.where(np.isin(seg.labels, hidden), 0.2, 1.0)
+    confidence = np.where(np.isin(seg.labels, hidden), 0.0, 1.0)
     blind = fitted(pair.with_flow(Flow(uv.astype(np.float32), confidence, "test")), seg)
     found = labelled(blind, [room, wedge])
     assert len(found.motions) == 2
