@@ -146,7 +146,7 @@ def propose(flow: FlowFit) -> Start:
     # the flow of bending regions is no evidence of the motions of rigid ones
     rigid = flow.without(bends)
     choice = None if bends.all() else labelled(rigid, motions)
-    turn = None if choice is None else turn_alone(rigid, choice)
+    turn = turn_alone(rigid, choice) if o.bending and choice is not None else None
     if choice is None or turn is not None:
         soup, error = constant_depth(flow.views, turn)
         every = np.ones(len(seg), bool)
