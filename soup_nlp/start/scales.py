@@ -27,7 +27,7 @@ STANDS, HIDES = 0.4, 0.2
 """Quantiles of the depth ratios along the outline of a component, below it and elsewhere."""
 BELOW_WEIGHT = 3.0
 """Weight of the contact below a component, relative to the rest of its outline."""
-FASTER, SLOWER = 0.8, 0.05
+FASTER, SLOWER = 1.5, 0.05
 """Price of a log unit by which a component moves farther or less far than the scene."""
 FREE = 1.0
 """Log units by which a component that stands on something may move farther than the scene."""
