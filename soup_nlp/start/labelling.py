@@ -122,8 +122,8 @@ def labelled(flow: FlowFit, motions: list[Motion]) -> Labelling:
             bad = seen & (cost[np.arange(len(cost)), np.array(used)[label]] > UNEXPLAINED * MOST)
             kept = [motions[c] for c in used]
             motions = _refitted(flow, kept, label, seen, bad, shared / SHARED)
-    label = _earned(flow, cost[:, used], label)
     label = belonging(flow.seg, label, seen)
+    label = _earned(flow, np.where(seen[:, None], cost[:, used], 0.0), label)
     return Labelling.of(flow, [motions[c] for c in used], label, shared)
 
 
