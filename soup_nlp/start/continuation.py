@@ -20,7 +20,7 @@ JOINED = 1e-6
 
 def likeness(seg: Segmentation) -> Float:
     """(P,) weight of two neighbours: the length of their boundary, less where colours differ."""
-    colour = seg.pair_weight / max(float(seg.pair_weight.max()), 1e-12)
+    colour = seg.pair_weight / seg.pair_weight.max(initial=1e-12)
     return np.asarray(seg.boundary_length * colour**CONTRAST)
 
 
