@@ -6,6 +6,7 @@ from typing import Self
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import (
     constant_depth,
@@ -25,7 +26,13 @@ from soup_nlp.start.continuation import continued
 from soup_nlp.start.epipolar import Motion, stacked
 from soup_nlp.start.ground import ground, on_ground
 from soup_nlp.start.homographies import unorganised
-from soup_nlp.start.labelling import LEAST_NOISE, Labelling, labelled, limited_noise
+from soup_nlp.start.labelling import (
+    LEAST_NOISE,
+    PIECE_SIZE,
+    Labelling,
+    labelled,
+    limited_noise,
+)
 from soup_nlp.start.overlay import fixed_to_camera
 from soup_nlp.start.pace import order_in_front
 from soup_nlp.start.scales import scaled
@@ -192,11 +199,17 @@ def propose(flow: FlowFit) -> Start:
         surface=surface,
         tie=tie,
         bends=bends,
-        unexplained=jumping | wrong & ~bends,
+        unexplained=jumping | _large(wrong & ~bends, seg),
         wrong=wrong & ~bends,
         noise=noise,
         order=order_in_front(flow, soup, component, tie),
     )
+
+
+def _large(mask: Mask, seg: Segmentation) -> Mask:
+    """(N,) the mask (N,) without connected pieces that are too small to have a motion."""
+    piece = connected_pieces(mask, seg)
+    return mask & (np.bincount(piece[mask], minlength=1)[piece] >= PIECE_SIZE)
 
 
 def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Mask]:
