@@ -20,7 +20,7 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, essential_motion, refine_near
-from soup_nlp.start.labelling import SHARED, Labelling, candidates, dominant
+from soup_nlp.start.labelling import Labelling, candidates, dominant
 from soup_nlp.start.views import FlowFit, Views
 
 REFERENCE = 1000
@@ -256,7 +256,10 @@ def torn(flow: FlowFit, surface: Int, bends: Mask) -> Mask:
     return out
 
 
-NOISES, SYSTEMATIC, LEAST_PX, MOST_PX = 1.7, 4.0, 0.01, 0.1
+TELLS = 7.0
+"""Ratio of what depth explains to what it leaves from which the flow tells of depth. Of rigid pairs
+`sun3d_lounge` and `s7_kitchen_150` have the least, 7.8; `rgbd/opening_door`, which bends, 6.5."""
+NOISES, SYSTEMATIC, LEAST_PX, MOST_PX = 2.5, 4.0, 0.01, 0.1
 """Median excess of the error, in units of the noise, from which a surface may bend; below
 `SYSTEMATIC` noises, within these limits in pixels, it never does."""
 LEAST_LEFT = 15
@@ -270,9 +273,9 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     """The best rigid motion of each surface (N,) that does not bend, and which surfaces bend.
 
     A surface bends if the best rigid motion leaves a median excess over the residual of affine
-    flows that noise does not explain, or that tells nothing of depth: an error shared along the
-    epipolar lines, `SHARED` times as large, would cause as much relief as depth itself does, with
-    the deviation `RELIEF` of log depth. What depth explains is the excess of a turn alone.
+    flows that noise does not explain, or from which depth, which explains what a turn alone does
+    not, stands out less than `TELLS` times: an error shared along the epipolar lines would then
+    cause much of the relief.
     Pieces that the best motion does not explain are surfaces of their own if they have
     `LEAST_SHARE`, and `LEAST_LEFT` superpixels: where the flow jumps little along its outline, a
     bending surface is joined to its surroundings.
@@ -303,7 +306,7 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
         middle = np.median(excess, axis=0)
         gain = np.median(fit_turn(views.subset(at), ANY_TURN)[1] - flow.residual[at])
         least = np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX)
-        most = max(float(least), min(RELIEF / SHARED * gain, NOISES * noise))
+        most = max(float(least), min(gain / TELLS, NOISES * noise))
         # where many motions explain half of a surface badly, the one of least median is chance
         chance = (np.arange(len(middle)) >= len(tried)) & (middle > SURELY * most)
         best = int(np.argmin(np.where(chance, np.inf, middle)))
