@@ -52,8 +52,7 @@ class Evidence:
         constant: (C,) mean error of the best rigid motion of a component at a constant depth.
         solution: (C,) mean error of the answer.
         noise: Noise of the flow, pixels.
-        sigma: (N,) standard deviation of log depth by the systematic error of the flow and by
-            errors of the camera.
+        sigma: (N,) standard deviation of log depth by errors of the camera.
         camera: Error of the given camera that the flow shows, one of `KINDS`, or None.
     """
 
@@ -129,7 +128,9 @@ def evidence(
             continue
         errors[:, c] = *_without_depth(data, at), trimmed_mean(misfit[at])
         members = np.flatnonzero(component == c)
-        sigma[members] = _open_motion(soup, data, members, valid[members], OPEN * noise, camera)
+        sigma[members] = 0.0
+        if camera.any():
+            sigma[members] = _by_camera(soup, data, members, valid[members], OPEN * noise, camera)
     return Evidence(errors[0], errors[1], errors[2], noise, sigma, wrong)
 
 
@@ -166,15 +167,14 @@ def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float
     return error(turned, PLAIN_TURN, ray), error(displaced, 6, at_one)
 
 
-def _open_motion(
+def _by_camera(
     soup: Soup, data: EnergyData, at: Int, valid: Mask, error: float, camera: Float
 ) -> Float:
-    """(K,) standard deviation of log depth by a motion undetermined within a systematic error.
+    """(K,) standard deviation of log depth by errors of the camera, which the motion follows.
 
     A change of the component's motion moves a superpixel along its epipolar line, which its depth
     follows, and across it, which the flow contradicts. The information on the motion is that of
-    one measurement with the error of the flow, and of relief with the deviation `RELIEF`. Errors of
-    the camera are not part of the answer: they count wholly, and the motion follows them.
+    one measurement with the error of the flow, and of relief with the deviation `RELIEF`.
 
     Args:
         soup: The answer.
@@ -216,6 +216,5 @@ def _open_motion(
         # a foreign solver may return a soup without finite information
         return np.full(len(at), np.inf)
     covariance = np.linalg.pinv(information[:6, :6], rcond=1e-12, hermitian=True)
-    motion = np.einsum("ni,ij,nj->n", follow[:, :6], covariance, follow[:, :6])
     by_camera = camera * (follow[:, 6:] - follow[:, :6] @ (covariance @ information[:6, 6:]))
-    return np.sqrt(np.maximum(motion, 0.0) + error**2 / squared + np.sum(by_camera**2, axis=1))
+    return np.sqrt(np.sum(by_camera**2, axis=1))

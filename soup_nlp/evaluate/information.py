@@ -22,8 +22,6 @@ from soup_nlp.solve.selected_inverse import BlockCholesky
 
 SMOOTHING = 0.03
 """Width in pixels within which a norm is treated as a square: no flow is more exact."""
-LEAST_LEARNED = 1e-4
-"""Least share of the information that is attributed to the flow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,14 +140,3 @@ def spread_in_image(info: Information, plane: Float, labels: Labels, K_ref: Floa
     a = np.concatenate([np.ones((*labels.shape, 1)), off], axis=-1)
     a /= np.einsum("hwc,hwc->hw", a, info.plane[labels])[..., None]
     return np.asarray(np.sqrt(np.maximum(np.einsum("hwi,hwij,hwj->hw", a, plane[labels], a), 0.0)))
-
-
-def learned(variance: Float, without: Float) -> Float:
-    """Variance by the information that the flow adds to the terms on shape.
-
-    Information adds up: `1 / v - 1 / v0` is that of the flow, with the variance v of all terms and
-    v0 without the flow. Where both are equal, the flow adds none.
-    """
-    # the mean of a single component is the fixed one: both variances are 0
-    share = np.divide(variance, without, out=np.zeros_like(variance), where=without > 0)
-    return np.asarray(variance / np.clip(1 - share, LEAST_LEARNED, 1.0))

@@ -162,7 +162,8 @@ def certainty(run: Run) -> dict[str, float]:
     unseen = (run.pair.flow.confidence <= 0) | hidden(run.reconstruction)
     rest, fixed = np.full(labels.shape, start.at_rest), tie == FIXED
     flat = run.confidence.evidence.guess[start.component][labels]
-    loose = run.confidence.scale[labels] > MOST_SIGMA
+    by_scale = [run.confidence.terms[name] for name in ("scale", "pace")]
+    loose = np.hypot(*by_scale) > MOST_SIGMA
     guess, left = {}, ~sure
     reasons = {
         "rest": rest,
