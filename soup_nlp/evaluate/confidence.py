@@ -187,8 +187,8 @@ def confidence(
 ) -> Confidence:
     """The uncertainty of the depth of an answer.
 
-    Where the camera rests or only turns, and where something is fixed in the image, sigma is that
-    of the drawn depth. Elsewhere the information of all terms and of a prior on the depths of a
+    Where the camera rests or only turns, where something is fixed in the image, and where a surface
+    is taken to bend although its flow jumps (`Start.unexplained`), sigma is that of what is drawn. Elsewhere the information of all terms and of a prior on the depths of a
     scene add up; so does that of a depth prior.
 
     Args:
@@ -224,7 +224,7 @@ def confidence(
     squares = (
         sum(value**2 for value in known.values()) + np.minimum(sure.sigma, LARGEST)[labels] ** 2
     )
-    drawn = (start.at_rest | fixed)[labels]
+    drawn = (start.at_rest | fixed | (start.bends & start.unexplained))[labels]
     sigma = np.where(drawn, DRAWN, with_prior(np.sqrt(squares)))
     if given_depth is not None:
         # where the depth is that of a prior which no flow confirms, the flow is no evidence

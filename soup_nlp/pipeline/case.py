@@ -22,7 +22,6 @@ from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.components import TIES, TOO_FAST
 from soup_nlp.start.focal_length import focal_length
 from soup_nlp.start.given_depth import Given, by_prior
-from soup_nlp.start.ground import off_ground
 from soup_nlp.start.occlusion import in_order
 from soup_nlp.start.prior_evidence import PIECES, PriorEvidence, judged
 from soup_nlp.start.propose import Start, propose
@@ -70,9 +69,6 @@ def prepare(
         start, given_depth = by_prior(*begun, evidence)
         if log:
             log(str(evidence))
-    if flow.options.upright and flow.options.ground and flow.options.method != "homography":
-        contact = off_ground(flow, start.soup, start.component, ~start.borrowed)
-        start = replace(start, off_ground=contact)
     done("start", start)
     data, weights = build_energy(problem, pair, seg, start, given_depth)
     stages = solver_options(problem, start)

@@ -1,4 +1,4 @@
-"""Ground plane: what stands on it, lies below it or is off it.
+"""Ground plane: what stands on it or lies below it.
 
 A superpixel without usable flow (it leaves the image, is dark or moves too fast) borrows its depth
 from its neighbours, and a component without a known support is scaled by its outline. Both may come
@@ -13,10 +13,7 @@ import numpy as np
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import (
-    CONTACT,
     SCENE,
-    connected_pieces,
-    outlines,
     quantile,
 )
 from soup_nlp.start.views import FlowFit
@@ -29,18 +26,6 @@ second on it lies below."""
 LEAST_ON, MOST_BELOW = 0.05, 0.05
 """Of the area with known depth, the least share on the ground and the largest share of another
 surface below it. Of wrong flow less must lie below it than on it."""
-STANDS = 0.1
-"""Log ratio to the depth of the ground up to which a superpixel lies on it, and up to which a
-region stands on it. Regions with the right depth have at most 0.16."""
-STEP = 0.15
-"""Least log ratio of depths along the outline of a region."""
-FEWEST = 3
-"""Least number of superpixels of a region that may be off the ground."""
-MOST_AREA = 0.25
-"""Largest share of the image of a region of the scene whose contact with the ground tells its
-depth: a larger one may be a table, which does not stand on the floor below its edge."""
-VISIBLE = 0.6
-"""Least share of ground along the lower border of a region."""
 TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
@@ -120,49 +105,3 @@ def on_ground(
     factor = np.where(lifted, mu / np.maximum(floor, 1e-12), 1.0)
     t = np.where((lifted & scene)[:, None], soup.t / factor[:, None], soup.t)
     return replace(soup, lam=soup.lam * factor, t=t), lifted
-
-
-def off_ground(flow: FlowFit, soup: Soup, component: Int, reliable: Mask) -> Float:
-    """(N,) log ratio of the depth of the ground below a region to its own, 0 where none is known.
-
-    The camera's motion explains what moves along the epipolar lines at a wrong depth. Where the
-    ground is visible along the lower border of a region, its depth there shows that. The ground is
-    that of the component with the largest area on a level plane.
-
-    Args:
-        flow: The flow of every superpixel.
-        soup: Start.
-        component: (N,) group that moves as one.
-        reliable: (N,) True where the depth is reliable.
-    """
-    mu, area = 1 / soup.depth_at(flow.views.anchor), flow.seg.sizes
-    floor, most = np.zeros(len(mu)), 0
-    for c in range(int(component.max()) + 1):
-        own = component == c
-        level = ground(flow, mu, reliable & own)
-        on = area[own & (np.abs(mu - level) < ON * level)].sum()
-        if on > most:
-            floor, most = level, on
-    out = np.zeros(len(mu))
-    if not floor.any():
-        return out
-    seg, middle = flow.seg, flow.middle
-    on_ground = (floor > 0) & (np.abs(np.log(mu / np.maximum(floor, 1e-9))) < STANDS)
-    depth = soup.depth_across(seg.pairs, middle)
-    whole = (np.abs(np.log(depth[1] / depth[0])) < STEP) & ~seg.across(component)
-    region = 1 + connected_pieces(~on_ground, seg, whole)
-    around, across = outlines(region, seg), seg.across(region)
-    ray = flow.views.anchor[floor > 0]
-    plane = np.linalg.lstsq(ray, floor[floor > 0])[0]
-    level = -np.log(np.maximum(middle @ plane, 1e-9))
-    rise = (level - np.log(depth))[:, across].ravel()
-    scene = component == SCENE
-    for c in range(1, int(region.max()) + 1):
-        mine = region == c
-        low = (around.component == c) & around.below
-        on = low & on_ground[around.neighbour]
-        visible = on.any() and around.contact[on].sum() >= VISIBLE * around.contact[low].sum()
-        large = area[mine].sum() > MOST_AREA * area.sum() and scene[mine].any()
-        if mine.sum() >= FEWEST and visible and not large:
-            out[mine] = quantile(rise[on], around.contact[on], CONTACT)
-    return out

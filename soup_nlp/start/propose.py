@@ -72,8 +72,6 @@ class Start:
         order: (P,) probability that the second superpixel of a neighbour pair covers the first one,
             negative if the first covers the second, 0 where neither is known (`start.occlusion`,
             `order_in_front`); None where nothing is known.
-        off_ground: (N,) log ratio of the depth of the ground below a region to its own, see
-            `start.ground.off_ground`; None where no ground was sought.
     """
 
     soup: Soup
@@ -92,7 +90,6 @@ class Start:
     at_rest: bool = False
     noise: float = LEAST_NOISE
     order: Float | None = None
-    off_ground: Float | None = None
 
     def __str__(self) -> str:
         return (

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soup_nlp.evaluate.confidence import MOST_SIGMA, SIGMA_PRIOR, scale_by_contact
+from soup_nlp.evaluate.confidence import MOST_SIGMA, PRIOR
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.report.findings import (
     DETERMINED,
@@ -17,22 +17,21 @@ from soup_nlp.report.findings import (
     guess_line,
 )
 from soup_nlp.report.summary import certainty
-from soup_nlp.start.components import FIXED, TIES
+from soup_nlp.start.components import FIXED, SCENE, TIES
 
 
-def unsure(run, component_variance=None):
+def unsure(run, scale=None):
     """The same run where every pixel is a guess, though the flow is evidence of depth."""
     sure = run.confidence
     far = np.full(int(run.start.component.max()) + 1, 9.0)
     evidence = replace(sure.evidence, turn=far, constant=far, solution=np.zeros_like(far))
-    scale, start = sure.scale, run.start
-    if component_variance is not None:
-        marginals = replace(sure.marginals, component=np.full_like(far, component_variance))
-        # all components move equally far
-        paces = np.ones(len(run.soup))
-        scale = scale_by_contact(marginals, start, run.segmentation.sizes, paces)
-    sigma = np.full_like(sure.sigma, SIGMA_PRIOR)
-    return replace(run, confidence=replace(sure, sigma=sigma, scale=scale, evidence=evidence))
+    terms = dict(sure.terms)
+    if scale is not None:
+        other = (run.start.component != SCENE)[run.segmentation.labels]
+        terms["scale"] = np.where(other, scale, 0.0)
+        terms["pace"] = np.zeros_like(terms["pace"])
+    sigma = np.full_like(sure.sigma, PRIOR)
+    return replace(run, confidence=replace(sure, sigma=sigma, terms=terms, evidence=evidence))
 
 
 def test_shares_add_up(small_run):
@@ -55,11 +54,11 @@ def test_a_scale_that_contact_hardly_determines_is_named(small_run):
     start, labels = small_run.start, small_run.segmentation.labels
     two = (np.arange(len(start.soup)) < 9).astype(int)
     tie = np.where(two, TIES.index("contact below"), TIES.index("reference"))
-    start = replace(start, component=two, tie=tie, off_ground=None)
+    start = replace(start, component=two, tie=tie)
     small_run = replace(small_run, start=start)
     loose = certainty(unsure(small_run, 1.0))
     firm = certainty(unsure(small_run, 1e-6))
-    tied_share = (start.tie != TIES.index("reference"))[labels].mean()
+    tied_share = (start.component != SCENE)[labels].mean()
     # without evidence of depth the scale is not the reason
     assert 0 <= firm["scale"] < loose["scale"] <= tied_share
     assert loose["scale"] + loose["weak"] == pytest.approx(firm["scale"] + firm["weak"])

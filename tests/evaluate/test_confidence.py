@@ -5,40 +5,30 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_model import directional
-from scipy import ndimage, sparse
+from scipy import sparse
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow
 from soup_nlp.evaluate import information as information_module
 from soup_nlp.evaluate.confidence import (
-    BENDING_FACTOR,
-    BENDING_SIGMA,
-    CONTACT,
-    GUESSED,
-    LEAST_SPREAD,
-    MIXED,
+    DRAWN,
+    MISFIT,
     MOST_SIGMA,
-    OUTLINE,
-    POWER,
-    SIGMA_PRIOR,
-    USUAL,
+    PRIOR,
+    SHARES,
     at_outlines,
-    calibrated,
     confidence,
     flow_misfit,
-    of_mixed_flow,
-    scale_by_contact,
+    with_prior,
 )
-from soup_nlp.evaluate.information import information, learned, marginals, spread_in_image
+from soup_nlp.evaluate.information import information, marginals, spread_in_image
 from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.selected_inverse import BlockCholesky, layers
-from soup_nlp.start.components import TIES
-from soup_nlp.start.ground import STANDS
-from soup_nlp.start.labelling import LEAST_NOISE
+from soup_nlp.start.components import FIXED, SCENE, TIES
 
 FORM = Formulation()
 
@@ -48,7 +38,7 @@ def small_room(small_room):
     """The small room with a second component, whose scale is from contact."""
     second = np.arange(len(small_room.soup)) < 9
     tie = np.where(second, TIES.index("contact below"), TIES.index("reference"))
-    start = replace(small_room.start, component=second.astype(int), tie=tie, off_ground=None)
+    start = replace(small_room.start, component=second.astype(int), tie=tie)
     return replace(small_room, start=start)
 
 
@@ -151,34 +141,18 @@ def test_the_variance_of_a_pixel_is_of_log_depth(small_room, info, dense):
 
 def test_pixels_beside_a_step_may_lie_on_either_side():
     log_depth = np.where(np.arange(400) < 200, 0.0, 0.4) * np.ones((60, 1))
-    sigma = at_outlines(np.exp(log_depth))
-    np.testing.assert_allclose(sigma[:, 198:202], 0.4 * OUTLINE, atol=1e-6)
-    assert sigma[:, :190].max() == sigma[:, 210:].max() == 0
+    step = at_outlines(np.exp(log_depth))
+    np.testing.assert_allclose(step[:, 198:202], 0.4, atol=1e-6)
+    assert step[:, :190].max() == step[:, 210:].max() == 0
     slope = at_outlines(np.exp(np.linspace(0, 4, 400) * np.ones((60, 1))))
     assert slope[:, 10:-10].max() < 1e-5
 
 
-def test_a_superpixel_with_partly_usable_flow_is_less_sure():
-    """Superpixels of 10 columns: usable, half usable, not usable, leaving the image."""
-    labels = np.repeat(np.arange(4), 10)[None] * np.ones((20, 1), np.int32)
-    confidence = np.where(labels == 0, 1.0, 0.0)
-    confidence[:10, labels[0] == 1] = confidence[:10, labels[0] == 3] = 1.0
-    uv = np.where(labels[..., None] == 3, [30.0, 0.0], 0.0)
-    flow = Flow(uv.astype(np.float32), confidence.astype(np.float32), "test")
-    sigma = of_mixed_flow(flow, labels.astype(np.int32), (60, 60))
-    np.testing.assert_allclose(sigma, [0, MIXED, MIXED, 0], atol=1e-3)
-
-
-def test_calibration_is_capped_where_nothing_is_known():
-    zero, most, endless = calibrated(np.array([0.0, 1e9, np.inf]), 0.1)
+def test_sigma_is_capped_by_the_prior():
+    zero, most, endless = with_prior(np.array([0.0, 1e9, np.inf]))
     assert zero == 0.0
-    assert most == endless == pytest.approx(SIGMA_PRIOR)
-    single, double = calibrated(np.array([0.001, 0.002]), 0.1)
-    assert double / single == pytest.approx(2**POWER, rel=1e-4)
-    assert calibrated(np.array([0.001]), 0.2)[0] == pytest.approx(double)
-    # the prior's information is added to the pair's
-    alone = calibrated(np.array([0.5]), 0.1, prior=np.inf)[0]
-    assert calibrated(np.array([0.5]), 0.1)[0] ** -2 == pytest.approx(alone**-2 + SIGMA_PRIOR**-2)
+    assert most == endless == pytest.approx(PRIOR)
+    assert with_prior(np.array([0.5]))[0] ** -2 == pytest.approx(0.5**-2 + PRIOR**-2)
 
 
 def test_the_information_is_that_of_measured_pixels(small_room, monkeypatch):
@@ -227,6 +201,13 @@ def sure(small_room):
     return sure_of(small_room)
 
 
+def test_sigma_is_the_root_of_the_squares_of_its_terms(small_room, sure):
+    known = sum(term**2 for term in sure.terms.values())
+    np.testing.assert_allclose(sure.sigma, with_prior(np.sqrt(known)))
+    assert sure.terms.keys() == SHARES.keys()
+    assert all(np.isfinite(term).all() and term.min() >= 0 for term in sure.terms.values())
+
+
 def test_an_undetermined_superpixel_has_the_sigma_of_the_prior(small_room, sure):
     blind = 25
     weight = small_room.data.pixel_weight.copy()
@@ -235,8 +216,8 @@ def test_an_undetermined_superpixel_has_the_sigma_of_the_prior(small_room, sure)
     loose = small_room.weights.replace(arap=1e-9, cont=1e-9, orient=1e-9)
     sigma = sure_of(small_room, data, loose).sigma
     inside = small_room.segmentation.labels == blind
-    np.testing.assert_allclose(sigma[inside], SIGMA_PRIOR, rtol=0.02)
-    assert sure.sigma[inside].mean() < 0.9 * SIGMA_PRIOR
+    np.testing.assert_allclose(sigma[inside], PRIOR, rtol=0.05)
+    assert sure.sigma[inside].mean() < 0.9 * PRIOR
 
 
 @pytest.mark.slow
@@ -285,156 +266,69 @@ def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
     misfit = flow_misfit(rec, Flow(moved, flow.confidence))
     assert misfit[25] == pytest.approx(2.0, abs=1e-4)
     assert np.delete(misfit, 25).max() < 1e-4
-    quiet, loud = (calibrated(np.array([0.001]), 0.1, m) for m in (0.05, 0.4))
-    # the geometric mean of noise and misfit is twice the noise
-    assert loud / quiet == pytest.approx(2**POWER, rel=1e-3)
+    # the geometric mean of noise and misfit counts
+    quiet, loud = (
+        replace(small_room, pair=small_room.pair.with_flow(Flow(f, flow.confidence)))
+        for f in (rec.flow.astype(np.float32), moved)
+    )
+    before, after = (sure_of(case).terms["flow"][inside] for case in (quiet, loud))
+    np.testing.assert_allclose(after / before, np.sqrt(MISFIT * 2.0 / small_room.start.noise))
 
 
-def test_misfit_and_spread_count_differently_where_surfaces_bend():
-    spread, misfit = np.array([100 * LEAST_SPREAD]), 100 * LEAST_NOISE
-    base = calibrated(spread, 0.1, misfit, prior=np.inf, bends=True)
-    # what is added in squares is 1e-4 of either square
-    assert base[0] == pytest.approx(BENDING_FACTOR * misfit * np.sqrt(spread[0]), rel=1e-4)
-    half = calibrated(0.25 * spread, 0.1, misfit, prior=np.inf, bends=True)
-    assert half[0] == pytest.approx(0.5 * base[0], rel=1e-3)
-    # small spreads keep their order and add little
-    small = calibrated(LEAST_SPREAD * np.array([0.0, 0.1]), 0.1, LEAST_NOISE, bends=True)
-    assert small[0] < small[1] == pytest.approx(small[0], rel=0.01)
-    assert calibrated(spread, 0.6, misfit, prior=np.inf, bends=True) == base
-    assert calibrated(spread, 0.1, 0.0, bends=True)[0] > 0
-    assert calibrated(np.array([np.inf]), 0.1, bends=True)[0] == pytest.approx(SIGMA_PRIOR)
-
-
-@pytest.mark.parametrize("bends", [False, True])
-def test_systematic_uncertainty_is_added_at_any_noise(bends):
-    spread = np.array([0.01])
-    for noise in (0.05, 0.6):
-        alone, total = (
-            calibrated(spread, noise, 0.1, prior=np.inf, bends=bends, added=added)[0]
-            for added in (0.0, 0.2)
-        )
-        assert total**2 == pytest.approx(alone**2 + 0.2**2)
-    assert calibrated(spread, 0.1, added=np.inf)[0] == pytest.approx(SIGMA_PRIOR)
-
-
-def test_other_components_are_less_sure_than_the_reference(small_room, sure):
-    start = small_room.start
-    sizes = small_room.segmentation.sizes
-    scale = scale_by_contact(sure.marginals, start, sizes, np.ones(len(sizes)))
-    reference = start.tie == TIES.index("reference")
-    assert 0 < reference.sum() < len(reference)
-    # the other scales move the mean, to which the reference component refers
-    mean = np.sum(sizes[~reference] * scale[~reference]) / sizes.sum()
-    np.testing.assert_allclose(scale[reference], mean, rtol=0.2)
-    assert scale[~reference].min() > np.hypot(CONTACT, scale[reference][0]) * (1 - 1e-9)
+def test_other_components_are_less_sure_than_the_scene(small_room, sure):
+    scene = (small_room.start.component == SCENE)[small_room.segmentation.labels]
+    assert 0 < scene.mean() < 1
+    assert sure.terms["scale"][scene].max() == sure.terms["pace"][scene].max() == 0
+    assert sure.terms["scale"][~scene].min() > 0
     # no component is less certain than the prior
     raw = np.sqrt(sure.marginals.component)
-    expected = 1 / np.sqrt(1 / raw**2 + 1 / SIGMA_PRIOR**2)
-    np.testing.assert_allclose(sure.component_sigma, expected)
+    np.testing.assert_allclose(sure.component_sigma, 1 / np.sqrt(raw**-2 + PRIOR**-2))
 
 
-def test_a_scale_is_open_where_contact_implies_too_fast_motion(small_room, sure):
-    start = small_room.start
-    tied = start.tie != TIES.index("reference")
-    fast = int(start.component[tied][0])
-    moving = start.component == fast
-
-    def scale(ratio):
-        far = np.where(moving, ratio, 1.0)
-        return scale_by_contact(sure.marginals, start, small_room.segmentation.sizes, far)
-
-    usual = scale(1.0)
-    np.testing.assert_array_equal(scale(np.exp(0.9 * USUAL)), usual)
-    np.testing.assert_allclose(scale(5.0)[moving], np.hypot(usual[moving], np.log(5.0)))
-    # the other components do not change
-    np.testing.assert_array_equal(scale(5.0)[~moving], usual[~moving])
+def test_the_scale_of_what_moves_faster_than_the_scene_is_open(small_room, sure):
+    labels, part = small_room.segmentation.labels, small_room.start.component
+    moving = part == part[part != SCENE][0]
+    soup = small_room.soup
+    factor = np.where(moving, 5.0, 1.0)[:, None]
+    # the translation of a component relative to the camera grows with its scale
+    faster = replace(small_room, soup=replace(soup, lam=soup.lam * factor[:, 0]))
+    more = sure_of(faster).terms["pace"] - sure.terms["pace"]
+    inside = moving[labels]
+    assert more[inside].min() > 0.9 * SHARES["pace"] * np.log(5.0) - sure.terms["pace"].max()
+    np.testing.assert_allclose(more[~inside], 0.0, atol=1e-9)
 
 
-@pytest.mark.slow
-def test_depth_far_from_the_initialisation_is_unsure_by_the_ratio(small_room, sure):
-    parts, n = small_room.start.component, len(small_room.soup)
-    at = surest(small_room, sure)
-    inside = small_room.segmentation.labels == at
-    assert sure.sigma[inside].mean() < 0.1
-
-    def sigma(factor, **start):
-        first = small_room.start.soup
-        first = replace(first, d=first.d * factor)
-        return sure_of(replace(small_room, start=replace(small_room.start, soup=first, **start)))
-
-    for ratio in (0.8, 1.25):
-        apart = sigma(np.where(np.arange(n) == at, ratio, 1.0)).sigma
-        assert apart[inside].min() > 0.18
-        np.testing.assert_allclose(apart[~inside], sure.sigma[~inside], rtol=1e-9)
-    # a scale of a component is no evidence about its relief
-    of_component = sigma(np.where(parts == parts[at], 1.25, 1.0))
-    np.testing.assert_allclose(of_component.sigma, sure.sigma, rtol=1e-9)
-    # where surfaces bend the initialisation is rough
-    bends = np.ones(n, bool)
-    rough = sigma(np.where(np.arange(n) == at, 1.25, 1.0), bends=bends).sigma
-    np.testing.assert_allclose(rough, sigma(1.0, bends=bends).sigma, rtol=1e-9)
+def test_relief_is_less_sure_the_less_of_the_flow_depth_explains(small_room, sure):
+    gap = sure.evidence.gap[SCENE]
+    assert gap > SHARES["relief"] * small_room.start.noise
+    scene = (small_room.start.component == SCENE)[small_room.segmentation.labels]
+    noisy = replace(small_room, start=replace(small_room.start, noise=2 * small_room.start.noise))
+    twice = sure_of(noisy).terms["relief"][scene]
+    np.testing.assert_allclose(twice, 2 * sure.terms["relief"][scene], rtol=1e-9)
+    # without any evidence relief may be as wrong as it is large
+    most = np.abs(np.log(small_room.soup.depth_at(small_room.data.anchor_ray)))
+    loud = replace(small_room, start=replace(small_room.start, noise=1e3))
+    assert sure_of(loud).terms["relief"].max() <= 2 * most.max()
 
 
-def surest(small_room, sure):
-    """The superpixel whose depth is surest."""
-    labels = small_room.segmentation.labels
-    return int(np.argmin(ndimage.mean(sure.sigma, labels, np.arange(labels.max() + 1))))
-
-
-def test_what_floats_above_the_ground_is_unsure_by_the_ratio(small_room, sure):
-    at = surest(small_room, sure)
-    inside = small_room.segmentation.labels == at
-    usual = sure.sigma
-    assert usual[inside].mean() < 0.1
-
-    def sigma(log_ratio):
-        off = np.where(np.arange(len(small_room.soup)) == at, log_ratio, 0.0)
-        return sure_of(replace(small_room, start=replace(small_room.start, off_ground=off))).sigma
-
-    np.testing.assert_array_equal(sigma(0.99 * STANDS), usual)
-    # both too near and too far by 20 %
-    for log_ratio in np.log([0.8, 1.25]):
-        floats = sigma(log_ratio)
-        assert floats[inside].min() > 0.18
-        np.testing.assert_array_equal(floats[~inside], usual[~inside])
-
-
-def test_a_camera_at_rest_leaves_a_guess_in_its_order(small_room, sure):
-    rests = replace(small_room, start=replace(small_room.start, at_rest=True))
-    moving, resting = sure.sigma, sure_of(rests).sigma
-    least = GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)
-    assert least <= resting.min() <= resting.max() <= SIGMA_PRIOR
-    sharp = moving < MOST_SIGMA
-    assert np.all(np.diff(resting[sharp][np.argsort(moving[sharp])]) > -1e-9)
-    assert np.unique(resting).size > 1000
-
-
-def test_what_no_motion_explains_is_a_guess(small_room, sure):
-    part = np.arange(len(small_room.soup)) < 5
-    more = part | small_room.start.unexplained
-    doubtful = replace(small_room, start=replace(small_room.start, unexplained=more))
-    inside = part[small_room.segmentation.labels]
-    sigma = sure_of(doubtful).sigma
-    least = GUESSED / np.hypot(1, GUESSED / SIGMA_PRIOR)
-    assert sigma[inside].min() >= least * (1 - 1e-9)
-    np.testing.assert_allclose(sigma[~inside], sure.sigma[~inside], rtol=1e-9)
+@pytest.mark.parametrize("change", ["rest", "fixed"])
+def test_drawn_depth_has_the_sigma_of_what_is_drawn(small_room, change):
+    start, part = small_room.start, np.arange(len(small_room.soup)) < 5
+    changes = {"rest": {"at_rest": True}, "fixed": {"tie": np.where(part, FIXED, start.tie)}}
+    drawn = sure_of(replace(small_room, start=replace(start, **changes[change]))).sigma
+    inside = (part | (change == "rest"))[small_room.segmentation.labels]
+    assert (drawn[inside] == DRAWN).all()
+    assert drawn[~inside].size == 0 or (drawn[~inside] != DRAWN).any()
 
 
 def test_where_surfaces_bend_nothing_is_surer_than_relief_without_parallax(small_room):
     all_bend = np.ones(len(small_room.soup), bool)
     bends = replace(small_room, start=replace(small_room.start, bends=all_bend))
-    limit = BENDING_SIGMA / np.hypot(1, BENDING_SIGMA / SIGMA_PRIOR)
-    assert sure_of(bends).sigma.min() >= limit * (1 - 1e-9)
+    assert sure_of(bends).sigma.min() >= with_prior(SHARES["bends"]) * (1 - 1e-9)
 
 
 def test_an_energy_that_sees_no_plane_leaves_everything_a_guess(small_room):
     alone = dict.fromkeys(("proj", "cont", "orient", "prior"), 0.0)
     sigma = sure_of(small_room, weights=small_room.weights.replace(**alone)).sigma
     assert np.isfinite(sigma).all()
-    assert np.median(sigma) == pytest.approx(SIGMA_PRIOR, rel=0.02)
-
-
-def test_what_the_flow_adds_to_the_terms_on_shape():
-    """The information is 4 with the flow and 3 without: the flow adds 1."""
-    assert learned(np.array([1 / 4]), np.array([1 / 3]))[0] == pytest.approx(1.0)
-    assert learned(np.array([2.0]), np.array([2.0]))[0] > 1e3
+    assert np.median(sigma) == pytest.approx(PRIOR, rel=0.05)

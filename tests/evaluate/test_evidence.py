@@ -58,7 +58,7 @@ def test_parallax_of_a_scene_with_relief_is_evidence(small_room):
     assert result.solution[0] < 1e-9
     assert result.gap[0] > LEAST_GAP_PX
     assert not result.guess[0]
-    assert np.median(result.sigma) < 0.1
+    assert result.sigma.max() == 0
 
 
 @pytest.mark.parametrize(("depth", "t"), [(0.4, (0.0, 0.0, 0.0)), (0.0, (0.3, 0.0, 0.1))])
@@ -93,45 +93,11 @@ def test_a_turn_explains_a_stabilised_flow_with_all_parameters_only(small_room):
     assert error(ANY_TURN) < 0.02
 
 
-def test_less_parallax_leaves_more_open(small_room):
-    near, far = (np.median(evidence_of(small_room, 0.3, (x, 0.0, 0.0)).sigma) for x in (0.3, 0.06))
-    assert far > 3 * near
-
-
-def test_a_far_background_leaves_no_more_open_before_it(small_room):
-    """The depth of the sky relative to the foreground is open, the foreground's relief is not."""
-    before, after = (
-        evidence_of(small_room, 0.3, (0.3, 0.0, 0.1), far=far).sigma for far in (1, 1e4)
-    )
-    assert np.median(before[1::2]) < np.median(after[1::2]) < 0.02
-    assert after[::2].min() > 0.4
-
-
-def test_what_motion_leaves_open_is_that_of_refitted_motions(small_room):
-    """The linear prediction agrees with depths that follow a changed motion."""
+def test_an_uncertain_focal_length_counts_in_proportion(small_room):
     soup, data = scene(small_room, 0.3, (0.3, 0.0, 0.1))
-    result = of_one(soup, data)
-    # a turn about y that changes the flow by at most the systematic error
-    error = 0.5 * NOISE
-    w = np.array([0.0, error / data.K_next[0, 0], 0.0])
-    X = np.einsum("nij,nj->ni", rotation.exp(w) @ soup.R, data.anchor_ray)
-    q = project(data.K_next, soup.moved(soup.points(data.anchor_ray)))
-    r = (q - data.K_next[:2, 2]) / np.diag(data.K_next)[:2]
-    t = soup.translation
-    a = X[:, :2] - r * X[:, 2:]
-    b = t[:, :2] - r * t[:, 2:]
-    z = -np.sum(a * b, axis=1) / np.sum(a * a, axis=1)
-    change = np.log(z / soup.depth_at(data.anchor_ray))
-    change -= change.mean()
-    # the systematic error does not exclude this change
-    assert np.sqrt(np.mean(change**2)) < 3 * np.sqrt(np.mean(result.sigma**2))
-
-
-def test_the_uncertain_focal_length_counts_in_squares(small_room):
-    soup, data = scene(small_room, 0.3, (0.3, 0.0, 0.1))
-    exact, uncertain, doubled = (of_one(soup, data, *x).sigma for x in ((), (0.2,), (0.4,)))
-    assert np.median(uncertain) > 1.5 * np.median(exact)
-    np.testing.assert_allclose(doubled**2 - exact**2, 4 * (uncertain**2 - exact**2), rtol=1e-9)
+    uncertain, doubled = (of_one(soup, data, x).sigma for x in (0.2, 0.4))
+    assert np.median(uncertain) > 0.001
+    np.testing.assert_allclose(doubled, 2 * uncertain, rtol=1e-9)
 
 
 def test_a_component_without_flow_is_a_guess(small_room):

@@ -6,7 +6,7 @@ from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.ground import ground, off_ground, on_ground
+from soup_nlp.start.ground import ground, on_ground
 from soup_nlp.start.views import FlowFit
 
 HIGH, FAR = 1.5, 30.0
@@ -89,27 +89,3 @@ def test_wrong_flow_below_the_road_is_lifted(flow):
     far = np.random.default_rng(0).uniform(1.5, 20, len(Z))
     soup = lift(flow, np.where(wrong, far * Z, Z), ALL, SCENE)
     np.testing.assert_allclose(soup.depth_at(ray), Z, rtol=1e-9)
-
-
-@pytest.mark.parametrize("car", [0.8, 1.0, 2.0])
-@pytest.mark.parametrize("number", [0, 1])
-def test_the_distance_of_a_region_from_the_ground_is_told(flow, car, number):
-    """Whether it is too near or too far, and whichever component the ground is."""
-    component = np.where(BODY, 1 - number, number)
-    soup = moving(street(flow, car))
-    off = off_ground(flow, soup, component, ALL)
-    np.testing.assert_allclose(off[BODY], -np.log(car), atol=0.02)
-    # the wall is the scene, and the road no region
-    np.testing.assert_allclose(off[~BODY], 0.0, atol=1e-12)
-    assert (off_ground(flow, soup, component, BODY) == 0).all()
-
-
-def test_a_quarter_of_the_image_may_be_a_resting_table(flow):
-    table = (ROW >= 4) & (ROW <= 16) & (COLUMN >= 5) & (COLUMN <= 24)
-    assert table.mean() > 0.25
-    edge = flow.views.anchor[17 * COLUMNS, 1]
-    soup = moving(np.where(table, 0.5 * HIGH / edge, street(flow)))
-    assert (off_ground(flow, soup, SCENE, ALL) == 0).all()
-    # what moves is no table
-    off = off_ground(flow, soup, table.astype(int), ALL)
-    np.testing.assert_allclose(off[table], np.log(2), atol=0.1)
