@@ -15,6 +15,7 @@ from benchmarks.accuracy import comparison, read_pages, write_suite
 from benchmarks.family.instances import SCENES, SIZES, STARTS, VERSION, select
 from benchmarks.family.write import check_sol, family_tasks, write_family
 from benchmarks.scores import measure_pair
+from benchmarks.sigma import measure_terms, sigma_page
 from benchmarks.solvers import write_results
 from benchmarks.suites import SUITES, Options, list_suite
 from benchmarks.table import Cell, measure
@@ -84,6 +85,25 @@ def accuracy(
         write_suite(page, frame, f"Suite `{each}`: {SUITES[each].text}.")
         codes.append(finish(page, frame))
     return max(codes)
+
+
+@app.command()
+def sigma(
+    suite: Annotated[list[str], typer.Option(help=f"{', '.join(SUITES)}; may be repeated.")],
+    overrides: Set = None,
+    only: Only = None,
+    data: Data = None,
+    out: Out = Path("out/bench/sigma"),
+    width: Annotated[int, typer.Option(min=64, help="Columns of rendered scenes.")] = 1024,
+    workers: Workers = 1,
+) -> int:
+    """The factors of sigma, fitted with families left out in turn; a stopped run goes on."""
+    wanted = Options(("dis",), width, (0,), tuple(only or ()))
+    say = partial(print, file=sys.stderr)
+    items = [item for each in suite for item in list_suite(each, data, wanted, say)]
+    cells = [Cell(item, tuple(overrides or ())) for item in items]
+    frame = measure(cells, measure_terms, out / "sigma.jsonl", workers)
+    return finish(out / "sigma.md", frame, sigma_page(frame))
 
 
 @app.command()

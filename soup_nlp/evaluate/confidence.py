@@ -187,8 +187,9 @@ def confidence(
 ) -> Confidence:
     """The uncertainty of the depth of an answer.
 
-    Where the camera rests or only turns, where something is fixed in the image, and where a surface
-    is taken to bend although its flow jumps (`Start.unexplained`), sigma is that of what is drawn. Elsewhere the information of all terms and of a prior on the depths of a
+    Where the camera rests or only turns, where something is fixed in the image, and where a
+    surface is taken to bend although its flow jumps (`Start.unexplained`), sigma is that of
+    what is drawn. Elsewhere the information of all terms and of a prior on the depths of a
     scene add up; so does that of a depth prior.
 
     Args:

@@ -31,9 +31,6 @@ SCENE = 0
 """Index of the component that is the static scene: depths and motions refer to it."""
 
 
-CONTACT = 0.4
-"""Quantile of the depth ratios along a contact that is the scale of a component: it occludes what
-is behind it."""
 BELOW = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 TIES = (
