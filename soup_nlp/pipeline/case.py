@@ -23,7 +23,7 @@ from soup_nlp.start.components import TIES, TOO_FAST
 from soup_nlp.start.focal_length import focal_length
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import in_order
-from soup_nlp.start.prior_evidence import PIECES, PriorEvidence, judged
+from soup_nlp.start.prior_evidence import LEAST_SIGMA, PIECES, PriorEvidence, judged
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
 from soup_nlp.start.views import FlowFit
@@ -206,6 +206,10 @@ def build_energy(
     prior = None
     if given_depth is not None and given_depth.evidence.used:
         prior = given_depth.log_depth, given_depth.opened, given_depth.error
+    elif start.at_rest:
+        # nothing is measured: terms on shape must not undo what is drawn
+        drawn, one = np.log(start.soup.depth_at(data.anchor_ray)), np.ones(len(seg))
+        prior = drawn, one, LEAST_SIGMA * one
     placed = np.isin(start.tie, [TIES.index("occlusion"), TOO_FAST])
     known = Known(start.component, bends, start.variance, start.noise, start.order, placed, prior)
     data = weighted(data, start.soup, known, e)

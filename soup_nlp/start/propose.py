@@ -148,14 +148,16 @@ def propose(flow: FlowFit) -> Start:
     bends &= o.bending
     jumping = torn(flow, surface, bends)
     # the flow of bending regions is no evidence of the motions of rigid ones
-    rigid = flow.without(bends)
-    choice = None if bends.all() else labelled(rigid, motions)
-    turn = turn_alone(rigid, choice) if o.bending and choice is not None else None
-    if choice is None or turn is not None:
+    rigid = flow if bends.all() else flow.without(bends)
+    choice = labelled(rigid, motions)
+    turn = turn_alone(rigid, choice) if o.bending else None
+    if bends.all() or turn is not None:
         soup, error = constant_depth(flow.views, turn)
+        if turn is not None and o.upright:
+            soup = receding(flow.views, soup)
         every = np.ones(len(seg), bool)
         start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
-        shared = [] if choice is None else choice.motions
+        shared = [] if turn is None else choice.motions
         start = replace(start, motions=shared, surface=surface, bends=every, unexplained=jumping)
         return start if turn is None else replace(start, at_rest=True, part=parts_at_rest(flow))
     if not bends.any():
@@ -227,6 +229,21 @@ def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Ma
         slope = np.where(weak[:, None], 0.0, slope)
     R, t = stacked(choice.motions)
     return views.soup(mu, slope, R[choice.label], t[choice.label] * length[:, None]), weak
+
+
+RECEDES = 0.8
+"""Relative change of inverse depth from the top to the bottom of an upright image of a scene that
+two views tell nothing of: most scenes recede upwards. True depths of cameras at rest have slopes of
+0.2 to 3, about 1 in the middle."""
+
+
+def receding(views: Views, soup: Soup) -> Soup:
+    """A soup at depth 1 on one plane that recedes upwards by `RECEDES`, with the same flow."""
+    low, high = views.ray[..., 1].min(), views.ray[..., 1].max()
+    fall = RECEDES / max(high - low, 1e-9)
+    mu = 1 + fall * (views.anchor[:, 1] - (low + high) / 2)
+    slope = np.stack([0 * mu, fall * views.radius / mu], axis=1)
+    return views.soup(mu, slope, soup.R, soup.translation / mu[:, None])
 
 
 SMALL = 0.008
