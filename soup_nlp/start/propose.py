@@ -148,21 +148,19 @@ def propose(flow: FlowFit) -> Start:
     bends &= o.bending
     jumping = torn(flow, surface, bends)
     # the flow of bending regions is no evidence of the motions of rigid ones
-    rigid = flow if bends.all() else flow.without(bends)
-    choice = labelled(rigid, motions)
-    turn = turn_alone(rigid, choice) if o.bending else None
+    rigid = flow.without(bends)
+    turn = turn_alone(rigid) if o.bending and not bends.all() else None
     if bends.all() or turn is not None:
         soup, error = constant_depth(flow.views, turn)
         if turn is not None and o.upright:
             soup = receding(flow.views, soup)
         every = np.ones(len(seg), bool)
         start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
-        shared = [] if turn is None else choice.motions
-        start = replace(start, motions=shared, surface=surface, bends=every, unexplained=jumping)
+        start = replace(start, surface=surface, bends=every, unexplained=jumping)
         return start if turn is None else replace(start, at_rest=True, part=parts_at_rest(flow))
     if not bends.any():
         surface = connected_labels(flow.jump < o.discontinuity_px, seg)
-    choice = settle(rigid, choice)
+    choice = settle(rigid, labelled(rigid, motions))
     wrong = choice.unexplained & rigid.views.usable
     soup, weak = _with_depth(rigid, choice, wrong)
     label = component = choice.label
@@ -231,7 +229,7 @@ def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Ma
     return views.soup(mu, slope, R[choice.label], t[choice.label] * length[:, None]), weak
 
 
-RECEDES = 0.8
+RECEDES = 0.7
 """Relative change of inverse depth from the top to the bottom of an upright image of a scene that
 two views tell nothing of: most scenes recede upwards. True depths of cameras at rest have slopes of
 0.2 to 3, about 1 in the middle."""
