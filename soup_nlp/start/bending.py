@@ -28,12 +28,12 @@ REFERENCE = 1000
 with the diameter of the superpixel."""
 RELIEF = 0.5
 """Standard deviation of log depth within a scene."""
-AT_REST = 0.45
-"""Least share of what is seen that a turn alone explains if the camera rests: 0.48 to 1 on seven
-scenes before a camera at rest, at most 0.33 on 40 others that are rigid in part."""
+AT_REST = 0.8
+"""Least ratio of what a turn explains to what the main rigid motion explains, if the camera
+rests."""
 LEAST_GAP, TURN_PX, TURN_SHARE = 3.0, 0.03, 9e-5
-"""Error up to which a turn explains the flow: in units of the flow's noise, and in pixels, or as a
-share of the longer side of a small image."""
+"""Error up to which a motion explains the flow: in units of the flow's noise, and in pixels, or as
+a share of the longer side of a small image."""
 STEP, NEAREST = 1e-5, 1e-3
 """Step by which matrices of motions are differentiated, and least depth of a moved point."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
@@ -46,23 +46,25 @@ def reference_noise(residual: Float) -> float:
     return float(np.median(residual) * np.sqrt(len(residual) / REFERENCE))
 
 
-def turn_alone(flow: FlowFit) -> Float | None:
-    """The camera's (3, 3) rotation, if a turn explains the flow of `AT_REST` of what is seen.
+def turn_alone(flow: FlowFit, choice: Labelling) -> Float | None:
+    """The camera's (3, 3) rotation, if a turn explains nearly as much as the main motion does.
 
-    It explains a superpixel if the error beyond that of an affine flow is at most `LEAST_GAP`
-    noises, or `TURN_PX` (in a small image `TURN_SHARE` of its longer side). A zoom and a shift of
-    the next image are free, because they leave a residual that depths explain; the rotation itself,
-    which a shift can replace, is that of the plain turn.
+    Of what is seen it explains at least `AT_REST` of the superpixels that the main rigid motion
+    explains with depths. Explained is an error of at most `LEAST_GAP` noises beyond that of an
+    affine flow, or of `TURN_PX` (in a small image `TURN_SHARE` of its longer side). A zoom and a
+    shift of the next image are free, because they leave a residual that depths explain; the
+    rotation itself, which a shift can replace, is that of the plain turn.
     """
     at = np.flatnonzero(flow.views.usable)
     if not len(at):
         return None
-    excess = fit_turn(flow.views.subset(at), ANY_TURN)[1] - flow.residual[at]
     least = min(TURN_PX, TURN_SHARE * max(flow.seg.labels.shape))
-    explained = excess < max(least, LEAST_GAP * reference_noise(flow.residual))
-    if explained.mean() < AT_REST:
+    most = max(least, LEAST_GAP * reference_noise(flow.residual))
+    rigid = (choice.label == 0) & (choice.excess < most)
+    turned = fit_turn(flow.views.subset(at), ANY_TURN)[1] - flow.residual[at] < most
+    if not turned.any() or turned.sum() < AT_REST * rigid[at].sum():
         return None
-    return fit_turn(flow.views.subset(at[explained]))[0]
+    return fit_turn(flow.views.subset(at[turned]))[0]
 
 
 PLAIN_TURN, ANY_TURN = 4, 7

@@ -149,8 +149,9 @@ def propose(flow: FlowFit) -> Start:
     jumping = torn(flow, surface, bends)
     # the flow of bending regions is no evidence of the motions of rigid ones
     rigid = flow.without(bends)
-    turn = turn_alone(rigid) if o.bending and not bends.all() else None
-    if bends.all() or turn is not None:
+    choice = None if bends.all() else labelled(rigid, motions)
+    turn = turn_alone(rigid, choice) if o.bending and choice is not None else None
+    if choice is None or turn is not None:
         soup, error = constant_depth(flow.views, turn)
         if turn is not None and o.upright:
             soup = receding(flow.views, soup)
@@ -160,7 +161,7 @@ def propose(flow: FlowFit) -> Start:
         return start if turn is None else replace(start, at_rest=True, part=parts_at_rest(flow))
     if not bends.any():
         surface = connected_labels(flow.jump < o.discontinuity_px, seg)
-    choice = settle(rigid, labelled(rigid, motions))
+    choice = settle(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
     soup, weak = _with_depth(rigid, choice, wrong)
     label = component = choice.label
@@ -241,7 +242,7 @@ def receding(views: Views, soup: Soup) -> Soup:
     fall = RECEDES / max(high - low, 1e-9)
     mu = 1 + fall * (views.anchor[:, 1] - (low + high) / 2)
     slope = np.stack([0 * mu, fall * views.radius / mu], axis=1)
-    return views.soup(mu, slope, soup.R, soup.translation / mu[:, None])
+    return views.soup(mu, slope, soup.R, soup.translation / mu[:, None]).normalised()
 
 
 SMALL = 0.008
