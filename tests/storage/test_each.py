@@ -100,6 +100,8 @@ def wait(number):
     time.sleep(60 * number)
     return {"process": os.getpid()}
 
+# a shell lets its background jobs ignore the signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
 rows = each({"0": partial(wait, 0), "1": partial(wait, 1), "2": partial(wait, 2)}, 2)
 try:
     for name, row in rows:
