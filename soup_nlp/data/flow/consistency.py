@@ -22,6 +22,8 @@ consistent at a single pixel, but rarely in a whole window."""
 
 LIMIT = 3.0
 """Round-trip error, pixels, above which a flow is not used: its confidence would be 0.0001."""
+MOST = 5.0
+"""Largest error that counts in the mean of a window, pixels."""
 
 
 def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
@@ -65,16 +67,17 @@ def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.boo
 def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:
     """(H, W) confidence in [0, 1] of a round-trip error.
 
-    With e the error and E the larger of e and the mean of min(e, `LIMIT`) over a window, the
-    confidence is `exp(-E^2)`, E in pixels, and 0 where e > `LIMIT`.
+    With e the error and E the larger of e and the mean of min(e, `MOST`) over a window, the
+    confidence is `exp(-E^2)`, E in pixels, and 0 where E > `LIMIT`.
 
     Args:
         gap: (H, W) round-trip error, pixels; infinite where the flow leaves the next image.
         support: Side of the window for the mean error, odd, pixels.
     """
-    known = np.minimum(gap, LIMIT)
-    mean = np.maximum(known, cv2.blur(known, (support, support)))
-    return np.where(gap <= LIMIT, np.exp(-np.square(mean)), 0.0).astype(np.float32)
+    gap = np.maximum(gap, cv2.blur(np.minimum(gap, MOST), (support, support)))
+    confidence = np.exp(-np.square(np.minimum(gap, LIMIT)), dtype=np.float32)
+    confidence[~(gap <= LIMIT)] = 0.0
+    return np.asarray(confidence, dtype=np.float32)
 
 
 BETTER = 0.8

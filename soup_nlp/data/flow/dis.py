@@ -3,7 +3,8 @@
 A coarse-to-fine search loses large displacements with a change of scale, such as those of the
 ground near a driving camera. The dominant homographies of a first flow explain most of such a
 motion. The flow is therefore computed again on images that a homography aligns: the remaining
-displacements are small. The new flow is used where its round trip closes better.
+displacements are small. The new flow is used where its round trip closes better than the first one.
+What still has no flow may be small surfaces that move far (`soup_nlp.data.flow.tiles`).
 """
 
 from collections.abc import Callable
@@ -12,24 +13,22 @@ import cv2
 import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap, Image
-from soup_nlp.data.flow.consistency import LIMIT, SUPPORT, confidence_of, round_trip_error
+from soup_nlp.data.flow.consistency import confidence_of, round_trip_error, sampled
+from soup_nlp.data.flow.tiles import with_tiles
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
 Match = Callable[[Image, Image], tuple[FloatMap, FloatMap]]
-"""Forward and backward flow of two grey images."""
+"""Forward and backward flow of two grey images of one size."""
 
-PLANES = 4
-"""Dominant homographies under which the flow is computed again."""
-LEAST_SHARE = 0.03
-"""Share of the confident pixels that a homography must explain."""
-MARGIN = 0.3
-"""By how much the round trip of a flow under a homography must close better, pixels."""
-STRIDE, ITERATIONS, ALPHA, DELTA = 2, 20, 30.0, 1.0
-"""Denser patches than OpenCV's medium preset (stride 3), and a longer and smoother refinement with
-less weight on intensities (5, 20, 5): the error falls on driving, indoor and rendered pairs."""
-MIN_SIDE = 16
-"""Smallest image side for DIS, pixels; smaller than 64, images are padded."""
+_STEP = 4  # homographies are fitted to every fourth pixel of both directions
+_SURE = 0.5  # confidence above which a pixel is fitted
+_LEAST = 0.03  # share of the confident pixels that a homography must explain
+_INLIER = 2.0  # pixels
+_ROUND_TRIP_CAP = 3.0  # pixels
+_WINDOW = 25  # side of the window of a score, pixels
+_MARGIN = 0.3  # by how much a flow under a homography must be better, pixels
+_GREY_CAP, _PER_GREY = 30.0, 0.05  # cap of a difference in grey levels; pixels per grey level
 
 
 def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> list[Float]:
@@ -43,14 +42,15 @@ def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> l
     Returns:
         (3, 3) maps from reference to next pixels, the dominant one first.
     """
-    # every fourth pixel of both directions
-    v, u = np.nonzero(confidence[::4, ::4] > 0.5)
-    ref = 4.0 * np.stack([u, v], axis=-1)
-    target = ref + flow[4 * v, 4 * u]
-    least = max(20.0, LEAST_SHARE * len(ref))
+    height, width = confidence.shape
+    v, u = np.mgrid[0:height:_STEP, 0:width:_STEP]
+    sure = confidence[::_STEP, ::_STEP] > _SURE
+    ref = np.stack([u[sure], v[sure]], axis=-1).astype(np.float64)
+    target = ref + flow[::_STEP, ::_STEP][sure]
+    least = max(20.0, _LEAST * len(ref))
     out: list[Float] = []
     while len(out) < count and len(ref) >= least:
-        H, inlier = cv2.findHomography(ref, target, cv2.USAC_MAGSAC, 2.0, maxIters=2000)
+        H, inlier = cv2.findHomography(ref, target, cv2.USAC_MAGSAC, _INLIER, maxIters=2000)
         if H is None or inlier is None or inlier.sum() < least:
             break
         out.append(np.asarray(H, dtype=np.float64))
@@ -59,30 +59,36 @@ def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> l
     return out
 
 
-def guided_flow(ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, FloatMap]:
+def guided_flow(
+    ref: Image, nxt: Image, match: Match, forward: FloatMap, backward: FloatMap
+) -> tuple[FloatMap, FloatMap]:
     """The best, for each pixel, of a flow and of flows found under its dominant homographies.
 
-    The score of a flow is the mean over a window of its limited round-trip error. A flow under a
-    homography must be better than the first flow by `MARGIN`.
+    The score of a flow is the mean over a window of its round-trip error and of the grey-level
+    difference between a pixel and its target. A flow under a homography must be better than the
+    first flow by a margin.
 
     Args:
         ref: (H, W) grey reference image.
         nxt: (H', W') grey next image.
         match: The flow method.
+        forward: (H, W, 2) first flow.
+        backward: (H', W', 2) first flow in the other direction.
 
     Returns:
         (H, W, 2) flow and (H, W) its round-trip error, both in pixels.
     """
-    best, backward = match(ref, nxt)
-    gap = round_trip_error(best, backward)
-    score = _score(gap)
-    # a small window: the near ground has usable flow in small pieces
-    for H in dominant_homographies(best, confidence_of(gap, support=5), PLANES):
+    gap = round_trip_error(forward, backward)
+    maps = dominant_homographies(forward, confidence_of(gap, support=5), PLANES)
+    best, best_gap = forward.copy(), gap
+    best_score = _score(ref, nxt, forward, gap)
+    for H in maps:
         flow, error = _under(H, ref, nxt, match)
-        new = _score(error) + MARGIN
-        better = new < score
-        best[better], gap[better], score[better] = flow[better], error[better], new[better]
-    return best, gap
+        score = _score(ref, nxt, flow, error) + _MARGIN
+        better = score < best_score
+        best[better], best_gap[better] = flow[better], error[better]
+        best_score = np.minimum(score, best_score)
+    return best, best_gap
 
 
 def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, FloatMap]:
@@ -105,19 +111,43 @@ def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, Fl
     return flow.astype(np.float32), gap
 
 
-def _score(gap: FloatMap) -> FloatMap:
-    score = cv2.blur(np.minimum(gap, LIMIT), (SUPPORT, SUPPORT))
-    return np.where(np.isfinite(gap), score, 2 * LIMIT).astype(np.float32)
+def _score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap) -> FloatMap:
+    height, width = ref.shape
+    v, u = np.mgrid[0:height, 0:width].astype(np.float32)
+    target = sampled(nxt, u + flow[..., 0], v + flow[..., 1])
+    grey = np.minimum(np.abs(target - ref), _GREY_CAP)
+    cost = np.minimum(gap, _ROUND_TRIP_CAP) + np.float32(_PER_GREY) * grey
+    score = cv2.blur(cost.astype(np.float32), (_WINDOW, _WINDOW))
+    score[~np.isfinite(gap)] = 2 * (_ROUND_TRIP_CAP + _PER_GREY * _GREY_CAP)
+    return np.asarray(score, dtype=np.float32)
+
+
+MIN_SIDE = 16
+"""Smallest image side for DIS, pixels."""
+
+FINEST_SCALE, PATCH_SIZE, PATCH_STRIDE = 0, 8, 2
+"""Full resolution, and denser patches than in OpenCV's medium preset (stride 3)."""
+ITERATIONS, ALPHA, DELTA, GAMMA = 20, 30.0, 1.0, 10.0
+"""Longer and smoother refinement than the preset (5 iterations, alpha 20), with less weight on
+intensities (preset: delta 5): the error falls on driving, indoor and rendered pairs."""
+PLANES = 4
+"""Dominant homographies under which the flow is computed again."""
+
+_FLAT = 1.0  # standard deviation in grey levels of an image without contrast
+_WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padded
 
 
 def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> Flow:
     """Dense inverse search flow (Kroeger et al., ECCV 2016) with forward-backward confidence.
 
-    It is computed in both directions, and again after
-    each of the dominant homographies has aligned the images (`guided_flow`). The confidence follows
-    from the round-trip error (`confidence_of`). A wrong but consistent flow, as on weak texture,
-    keeps its confidence. An image without contrast (standard deviation below one grey level) gives
-    a zero flow with confidence 0.
+    The flow is computed in both directions, and again after each of the dominant homographies
+    (`PLANES`) has aligned the images. The better one is used for each pixel (`guided_flow`), since
+    displacements near a driving camera are too large for a coarse-to-fine search alone. Small
+    surfaces that move far are searched for by their tiles (`with_tiles`).
+
+    The confidence follows from the round-trip error (`confidence_of`). A wrong but consistent flow,
+    as on weak texture, keeps its confidence. An image without contrast (standard deviation below
+    one grey level) gives a zero flow with confidence 0.
 
     Args:
         image_ref: (H, W, 3) uint8 RGB reference image.
@@ -136,18 +166,21 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
                 expected=f"at least {MIN_SIDE} pixels on each side",
             )
     ref, nxt = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (image_ref, image_next))
-    if min(float(ref.std()), float(nxt.std())) < 1.0:
-        zero = np.zeros((*ref.shape, 3), np.float32)
-        return Flow(zero[..., :2], zero[..., 2], "dis")
+    height, width = ref.shape
+    if min(float(ref.std()), float(nxt.std())) < _FLAT:
+        zero = np.zeros((height, width), np.float32)
+        return Flow(np.zeros((height, width, 2), np.float32), zero, "dis")
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    dis.setFinestScale(0)
-    dis.setPatchStride(STRIDE)
+    dis.setFinestScale(FINEST_SCALE)
+    dis.setPatchSize(PATCH_SIZE)
+    dis.setPatchStride(PATCH_STRIDE)
     dis.setVariationalRefinementIterations(ITERATIONS)
     dis.setVariationalRefinementAlpha(ALPHA)
     dis.setVariationalRefinementDelta(DELTA)
+    dis.setVariationalRefinementGamma(GAMMA)
 
     def match(first: Image, second: Image) -> tuple[FloatMap, FloatMap]:
-        size = np.maximum(np.maximum(first.shape, second.shape), 4 * MIN_SIDE)
+        size = np.maximum(np.maximum(first.shape, second.shape), _WORK_SIDE)
         # the last row and column are repeated up to a common size
         a, b = (
             np.pad(image, [(0, n - m) for n, m in zip(size, image.shape, strict=True)], mode="edge")
@@ -156,6 +189,7 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
         (h1, w1), (h2, w2) = first.shape, second.shape
         return dis.calc(a, b, None)[:h1, :w1], dis.calc(b, a, None)[:h2, :w2]
 
-    uv, gap = guided_flow(ref, nxt, match)
+    uv, gap = guided_flow(ref, nxt, match, *match(ref, nxt))
+    uv, gap = with_tiles(ref, nxt, match, uv, gap)
     confidence = confidence_of(gap) if consistency else np.isfinite(gap)
     return Flow(np.ascontiguousarray(uv), confidence.astype(np.float32), "dis")
