@@ -9,13 +9,14 @@ from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_depth, follow_flow
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.working_size import resized_flow, working_size
+from soup_nlp.data.working_size import working_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import Labels, segment
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import BENDING_ARAP, WIDEST_BENDING_EPS, Weights
 from soup_nlp.model.reweighting import Known, in_pixels, in_translations, weighted
+from soup_nlp.pipeline.flow import with_flow
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
@@ -108,11 +109,7 @@ def _observed(
         (h, w), (rows, columns) = full.size, pair.size
         log(f"{w}x{h} is solved at {columns}x{rows} (max_size {problem.max_size:g} megapixels)")
     done("load")
-    flow = pair.flow
-    if flow is None and pair is not full and problem.flow.is_file():
-        # a flow file has the size of the original images
-        flow = resized_flow(problem.flow.load(full, problem.path), full, pair)
-    pair = pair.with_flow(flow or problem.flow.load(pair, problem.path))
+    pair = with_flow(problem, full, pair, log)
     done("flow", pair)
     labels = superpixels(problem, pair)
     seg = _segmented(problem, pair, labels)

@@ -44,6 +44,28 @@ def test_noise_has_its_size_and_correlation_length(pair):
     assert not is_named("flow.flo")
 
 
+def test_black_bars_have_no_confidence(pair):
+    above, left = 16, 24
+
+    def coded(image):
+        frame = cv2.copyMakeBorder(image, above, 8, left, 0, cv2.BORDER_CONSTANT)
+        data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 50])[1]
+        return cv2.imdecode(data, cv2.IMREAD_COLOR)
+
+    frames = coded(pair.image_ref), coded(pair.image_next)
+    flow = resolve_flow(Pair(*frames, pair.K_ref, pair.K_next), "dis")
+    inside = np.s_[above : 96 + above, left:]
+    assert flow.confidence[inside].mean() > 0.5
+    bar = np.ones(flow.confidence.shape, bool)
+    bar[inside] = False
+    assert flow.confidence[bar].max() == 0.0
+    # dark in one of the frames only
+    night = pair.image_ref.copy()
+    night[:30] = 0
+    whole = resolve_flow(Pair(night, pair.image_next, pair.K_ref, pair.K_next), "dis")
+    assert whole.confidence[:30].max() > 0.0
+
+
 @pytest.fixture(scope="module")
 def onnx():
     pytest.importorskip("onnxruntime", reason="onnxruntime is not installed (extra onnx)")

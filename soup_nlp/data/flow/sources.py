@@ -36,6 +36,9 @@ NOISE = "truth+noise:"
 CORRELATION = 5.0
 """Standard deviation of the Gaussian that blurs the noise, pixels."""
 
+BLACK = 24
+"""Largest grey level of a black bar: black of limited range is 16, and its coding has errors."""
+
 
 def load_flow(path: PathLike) -> Flow:
     """A Flow of a file (.flo, KITTI .png, .npy) with confidence 1 where known, else 0.
@@ -105,6 +108,9 @@ class FlowOptions(Section):
     consistency: bool = True
     """Weight a vector of DIS, or of a file with a backward flow, by how well its round trip closes;
     if false, all vectors that stay in the image have the same weight, as in the paper."""
+    see_through: bool = True
+    """Search for the flow behind a layer that stands still before the scene, such as a reflection
+    in a windscreen, if the flow is computed."""
 
     def load(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
         """The flow of a pair.
@@ -200,11 +206,11 @@ def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
         DataError: the source is unknown or fails, or its flow has another size.
     """
     if source == "dis":
-        return dis_flow(pair.image_ref, pair.image_next, consistency)
+        return _without_bars(dis_flow(pair.image_ref, pair.image_next, consistency), pair)
     if source == "truth" or source.startswith(NOISE):
         return flow_from_truth(pair, source)
     if is_network(source):
-        return learned_flow(source, pair.image_ref, pair.image_next)
+        return _without_bars(learned_flow(source, pair.image_ref, pair.image_next), pair)
     plugins = flow_sources()
     if source in plugins:
         return _run_plugin(plugins[source], pair)
@@ -219,6 +225,15 @@ def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
     pair.with_flow(flow)  # checks its size
     check_flow(flow, pair)
     return flow
+
+
+def _without_bars(flow: Flow, pair: Pair) -> Flow:
+    """A flow with confidence 0 in rows and columns that are black in both frames."""
+    if pair.image_ref.shape != pair.image_next.shape:
+        return flow
+    light = np.maximum(pair.image_ref, pair.image_next).max(axis=2) > BLACK
+    inside = light.any(axis=1)[:, None] & light.any(axis=0)
+    return Flow(flow.uv, flow.confidence * inside, flow.source)
 
 
 def _run_plugin(point: EntryPoint, pair: Pair) -> Flow:
