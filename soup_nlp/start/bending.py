@@ -260,7 +260,7 @@ def torn(flow: FlowFit, surface: Int, bends: Mask) -> Mask:
 TELLS = 7.0
 """Ratio of what depth explains to what it leaves from which the flow tells of depth. Of rigid pairs
 `sun3d_lounge` and `s7_kitchen_150` have the least, 7.8; `rgbd/opening_door`, which bends, 6.5."""
-NOISES, SYSTEMATIC, LEAST_PX, MOST_PX = 2.5, 4.0, 0.01, 0.1
+NOISES, SYSTEMATIC, LEAST_PX, MOST_PX = 2.5, 4.0, 0.01, 0.08
 """Median excess of the error, in units of the noise, from which a surface may bend; below
 `SYSTEMATIC` noises, within these limits in pixels, it never does."""
 LEAST_LEFT = 15

@@ -29,6 +29,14 @@ SMALL = sets(
 )
 
 
+@pytest.fixture(autouse=True)
+def heard():
+    """Ctrl-C is heard: it is ignored where the tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def solve(out: Path) -> int:
     return cli.main(["solve", "orbit", "--out", str(out), "-q", *SMALL])
 
@@ -88,11 +96,9 @@ def test_an_interrupt_that_a_library_turns_into_another_error(tmp_path, monkeypa
 
 def test_a_second_interrupt_aborts_with_a_message(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(cases, "propose", lambda *args: ctrl_c(2))
-    # ignored where the tests run in the background of a shell
-    before = signal.getsignal(signal.SIGINT)
     assert solve(tmp_path / "out") == 130
     assert "no result is written" in capfd.readouterr().err
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 LOG = solve_module.options.SolveLog

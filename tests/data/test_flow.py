@@ -163,10 +163,10 @@ def test_a_larger_next_image_is_searched_as_a_whole() -> None:
         np.random.default_rng(1).integers(0, 256, (96, 400, 3), np.uint8), (0, 0), 2
     )
     # what leaves the size of the reference image is still in the next one
-    pair = Pair(wide[:, 100:260], wide[:, 90:330], K, K)
+    pair = Pair(wide[:, 100:260], wide[:, 60:300], K, K)
     flow = resolve_flow(pair, "dis")
-    assert flow.confidence[:, 150:].mean() > 0.9
-    np.testing.assert_allclose(np.median(flow.uv[:, 150:], axis=(0, 1)), [10, 0], atol=0.1)
+    assert flow.confidence[:, 130:].mean() > 0.9
+    np.testing.assert_allclose(np.median(flow.uv[:, 130:], axis=(0, 1)), [40, 0], atol=0.1)
 
 
 PLUGINS = SimpleNamespace(
@@ -259,6 +259,36 @@ def test_homographies_are_recovered_one_after_the_other():
         np.testing.assert_allclose(H / H[2, 2], true, atol=1e-3, rtol=1e-3)
     assert dominant_homographies(flow, np.zeros((HEIGHT, WIDTH), np.float32), 4) == []
     assert len(dominant_homographies(flow, np.ones((HEIGHT, WIDTH), np.float32), 1)) == 1
+
+
+def test_a_first_flow_that_is_half_wrong_is_completed(monkeypatch):
+    """The first flow is right on the left only; under its homography it is right everywhere."""
+    first, second = images(ROAD)
+    true = truth(ROAD)
+    ref, nxt = first[..., 0], second[..., 0]
+    left_half = np.arange(WIDTH)[None, :] < WIDTH // 2
+    forward = np.where(left_half[..., None], true, 0.0).astype(np.float32)
+    backward = np.full((HEIGHT, WIDTH, 2), 50.0, np.float32)
+    back = truth(np.linalg.inv(ROAD))
+    backward[:, : WIDTH // 2] = back[:, : WIDTH // 2]
+
+    flow, gap = guided_flow(ref, nxt, match, forward, backward)
+    at = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1) + true
+    inside = ((at > 8) & (at < [WIDTH - 9, HEIGHT - 9])).all(axis=-1)
+    right = inside & ~left_half
+    right[:, : WIDTH // 2 + 20] = False
+    assert right.sum() > 3000
+    error = np.linalg.norm(flow - true, axis=-1)
+    assert np.median(error[right]) < 0.2
+    assert np.median(confidence_of(gap)[right]) > 0.8
+    # pixels whose target is outside the next image are never certain
+    outside = ((at < -0.5) | (at > [WIDTH - 0.5, HEIGHT - 0.5])).any(axis=-1)
+    assert outside.any()
+    assert confidence_of(gap)[outside & ~left_half].max(initial=0.0) < 0.5
+    # no homography: the first flow is returned
+    monkeypatch.setattr(dis, "PLANES", 0)
+    same, _ = guided_flow(ref, nxt, match, forward, backward)
+    np.testing.assert_array_equal(same, forward)
 
 
 @pytest.mark.parametrize(("planes", "least", "most"), [(0, 0.0, 0.3), (4, 0.7, 1.0)])

@@ -106,7 +106,7 @@ def test_sheet_bends_and_can_be_told_not_to():
 
 @pytest.mark.parametrize("count", [60, 600])
 @pytest.mark.parametrize(
-    ("scene", "least", "most"), [("sheet", 0.9, 1), ("banner", 0.2, 0.45), ("street", 0, 0)]
+    ("scene", "least", "most"), [("sheet", 0.9, 1), ("banner", 0.2, 0.4), ("street", 0, 0)]
 )
 def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least, most, count):
     wide = "input.width=512", "input.height=218"
@@ -123,7 +123,7 @@ def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least,
 def test_a_rigid_room_does_not_bend_with_its_banner(seed, least):
     banner = problem("banner", f"input.seed={seed}")
     start = prepare(banner, pair=banner.load_pair()).start
-    assert least < start.bends.mean() < 0.45
+    assert least < start.bends.mean() < 0.41
 
 
 def test_a_bending_region_whose_flow_jumps_is_torn():
@@ -280,10 +280,10 @@ def test_noise_where_surfaces_bend_is_that_of_affine_flows():
     assert quiet.noise == LEAST_NOISE
     assert np.median(quiet.error) > LEAST_NOISE
     raw = {"kind": "scene", "scene": "sheet", "seed": 0, "width": 768, "height": 327}
-    raw = {"input": raw, "flow": {"source": "truth+noise:0.08"}}
+    raw = {"input": raw, "flow": {"source": "truth+noise:0.11"}}
     noisy = prepare(make_problem(raw, ["segmentation.superpixels=150"])).start
     assert noisy.bending
-    assert LEAST_NOISE < noisy.noise < 0.5
+    assert 2 * LEAST_NOISE < noisy.noise < 0.5
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,8 @@ def test_a_swinging_object_comes_before_the_wall(swing):
         z = s.soup.depth_at(camera.rays(pair.K_ref, seg.anchors))
         return float(np.mean(z[i] > z[k]))
 
-    assert right(start) > right(before) + 0.1
+    # of what is wrong before, little is left
+    assert 1 - right(start) < min(0.05, 0.3 * (1 - right(before)))
     # depths determined by parallax keep their shape
     main = start.component == np.argmax(np.bincount(start.component))
     ratio = start.soup.distance[main] / before.soup.distance[main]

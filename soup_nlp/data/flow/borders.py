@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.data.pair import Flow
@@ -19,7 +20,7 @@ SCALE_PX = 0.25
 """Smallest residual that a fit may treat as an outlier, pixels."""
 ROUNDS = 4
 """Re-weighted fits of an affine flow."""
-SWEEPS = 8
+SWEEPS = 12
 """Number of sweeps, in each of which a border moves at most one pixel, after each of two fits."""
 LEAST_STEP = 0.05
 """Least reduction of the residual of log depth for which a pixel changes its superpixel."""
@@ -124,7 +125,7 @@ def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Flo
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
     s is the larger of `SCALE_PX` and 1.48 times the weighted mean absolute residual of the
-    superpixel. The first weights are those of the distance to its mean flow, since plain least
+    superpixel. The first weights are those of the distance to its median flow, since plain least
     squares would fit a slope across two motions without outliers.
 
     Args:
@@ -145,7 +146,7 @@ def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Flo
     X = fit.basis(which, u, v)
     Y = flow.uv[v, u].astype(np.float64)
     C, weight = fit.coefficients, np.ones(len(which))
-    C[:, 0] = np.stack([np.bincount(which, base * y, n) / total for y in Y.T], axis=1)
+    C[:, 0] = np.stack([median(y, which, np.arange(n)) for y in flow.uv[v, u].T], axis=1)
     for k in range(ROUNDS):
         C = _weighted(which, X, Y, base * weight, n) if k else C
         r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, C[which]), axis=1)
