@@ -20,9 +20,7 @@ PIXELS = 6000
 """Largest number of moving pixels to which their motion is fitted."""
 
 
-def with_flow(
-    problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] | None
-) -> Pair:
+def with_flow(problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] | None) -> Pair:
     """A pair with its flow, searched for behind a layer that stands still if there is one.
 
     `full` is the pair at its own size; `log` is called with a line if there is such a layer.
