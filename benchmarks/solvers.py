@@ -12,7 +12,7 @@ from benchmarks.table import markdown, panels, save
 from soup_nlp.storage.each import Row
 from soup_nlp.storage.files import write_json
 
-PROBLEM = ["problem", "superpixels", "formulation", "problem_hash"]
+PROBLEM = ["problem", "superpixels", "formulation", "identity"]
 """Columns that identify a problem."""
 LABELS = {
     "cpu": "CPU time / best CPU time",

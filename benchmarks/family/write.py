@@ -221,7 +221,7 @@ def family_tasks(folder: Path) -> Iterator[Labelled]:
         instance = parse_name(name)
         label = {
             "problem": f"{instance.scene} {instance.start}",
-            "problem_hash": VERSION,
+            "identity": VERSION,
             "superpixels": instance.size,
             "formulation": instance.formulation,
             "start": instance.start,

@@ -2,12 +2,10 @@
 
 import csv
 import io
-import json
 import os
 import socket
 import threading
 import time
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -19,21 +17,15 @@ import psutil
 
 from soup_nlp.batches.page import page
 from soup_nlp.batches.sources import Source, problems_of
-from soup_nlp.config.identity import identity
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError, SoupError
-from soup_nlp.pipeline.case import solve_bytes
-from soup_nlp.report.folder import run
-from soup_nlp.report.verdict import exit_code
+from soup_nlp.report.pairs import PAIRS, ROWS, fitting, head, kept_rows, needed_bytes, solve_into
 from soup_nlp.storage.each import Row, each, failure
 from soup_nlp.storage.files import as_path, write_text
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.rows import Say, append_row, failed, read_rows, reason
-from soup_nlp.storage.versions import code_version
+from soup_nlp.storage.rows import Say, append_row, failed, reason
 
 FILES = ("table.csv", "index.html")
-ROWS = "pairs.jsonl"
-"""Every row that was ever made; the last good one of a pair counts."""
 COLUMNS = (
     *("pair", "exit_code", "reason", "mre", "constant", "guess", "seconds", "cpu_seconds"),
     *("peak_bytes", "superpixels", "seed", "code", "identity"),
@@ -97,18 +89,16 @@ def batch(
     problems = problems_of(pairs, overrides)
     claim(folder, FILES, overwrite, journal=ROWS)
     rows: dict[str, Row] = {}
-    heads, needs = {}, 0.0
+    heads, needs = dict[str, Row](), 0.0
     for name, problem in problems.items():
-        heads[name] = head = {"key": name, "pair": name, "seed": problem.seed}
         try:
-            head |= {"identity": identity(problem), "code": code_version()}
-            parts = solve_bytes(problem, problem.load_pair())
-            needs = max(needs, sum(size for size, _ in parts.values()))
+            heads[name] = head(problem)
+            needs = max(needs, needed_bytes(problem))
         except SoupError as error:
-            rows[name] = {**head, **failure(f"{type(error).__name__}: {error}")}
+            rows[name] = {"key": name, "pair": name, "seed": problem.seed}
+            rows[name] |= failure(f"{type(error).__name__}: {error}")
     left = [name for name in problems if name not in rows]
-    free = psutil.virtual_memory().available
-    workers = max(1, min(workers, int(free / max(needs, 1.0))))
+    workers = fitting(workers, needs)
     token = f"{socket.gethostname()} {os.getpid()} {time.time_ns()}"
 
     told = [0.0]
@@ -133,12 +123,12 @@ def batch(
 
     with _alive(folder, left, token):
         while left:
-            rows |= _stored(folder, [heads[name] for name in left], retry_failed)
+            known = kept_rows(folder, {name: heads[name] for name in left})
+            rows |= {k: row for k, row in known.items() if not (retry_failed and failed(row))}
             todo = [name for name in left if name not in rows]
-            size = (folder / ROWS).stat().st_size if (folder / ROWS).is_file() else 0
             home = folder.absolute()
             works = {
-                name: partial(_solve, problems[name], home, heads[name], token, size)
+                name: partial(_solve, problems[name], home, heads[name], token, known.get(name))
                 for name in todo
             }
             tell()
@@ -161,60 +151,23 @@ def batch(
     return Batch([rows[name] for name in problems], folder)
 
 
-def _stored(folder: Path, heads: Sequence[Row], retry_failed: bool) -> dict[str, Row]:
-    """Rows of an earlier or another run that have the same input and code, by name."""
-    out: dict[str, Row] = {}
-    wanted = {head["key"]: head for head in heads}
-    for row in read_rows(folder / ROWS):
-        head = wanted.get(str(row.get("key")))
-        if head is None or any(row.get(k) != head.get(k) for k in ("identity", "code")):
-            continue
-        gone = not failed(row) and not (folder / "pairs" / head["key"] / "result.h5").is_file()
-        if not gone and not (failed(row) and (retry_failed or head["key"] in out)):
-            out[head["key"]] = row
-    return out
-
-
 def _mark(folder: Path, name: str) -> Path:
     """File that exists while a run solves a pair."""
-    return folder / "pairs" / f"{name}.claim"
+    return folder / PAIRS / f"{name}.claim"
 
 
-def _solve(problem: Problem, folder: Path, head: Row, token: str, size: int) -> Row:
+def _solve(problem: Problem, folder: Path, own: Row, token: str, before: Row | None) -> Row:
     """Solve a pair into its folder, unless another run does or did: then the row says "claimed".
 
-    `size` is that of the file of rows when this run read it.
+    `own` is the head of its row, `before` its row when this run looked.
     """
     mark = _mark(folder, problem.name)
     if not _claimed(mark, token):
         return {"claimed": True}
-    if any(all(row.get(k) == head[k] for k in head) for row in _rows_after(folder / ROWS, size)):
+    if kept_rows(folder, {problem.name: own}).get(problem.name) != before:
         mark.unlink(missing_ok=True)
         return {"claimed": True}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        solved = run(problem)
-        solved.save(folder / "pairs" / problem.name)
-    code, why = exit_code(solved, problem.expected.mre_at_most)
-    scores = {name: m.mre for name, m in solved.metrics.items()}
-    return {
-        "exit_code": code,
-        "reason": why,
-        "mre": scores.get("solution"),
-        "constant": scores.get("constant"),
-        "guess": solved.confidence.guessed,
-        "superpixels": len(solved),
-        "warnings": [str(w.message) for w in caught],
-    }
-
-
-def _rows_after(path: Path, size: int) -> Iterator[Row]:
-    """Rows of a file beyond its first bytes."""
-    with suppress(OSError), path.open("rb") as file:
-        file.seek(size)
-        for line in file.read().decode(errors="replace").splitlines():
-            with suppress(ValueError):
-                yield json.loads(line)
+    return solve_into(problem, folder)
 
 
 def _claimed(mark: Path, token: str) -> bool:

@@ -18,6 +18,7 @@ from soup_nlp.evaluate.metrics import Scale
 from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
 from soup_nlp.geometry.constraints import table
+from soup_nlp.report.chain import Lazy
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.formats import FORMATS
 from soup_nlp.report.result import PAGE
@@ -86,7 +87,7 @@ def evaluate(
         )
     if chain:
         files = numbered_files(depth, DEPTHS, "true depth", "depth_*")
-        truths = [read_depth(file, depth_scale) for file in files]
+        truths = Lazy(lambda k: read_depth(files[k], depth_scale), len(files))
         poses = None if path is None else read_path(path)
         print("\n".join(score_lines(score(read_chain(folder), truths, poses))))
         return

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from soup_nlp.config.identity import identity
 from soup_nlp.export.artefact import form_label
 from soup_nlp.export.solvers import WALL_PER_CPU, Answer, Task, find_solver
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
@@ -30,7 +31,7 @@ Build = Callable[[], tuple[NLP, Layout, Formulation]]
 Labelled = tuple[Label, Callable[[Limits], Task]]
 """Entries of the rows of a task, and what makes the task."""
 
-KEY = ("problem", "problem_hash", "superpixels", "formulation", "start")
+KEY = ("problem", "identity", "superpixels", "formulation", "start")
 """Entries of a label that identify a task."""
 BUILDING = 600.0
 """Wall seconds for building an NLP, which the limits of a run do not count."""
@@ -81,7 +82,7 @@ def problem_task(case: Case, coordinates: str) -> Labelled:
     ceiling = oracle.energy(case.start.soup, case.data, case.weights)["total"]
     label = {
         "problem": case.problem.name,
-        "problem_hash": case.problem.digest(),
+        "identity": identity(case.problem),
         "superpixels": len(case),
         "formulation": form_label(form),
         "start": "proposal",
@@ -105,10 +106,10 @@ def compare(
     """
     jobs = []
     for label, make in tasks:
-        identity = {k: label[k] for k in KEY} | {"limits": asdict(limits)}
+        name = {k: label[k] for k in KEY} | {"limits": asdict(limits)}
         for solver in dict.fromkeys(solvers):
             work = partial(run_row, make, label, solver, limits)
-            jobs.append(Job({**identity, "solver": solver}, work))
+            jobs.append(Job({**name, "solver": solver}, work))
     wall = BUILDING + WALL_PER_CPU * limits.seconds
     told: dict[str, Any] = {"say": lambda done, total, row: say(one_line(row)), "after": after}
     return measure_all(jobs, path, fresh=True, seconds=wall, **told)

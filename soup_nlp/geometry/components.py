@@ -1,7 +1,7 @@
 """The rigid components of a solved soup: their pixels and their motions."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,11 @@ class Component:
         )
 
     __repr__ = __str__
+
+    def scaled(self, factor: float) -> "Component":
+        """The same in another unit of length, of which `factor` are one of now."""
+        motion = RigidMotion(self.motion.R, factor * self.motion.t)
+        return replace(self, motion=motion, centre=factor * self.centre)
 
 
 @dataclass(frozen=True, eq=False)

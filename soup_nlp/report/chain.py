@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,76 @@ AXES = "x right, y down, z ahead"
 """Axes of a camera, in words."""
 STILL = RigidMotion(np.eye(3), np.zeros(3))
 """The identity."""
+
+
+NEAR = 5
+"""Number of pairs of a chain that are in memory at once: clouds compare a frame with two on either
+side."""
+SAMPLES = 1_000_000
+"""Largest number of depths of a chain from which the range of its colours is found."""
+
+Item = TypeVar("Item")
+
+
+class Lazy(Sequence[Item]):
+    """Items that are made when they are needed; the last few stay in memory."""
+
+    def __init__(self, make: Callable[[int], Item], count: int) -> None:
+        self._make, self._count, self._near = make, count, dict[int, Item]()
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, number: Any) -> Any:
+        if isinstance(number, slice):
+            return [self[k] for k in range(self._count)[number]]
+        k = range(self._count)[number]
+        if k not in self._near:
+            if len(self._near) == NEAR:
+                del self._near[next(iter(self._near))]
+            self._near[k] = self._make(k)
+        return self._near[k]
+
+
+class Brief(NamedTuple):
+    """What a chain keeps of every pair; its images and maps are read again when they are needed.
+
+    Attributes:
+        parts: Its components, in the unit of the chain.
+        depths: Some depths of its reference frame, in the unit of the chain.
+        certainty: Shares of `report.summary.certainty`.
+        parallax_px: Median displacement that the camera's translation causes, pixels.
+        true_depth: Whether the truth knows a depth.
+        true_motion: (4, 4) next_from_ref of the static scene by the truth; None if unknown.
+    """
+
+    parts: tuple[Component, ...]
+    depths: Float
+    certainty: Mapping[str, float | None]
+    parallax_px: float
+    true_depth: bool
+    true_motion: Float | None
+
+    @classmethod
+    def of(cls, pair: Result, count: int = 1) -> Brief:
+        """That of one of `count` pairs."""
+        step = max(7, -(-pair.labels.size * count // SAMPLES))
+        # component 0 of a truth is the static scene
+        truth = pair.tree["truth"]
+        true = truth.get("motions")
+        return cls(
+            pair.components.members,
+            pair.depths[0].ravel()[::step],
+            pair.summary["certainty"],
+            pair.parallax_px,
+            bool({"depth_ref", "depth_next"} & truth.keys()),
+            None if true is None or not np.isfinite(true[0]).all() else true[0],
+        )
+
+    def scaled(self, factor: float) -> Brief:
+        """The same in another unit, of which `factor` are one of now."""
+        parts = tuple(part.scaled(factor) for part in self.parts)
+        return self._replace(parts=parts, depths=factor * self.depths)
 
 
 @dataclass(frozen=True)
@@ -116,7 +186,9 @@ class Chain:
     """Solved pairs of consecutive frames in the axes of the first camera and the first unit.
 
     Attributes:
-        pairs: Results of the frames k and k + 1, in the unit of the first.
+        pairs: Results of the frames k and k + 1, in the unit of the first; those of a folder are
+            read when they are needed.
+        briefs: What is kept of every pair.
         world_from_camera: Camera poses of the K + 1 frames.
         tracks: Number of the track by label of a component, for every pair.
         names: Names of the K + 1 frames in files.
@@ -125,7 +197,8 @@ class Chain:
         summary: Contents of chain.json, or of a single pair's summary.json.
     """
 
-    pairs: tuple[Result, ...]
+    pairs: Sequence[Result]
+    briefs: Sequence[Brief]
     world_from_camera: tuple[RigidMotion, ...]
     tracks: tuple[dict[int, int], ...]
     names: tuple[str, ...]
@@ -139,7 +212,9 @@ class Chain:
         poses = STILL, result.components.camera.inverse
         tracks = {k: k for k in range(len(result.components))}
         names = "ref", "next"
-        return cls((result,), poses, (tracks,), names, np.ones(1), summary=result.summary)
+        briefs = Lazy(lambda _: Brief.of(result), 1)
+        parts = (result,), briefs, poses, (tracks,), names, np.ones(1)
+        return cls(*parts, summary=result.summary)
 
     def __len__(self) -> int:
         return len(self.pairs) + 1
@@ -147,7 +222,7 @@ class Chain:
     def __str__(self) -> str:
         low, high = self.scales.min(), self.scales.max()
         flagged = sum(k.flagged for k in self.links)
-        guess = np.mean([pair.summary["certainty"]["guess"] for pair in self.pairs])
+        guess = self.certainty["guess"]
         return (
             f"Chain({len(self)} frames, scales {low:.3g}..{high:.3g}, {flagged} flagged links,"
             f" {guess:.0%} a guess)"
@@ -156,7 +231,7 @@ class Chain:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        near, far = depth_range(np.concatenate([frame.depth.ravel()[::7] for frame in self]))
+        near, far = depth_range(self.depths)
         chosen = sorted({*np.linspace(0, len(self) - 1, min(SHOWN, len(self))).astype(int)})
         panels = [self[k].picture(near, far, f"depth of frame {self.names[k]}") for k in chosen]
         return shown(str(self), strip(panels, ""))
@@ -192,8 +267,35 @@ class Chain:
         """(near, far) of the colours of depth in the shown unit, one for all frames."""
         if self.single and (truth := self.pairs[0].true_depth) is not None:
             return depth_range(truth)
-        depths = np.concatenate([frame.depth.ravel()[::7] for frame in self])
-        return depth_range(depths * (self.metre or 1.0))
+        return depth_range(self.depths * (self.metre or 1.0))
+
+    @property
+    def depths(self) -> Float:
+        """Some depths of all pairs."""
+        return np.concatenate([brief.depths for brief in self.briefs])
+
+    @cached_property
+    def certainty(self) -> dict[str, float]:
+        """Means over the pairs of the shares in `report.summary.certainty`."""
+        rows = [brief.certainty for brief in self.briefs]
+        known = {k: [v for row in rows if (v := row.get(k)) is not None] for k in rows[0]}
+        return {k: float(np.mean(values)) if values else np.nan for k, values in known.items()}
+
+    def part(self, first: int, last: int) -> Chain:
+        """The chain of the frames from `first` to `last`, in the same unit and axes."""
+        frames, pairs = slice(first, last + 1), slice(first, last)
+        links = [k for k in self.summary["links"] if first <= k["pairs"][0] < k["pairs"][1] < last]
+        return replace(
+            self,
+            pairs=Lazy(lambda k: self.pairs[first + k], last - first),
+            briefs=self.briefs[pairs],
+            world_from_camera=self.world_from_camera[frames],
+            tracks=self.tracks[pairs],
+            names=self.names[frames],
+            scales=self.scales[pairs],
+            links=tuple(k for k in self.links if first <= k.first < k.second < last),
+            summary={**self.summary, "links": links, "sources": self.summary["sources"][frames]},
+        )
 
     def seen(self, frame: int) -> tuple[int, int]:
         """A pair that holds a frame, and the frame's number in it: 0, and 1 for the last frame.
@@ -239,25 +341,34 @@ class Chain:
     def motion(self, pair: int, label: int) -> RigidMotion:
         """Motion of a component in the world from a frame to the next; label 0 does not move."""
         before, after = self.world_from_camera[pair], self.world_from_camera[pair + 1]
-        return after @ self.pairs[pair].components[label].motion @ before.inverse
+        return after @ self.briefs[pair].parts[label].motion @ before.inverse
 
     def of_track(self, pair: int) -> NDArray[np.int64]:
         """(C,) track of every component of a pair."""
         return np.array([self.tracks[pair][k] for k in range(len(self.tracks[pair]))])
 
+    @cached_property
+    def _members(self) -> dict[int, dict[int, Component]]:
+        out: dict[int, dict[int, Component]] = {}
+        for k, (brief, numbers) in enumerate(zip(self.briefs, self.tracks, strict=True)):
+            for label, track in numbers.items():
+                out.setdefault(track, {})[k] = brief.parts[label]
+        return out
+
     @property
     def track_numbers(self) -> list[int]:
         """Numbers of the tracks; the background, 0, is none."""
-        return sorted({track for numbers in self.tracks for track in numbers.values()} - {0})
+        return sorted(self._members.keys() - {0})
 
     def members(self, track: int) -> dict[int, Component]:
         """Components of a track, by number of the pair; a pair need not show the track."""
-        return {
-            k: pair.components[label]
-            for k, (pair, numbers) in enumerate(zip(self.pairs, self.tracks, strict=True))
-            for label, number in numbers.items()
-            if number == track
-        }
+        return dict(self._members.get(track, {}))
+
+    def share(self, track: int) -> float:
+        """Mean share of the images of a track where it is seen."""
+        members = self.members(track)
+        sizes = {k: sum(part.pixels for part in self.briefs[k].parts) for k in members}
+        return float(np.mean([part.pixels / sizes[k] for k, part in members.items()]))
 
     def path(self, track: int) -> dict[int, Float]:
         """Centre (3,) of a track in the world, by frame."""

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.errors import printable
 from soup_nlp.geometry.camera import project
-from soup_nlp.report.chain import AXES, STILL, Chain, Frame
+from soup_nlp.report.chain import AXES, STILL, Chain, Frame, Lazy
 from soup_nlp.storage.files import PathLike, write_bytes
 
 VOXEL = 0.004
@@ -140,19 +140,20 @@ def fuse(chain: Chain, most: int = MOST) -> Cloud:
     certain there. A voxel keeps its most certain point. Of more than `most` points each k-th one is
     returned.
     """
-    frames, masks = [*chain], [pair.static for pair in chain.pairs]
-    share = MOST / max(sum(int(mask.sum()) for mask in masks), 1)
+    count = len(chain.pairs)
+    share = MOST / max(sum(int(pair.static.sum()) for pair in chain.pairs), 1)
+    frames = Lazy(chain.__getitem__, count)
     clouds = []
-    for k, mask in enumerate(masks):
-        chosen = thinned(mask, max(share * mask.sum(), 1))
+    for k, pair in enumerate(chain.pairs):
+        chosen = thinned(pair.static, max(share * pair.static.sum(), 1))
         cloud = np.empty(int(chosen.sum()), POINT)
-        cloud["points"] = frames[k].pose(chain.pairs[k].points[0][chosen])
+        cloud["points"] = frames[k].pose(pair.points[0][chosen])
         cloud["colours"] = frames[k].image[chosen]
         cloud["sigma"], cloud["frame"] = frames[k].sigma[chosen], k
         fits = np.ones(len(cloud), bool)
         for other in (k - 2, k - 1, k + 1, k + 2):
-            if 0 <= other < len(chain.pairs):
-                fits &= ~_contradicts(cloud, frames[other], masks[other])
+            if 0 <= other < count:
+                fits &= ~_contradicts(cloud, frames[other], chain.pairs[other].static)
         clouds.append(cloud[fits])
     cloud = np.concatenate(clouds)
     if not len(cloud):

@@ -106,7 +106,7 @@ def _write_moving(path: Path, chain: Chain, k: int) -> None:
 
 def write_depths(folder: Path, chain: Chain) -> float:
     """Write depth maps as 16-bit PNG; returns the values per unit, the same for all."""
-    scale = depth_png_scale(np.concatenate([frame.depth.ravel() for frame in chain]))
+    scale = depth_png_scale(chain.depths)
     _each("depth", ".png", lambda path, _, k: write_depth_png16(path, chain[k].depth, scale))(
         folder, chain
     )
@@ -115,7 +115,7 @@ def write_depths(folder: Path, chain: Chain) -> float:
 
 def _write_cameras(path: Path, chain: Chain) -> None:
     """Write the intrinsics of all frames, 3 x 3; of one alone where they have the same."""
-    cameras = [frame.K for frame in chain]
+    cameras = [np.array(frame.K) for frame in chain]
     same = all(np.array_equal(cameras[0], K) for K in cameras)
     rows = np.concatenate(cameras[:1] if same else cameras)
     write_text(path, "".join(" ".join(f"{x:.17g}" for x in row) + "\n" for row in rows))

@@ -1,7 +1,7 @@
 """Meshes as GLB (glTF 2.0, binary), COLMAP's text model, images and masks for other programs."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -116,11 +116,11 @@ def write_colmap(folder: Path, chain: Chain) -> None:
         DataError: a camera has skew, which none of COLMAP's models has.
     """
     write_views(folder, chain)
-    model, cloud, frames = folder / "sparse" / "0", fuse(chain, POINTS), [*chain]
+    model, cloud = folder / "sparse" / "0", fuse(chain, POINTS)
     model.mkdir(parents=True, exist_ok=True)
-    seen = [_seen(cloud, frame) for frame in frames]
-    write_text(model / "cameras.txt", _cameras(frames))
-    write_text(model / "images.txt", _images(frames, seen))
+    seen = [_seen(cloud, frame) for frame in chain]
+    write_text(model / "cameras.txt", _cameras(chain))
+    write_text(model / "images.txt", _images(chain, seen))
     tracks: list[list[str]] = [[] for _ in cloud]
     for i, (points, _) in enumerate(seen, 1):
         for k, point in enumerate(points):
@@ -147,7 +147,7 @@ def _seen(cloud: Cloud, frame: Frame) -> tuple[Int, Float]:
     return at, project(frame.K, frame.pose.inverse(cloud["points"][at]))
 
 
-def _cameras(frames: Sequence[Frame]) -> str:
+def _cameras(frames: Iterable[Frame]) -> str:
     """PINHOLE cameras; the first pixel's centre is (0.5, 0.5) in COLMAP, (0, 0) here."""
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] as fx, fy, cx, cy"]
     for i, frame in enumerate(frames, 1):
@@ -157,7 +157,7 @@ def _cameras(frames: Sequence[Frame]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _images(frames: Sequence[Frame], seen: Sequence[tuple[Int, Float]]) -> str:
+def _images(frames: Iterable[Frame], seen: Sequence[tuple[Int, Float]]) -> str:
     lines = [
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (cam_from_world)",
         "# POINTS2D[] as (X, Y, POINT3D_ID)",

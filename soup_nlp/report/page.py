@@ -202,13 +202,12 @@ def paths(chain: Chain) -> list[Path]:
     out = list[Path]()
     colours = component_colours(max(chain.track_numbers, default=0) + 1)
     for track in chain.track_numbers:
-        path, members = chain.path(track), chain.members(track)
+        path = chain.path(track)
         points = [metre * point for point in path.values()]
         moved = np.linalg.norm(points[-1] - points[0]) > 0.01 * abs(points[0][2])
         if moved if chain.single else len(path) >= SHOWN:
-            share = sum(c.pixels / chain.pairs[k].labels.size for k, c in members.items())
-            own = Path(f"component {track}", _css(colours[track]), min(path), points)
-            out.append(own._replace(share=share / len(members)))
+            first, share = min(path), chain.share(track)
+            out.append(Path(f"component {track}", _css(colours[track]), first, points, share))
     out.sort(key=lambda one: -(one.share or 0.0))
     return [Path("camera", "#ffa94d", 0, camera), *out]
 
@@ -243,7 +242,7 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "deepest": median depth, depth beyond which points are hidden at first, largest depth.
         "origins": words for what gives a component its scale.
     """
-    metre, pairs = chain.metre or 1.0, []
+    metre, pairs, depths = chain.metre or 1.0, [], []
     most = min(PIXELS[0], PIXELS[1] / len(chain.pairs))
     for k in range(len(chain.pairs)):
         shown = drawn or pictures(chain, k)
@@ -251,7 +250,8 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         pair = make_pair(chain, k, most)
         figures = {name: _figure(picture, len(chain.pairs)) for name, picture in kept.items()}
         pairs.append({**{n: _stored(v) for n, v in pair.items()}, "pictures": figures})
-    z = metre * np.concatenate([pair.depths[0].ravel() for pair in chain.pairs])
+        depths.append(chain.pairs[k].depths[0].ravel())
+    z = metre * np.concatenate(depths)
     z = z[np.isfinite(z)]
     far, deepest = _far(z)
     still = chain.single and chain.pairs[0].bending

@@ -209,12 +209,7 @@ class Result:
         lengths = ("depth_ref", "depth_next", "points_ref", "points_next")
         changes = {name: factor * getattr(rec, name) for name in lengths}
         rec = replace(rec, soup=replace(soup, lam=factor * soup.lam), **changes)
-        members = tuple(
-            replace(
-                c, motion=RigidMotion(c.motion.R, factor * c.motion.t), centre=factor * c.centre
-            )
-            for c in parts
-        )
+        members = tuple(part.scaled(factor) for part in parts)
         metrics = {k: replace(m, scale=m.scale / factor) for k, m in self.metrics.items()}
         parts = replace(parts, members=members)
         return replace(self, reconstruction=rec, components=parts, metrics=metrics)

@@ -10,25 +10,22 @@ import numpy as np
 
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
-from soup_nlp.report.chain import AXES, Chain
+from soup_nlp.report.chain import AXES, Chain, Lazy
 from soup_nlp.report.check import CheckReport, Claim, check_folder, written
 from soup_nlp.report.formats import check_formats, write_depths, write_formats, write_tum
 from soup_nlp.report.page import pair_page
+from soup_nlp.report.pairs import PAIRS, ROWS
 from soup_nlp.report.result import PAGE, Result
 from soup_nlp.report.result import load as load_pair
 from soup_nlp.sequence.contents import Contents
 from soup_nlp.sequence.links import make_chain, read_pair
-from soup_nlp.sequence.score import certainty, chain_page, score
+from soup_nlp.sequence.score import chain_page, page_names, score
 from soup_nlp.storage.files import as_path, is_file, read_json, write_json, write_text
 from soup_nlp.storage.folders import staged
 from soup_nlp.storage.rows import failed, read_rows
 
 CHAIN = "chain.json"
 """File that makes a folder that of a chain."""
-PAIRS = "pairs"
-"""Folder with the results of the pairs."""
-ROWS = "pairs.jsonl"
-"""File with a row for each pair of a sequence."""
 SAME = 1e-6
 """Largest relative difference of stored scales and poses from recomputed ones."""
 SINGLE = CHAIN, "trajectory.tum", PAGE
@@ -81,8 +78,12 @@ def read_chain(folder: Path) -> Chain:
         DataError: a pair is missing or damaged.
     """
     contents = read_json(folder / CHAIN, CHAIN, Contents)
-    pairs = range(len(contents["scales"]))
-    return make_chain([read_pair(pair_folder(folder, k)) for k in pairs], contents)
+    return make_chain(read_pairs(folder, len(contents["scales"])), contents)
+
+
+def read_pairs(folder: Path, count: int) -> Lazy[Result]:
+    """The pairs of a chain's folder, each read when it is needed."""
+    return Lazy(lambda k: read_pair(pair_folder(folder, k)), count)
 
 
 def pair_folder(folder: Path, k: int) -> Path:
@@ -147,26 +148,27 @@ def convert(
 
 
 def renew_page(folder: Path) -> Path:
-    """Make the page of a result or a chain again from its arrays; returns its file.
+    """Make the pages of a result or a chain again from its arrays; returns the first.
 
     Raises:
         DataError: the folder holds neither or a page that was changed, or cannot be written.
     """
     found = load(folder)
-    try:
-        text = pair_page(found) if isinstance(found, Result) else chain_page(found)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise DataError(
-            "result lacks what a page shows", where=folder, found=repr(error), hint="solve it again"
-        ) from error
     with staged(folder) as new:
-        write_text(new / PAGE, text)
+        try:
+            if isinstance(found, Chain):
+                write_pages(new, found)
+            else:
+                write_text(new / PAGE, pair_page(found))
+        except (KeyError, ValueError, IndexError, TypeError) as error:
+            lacks, hint = "result lacks what a page shows", "solve it again"
+            raise DataError(lacks, where=folder, found=repr(error), hint=hint) from error
     return folder / PAGE
 
 
 def chain_files(count: int) -> list[str]:
     """Names of the files of a chain of `count` frames."""
-    return [*SINGLE, *(f"depth/{k:04d}.png" for k in range(count))]
+    return [*SINGLE[:2], *page_names(count), *(f"depth/{k:04d}.png" for k in range(count))]
 
 
 def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -> Chain:
@@ -187,8 +189,14 @@ def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -
     chain = replace(chain, summary=contents)
     write_json(folder / CHAIN, contents)
     write_tum(folder / "trajectory.tum", chain)
-    write_text(folder / PAGE, chain_page(chain))
+    write_pages(folder, chain)
     return chain
+
+
+def write_pages(folder: Path, chain: Chain) -> None:
+    """Write the pages of a chain, one after the other."""
+    for name in page_names(len(chain)):
+        write_text(folder / name, chain_page(chain, name))
 
 
 def summary(chain: Chain) -> dict[str, Any]:
@@ -198,8 +206,8 @@ def summary(chain: Chain) -> dict[str, Any]:
         "unit": chain.unit,
         "world": f"the first frame's camera: {AXES}",
         "scales": [
-            {"pair": [k, k + 1], "scale": s, "parallax_px": pair.parallax_px}
-            for k, (pair, s) in enumerate(zip(chain.pairs, chain.scales, strict=True))
+            {"pair": [k, k + 1], "scale": s, "parallax_px": brief.parallax_px}
+            for k, (brief, s) in enumerate(zip(chain.briefs, chain.scales, strict=True))
         ],
         "links": [
             {
@@ -212,7 +220,7 @@ def summary(chain: Chain) -> dict[str, Any]:
             }
             for k in chain.links
         ],
-        "certainty": certainty(chain),
+        "certainty": chain.certainty,
         "world_from_camera": [m.matrix for m in chain.world_from_camera],
         "tracks": [
             {

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import count, pairwise
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError, expect
 from soup_nlp.evaluate.metrics import overlap_shares
 from soup_nlp.geometry.superpixels import Labels
-from soup_nlp.report.chain import STILL, Chain, Link
+from soup_nlp.report.chain import STILL, Brief, Chain, Lazy, Link
 from soup_nlp.report.result import Result, load
 
 MIN_PIXELS = 200
@@ -58,28 +58,32 @@ def link(
     return Link(*ends, middle, spread, pixels, flagged=flagged or pixels < MIN_PIXELS)
 
 
-def find_links(pairs: Sequence[Result]) -> list[Link]:
-    """Links of consecutive pairs, from static pixels that are confident in both.
+def bridge(pairs: Sequence[Result], a: int) -> Link | None:
+    """The link of a pair to the one after a run of pairs without parallax; None if there is none.
 
-    The depth of a pair without parallax is a guess, so its links are flagged, as are those of pairs
-    without a pixel that is confident in both. The pairs before and after a run of pairs without
-    parallax are linked directly, with the depth of the former moved by the flow of the run.
+    The depth of the pair is moved by the flow of the run.
     """
-    out: list[Link | None] = []
-    for a, (first, second) in enumerate(pairwise(pairs)):
-        z, keep = first.depths[1], first.in_next(first.static, False)
-        guess, every = still(first) or still(second), np.ones_like(keep)
-        near = link((a, a + 1), z, second.depths[0], keep & second.static, guess)
-        out.append(near or link((a, a + 1), z, second.depths[0], every, flagged=True))
-    for a, first in enumerate(pairs):
-        z, keep, b = first.depths[1], first.in_next(first.static, False), a + 1
-        while not still(first) and b < len(pairs) and still(pairs[b]):
-            keep = pairs[b].in_next(keep & (pairs[b].components.of_pixel == 0), False)
-            z, b = pairs[b].in_next(z, np.nan), b + 1
-        if a + 1 < b < len(pairs):
-            bridge = link((a, b), z, pairs[b].depths[0], keep & pairs[b].static)
-            out.append(bridge and replace(bridge, bridge=True))
-    return [shared for shared in out if shared]
+    z, keep, b = pairs[a].depths[1], pairs[a].in_next(pairs[a].static, False), a + 1
+    while not still(pairs[a]) and b < len(pairs) and still(pairs[b]):
+        keep = pairs[b].in_next(keep & (pairs[b].components.of_pixel == 0), False)
+        z, b = pairs[b].in_next(z, np.nan), b + 1
+    if not a + 1 < b < len(pairs):
+        return None
+    found = link((a, b), z, pairs[b].depths[0], keep & pairs[b].static)
+    return found and replace(found, bridge=True)
+
+
+def near_link(pairs: Sequence[Result], a: int) -> Link | None:
+    """The link of a pair and the next one, from static pixels that are confident in both.
+
+    It is flagged where the depth of a pair without parallax is a guess, or where no pixel is
+    confident in both.
+    """
+    first, second = pairs[a], pairs[a + 1]
+    z, keep = first.depths[1], first.in_next(first.static, False)
+    guess, every = still(first) or still(second), np.ones_like(keep)
+    near = link((a, a + 1), z, second.depths[0], keep & second.static, guess)
+    return near or link((a, a + 1), z, second.depths[0], every, flagged=True)
 
 
 def chained_scales(total: int, links: Sequence[Link]) -> Float:
@@ -88,9 +92,11 @@ def chained_scales(total: int, links: Sequence[Link]) -> Float:
     Raises:
         DataError: a pair is linked to none before it.
     """
-    out = np.ones(total)
+    out, ending = np.ones(total), dict[int, list[Link]]()
+    for one in links:
+        ending.setdefault(one.second, []).append(one)
     for k in range(1, total):
-        before = sorted((link for link in links if link.second == k), key=lambda one: one.flagged)
+        before = sorted(ending.get(k, ()), key=lambda one: one.flagged)
         if not before:
             raise DataError("a pair shares no pixel with the others", where=f"pair {k}")
         out[k] = out[before[0].first] * np.exp(before[0].log_ratio)
@@ -107,22 +113,31 @@ def make_chain(pairs: Sequence[Result], summary: Mapping[str, Any] | None = None
     Raises:
         DataError: a pair shares no pixel with those before it.
     """
-    expect(pairs, (list, tuple), "pairs of a chain", MADE_BY)
-    for pair in pairs or (None,):
-        expect(pair, Result, "pair of a chain", MADE_BY)
-    links = find_links(pairs)
+    expect(pairs, (list, tuple, Lazy), "pairs of a chain", MADE_BY)
+    near, bridges, matches, briefs = list[Link | None](), list[Link | None](), [], list[Brief]()
+    if not pairs:
+        expect(None, Result, "pair of a chain", MADE_BY)
+    # every pair is read once
+    for k in range(len(pairs)):
+        for pair in pairs[k : k + 2]:
+            expect(pair, Result, "pair of a chain", MADE_BY)
+        pair = pairs[k]
+        briefs.append(Brief.of(pair, len(pairs)))
+        if k + 1 < len(pairs):
+            near.append(near_link(pairs, k))
+            bridges.append(bridge(pairs, k))
+            before = pair.in_next(pair.components.of_pixel, -1)
+            matches.append(follow(before, pairs[k + 1].components.of_pixel))
+    links = [one for one in (*near, *bridges) if one]
     scales = chained_scales(len(pairs), links)
-    results = [pair.scaled(s) for pair, s in zip(pairs, scales, strict=True)]
+    briefs = [brief.scaled(s) for brief, s in zip(briefs, scales, strict=True)]
     poses = [STILL]
-    for result in results:
-        poses.append(poses[-1] @ result.components.camera.inverse)
-    matches = [
-        follow(a.in_next(a.components.of_pixel, -1), b.components.of_pixel)
-        for a, b in pairwise(results)
-    ]
-    tracks = number(matches, [len(result.components) for result in results])
+    for brief in briefs:
+        poses.append(poses[-1] @ brief.parts[0].motion.inverse)
+    tracks = number(matches, [len(brief.parts) for brief in briefs])
     names = tuple(f"{k:04d}" for k in range(len(poses)))
-    parts = tuple(results), tuple(poses), tuple(tracks), names
+    results = Lazy(lambda k: pairs[k].scaled(scales[k]), len(pairs))
+    parts = results, tuple(briefs), tuple(poses), tuple(tracks), names
     return Chain(*parts, scales, tuple(links), {} if summary is None else summary)
 
 

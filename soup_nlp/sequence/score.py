@@ -1,6 +1,7 @@
 """Errors of a chain: depth with one scale for all or one for each frame, and the camera path."""
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from soup_nlp.geometry.rotation import log
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import certainty_lines, guess_line
 from soup_nlp.report.page import headline, page, path_table, preformatted, table
+from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import sectioned
 from soup_nlp.sequence.links import MAX_GUESSED
 from soup_nlp.storage.files import read_text
@@ -21,6 +23,10 @@ from soup_nlp.storage.files import read_text
 AFFINE = Convention("affine")
 AVERAGED = ("mre_own_scale", "mre_one_scale", "mre_affine", "rmse", "delta1")
 """Scores of frames of which a chain has the mean."""
+SAMPLES = 4_000_000
+"""Number of pixels of a chain from which its scale is found."""
+SHOWN = 50
+"""Largest number of pairs on one page."""
 LINKS = ("pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", "")
 """Columns of `link_table`."""
 
@@ -43,28 +49,39 @@ def score(
     """
     if truths is not None and len(truths) != len(chain):
         raise DataError("truth and chain differ in length", found=len(truths), expected=len(chain))
-    known = [pair.tree["truth"] for pair in chain.pairs]
-    stored = [*(truth.get("depth_ref") for truth in known), known[-1].get("depth_next")]
-    given = enumerate(stored if truths is None else truths)
-    true = {k: z for k, z in given if z is not None and MEDIAN.counts(z)}
-    if not true:
+
+    def truth(k: int) -> Float | None:
+        pair, last = chain.seen(k)
+        known = chain.pairs[pair].tree["truth"].get(("depth_ref", "depth_next")[last])
+        z = known if truths is None else truths[k]
+        return z if z is not None and MEDIAN.counts(z) else None
+
+    if truths is None and not any(brief.true_depth for brief in chain.briefs):
         return None
-    depths = {k: chain.depth(k) for k in true}
-    compared = {k: MEDIAN.mask(true[k]) & (z > 0) for k, z in depths.items()}
-    ratios = [true[k][mask] / depths[k][mask] for k, mask in compared.items()]
-    scale, own_scale, frames = float(np.median(np.concatenate(ratios))), {}, []
-    for k, z in depths.items():
-        own, one = depth_metrics(z, true[k]), depth_metrics(scale * z, true[k], UNSCALED)
-        own_scale[k] = own.scale
+    own_scale, ratios, frames = dict[int, float](), list[Float](), []
+    for k, frame in enumerate(chain):
+        if (true := truth(k)) is not None:
+            z, step = frame.depth, max(1, -(-frame.depth.size * len(chain) // SAMPLES))
+            compared = MEDIAN.mask(true) & (z > 0)
+            # of a long chain, the median over some pixels of every frame
+            ratios.append((true[compared] / z[compared])[::step])
+            own_scale[k] = depth_metrics(z, true).scale
+    if not own_scale:
+        return None
+    scale = float(np.median(np.concatenate(ratios)))
+    for k, factor in own_scale.items():
+        z, true = chain.depth(k), truth(k)
+        assert true is not None
+        own, one = depth_metrics(z, true), depth_metrics(scale * z, true, UNSCALED)
         frames.append(
             {
                 "frame": k,
                 "mre_own_scale": own.mre,
                 "mre_one_scale": one.mre,
-                "mre_affine": depth_metrics(z, true[k], AFFINE).mre,
+                "mre_affine": depth_metrics(z, true, AFFINE).mre,
                 "rmse": one.rmse,
                 "delta1": one.delta1,
-                "own_scale": own.scale,
+                "own_scale": factor,
                 "coverage": own.coverage,
             }
         )
@@ -123,22 +140,15 @@ def chain_lines(chain: Chain) -> list[str]:
     lines += ["".join(f"{c:<{w}}" for c, w in zip(row, widths)).rstrip() for row in rows]
     long = [track for track in contents["tracks"] if len(track["path"]) > 2]
     lines.append(f"tracks      {len(long)} components followed over two pairs or more")
-    lines.append(sectioned({"certainty": certainty_lines(certainty(chain))}))
+    lines.append(sectioned({"certainty": certainty_lines(chain.certainty)}))
     if contents["score"]:
         lines.append(f"accuracy    {score_text(contents['score'])}")
     return lines
 
 
-def certainty(chain: Chain) -> dict[str, float]:
-    """Means over the pairs of a chain of the shares in `report.summary.certainty`."""
-    rows = [pair.summary["certainty"] for pair in chain.pairs]
-    known = {k: [row[k] for row in rows if row.get(k) is not None] for k in rows[0]}
-    return {k: float(np.mean(values)) if values else np.nan for k, values in known.items()}
-
-
 def chain_exit_code(chain: Chain) -> tuple[int, str]:
     """Exit code of `soup-nlp chain`, and its reason."""
-    shares = certainty(chain)
+    shares = chain.certainty
     if shares["guess"] > MAX_GUESSED:
         return 1, guess_line(shares, "all images")
     return 0, "solved, and at most half of all images is a guess"
@@ -162,12 +172,10 @@ def score_lines(scores: Mapping[str, Any] | None) -> list[str]:
 def true_poses(chain: Chain) -> Float | None:
     """(K + 1, 4, 4) world_from_camera by the truth of the pairs; None if it is not known."""
     poses = [np.eye(4)]
-    for pair in chain.pairs:
-        # component 0 of a truth is the static scene
-        motions = pair.tree["truth"].get("motions")
-        if motions is None or not np.isfinite(motions[0]).all():
+    for brief in chain.briefs:
+        if brief.true_motion is None:
             return None
-        poses.append(poses[-1] @ np.linalg.inv(motions[0]))
+        poses.append(poses[-1] @ np.linalg.inv(brief.true_motion))
     return np.array(poses)
 
 
@@ -237,15 +245,29 @@ def similarity(points: Float, target: Float) -> tuple[float, Float, Float]:
     return scale, R, target.mean(axis=0) - scale * R @ points.mean(axis=0)
 
 
-def chain_page(chain: Chain) -> str:
-    """The page of a chain."""
-    links = link_table(chain.summary)
-    scores = chain.summary["score"]
-    words = [f"{len(chain)} frames", score_text(scores) if scores else f"in {chain.unit}"]
+def page_names(frames: int) -> dict[str, tuple[int, int]]:
+    """Names of the pages of a chain of so many frames, each with its first and last frame."""
+    count = -(-(frames - 1) // SHOWN)
+    ends = [k * (frames - 1) // count for k in range(count + 1)]
+    names = [PAGE, *(f"report_{k + 1}.html" for k in range(1, count))]
+    return dict(zip(names, pairwise(ends), strict=True))
+
+
+def chain_page(chain: Chain, name: str = PAGE) -> str:
+    """One of the pages of a chain, see `page_names`; it holds at most `SHOWN` pairs."""
+    names, scores = page_names(len(chain)), chain.summary["score"]
+    shown = chain.part(*names[name]) if len(names) > 1 else chain
+    links, words = link_table(shown.summary), [f"{len(chain)} frames"]
+    words.append(score_text(scores) if scores else f"in {chain.unit}")
+    others = " ".join(
+        f"{a} to {b}" if other == name else f'<a href="{other}">{a} to {b}</a>'
+        for other, (a, b) in names.items()
+    )
+    top = headline(guess_line(chain.certainty, "all images"), words)
     parts = {
-        "summary": headline(guess_line(certainty(chain), "all images"), words),
-        "Paths": path_table(chain),
+        "summary": top + f"<br>frames {others}" * (len(names) > 1),
+        "Paths": path_table(shown),
         "Links between pairs": table(links[0], links[1:]) if links else "",
-        "Verdict": preformatted(chain_lines(chain)),
+        "Verdict": preformatted(chain_lines(shown)),
     }
-    return page(chain, parts)
+    return page(shown, parts)

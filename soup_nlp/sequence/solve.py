@@ -11,7 +11,6 @@ from typing import Unpack
 
 import numpy as np
 
-from soup_nlp.config.identity import identity
 from soup_nlp.config.problem import Problem, make_problem, title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import DataWarning
@@ -20,15 +19,13 @@ from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.pipeline.run import ProblemKeys, sections
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import write_png
-from soup_nlp.report.folder import run
-from soup_nlp.report.result import Result
+from soup_nlp.report.pairs import PAIRS, ROWS, fitting, head, kept_rows, needed_bytes, solve_into
 from soup_nlp.sequence.folder import (
     CHAIN,
-    PAIRS,
-    ROWS,
     SINGLE,
     chain_files,
     pair_folder,
+    read_pairs,
     write_chain,
 )
 from soup_nlp.sequence.frames import (
@@ -47,12 +44,11 @@ from soup_nlp.sequence.frames import (
     numbered_files,
     video_frames,
 )
-from soup_nlp.sequence.links import make_chain, read_pair
-from soup_nlp.storage.each import Row
+from soup_nlp.sequence.links import make_chain
+from soup_nlp.storage.each import Row, each
 from soup_nlp.storage.files import as_path, is_file, is_folder
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.rows import Job, Say, failed, measure_all, read_rows
-from soup_nlp.storage.versions import code_version
+from soup_nlp.storage.rows import Say, append_row, failed
 
 SCENE = "scene:"
 """Prefix of the name of a rendered scene."""
@@ -149,8 +145,9 @@ def solve_chain(
     chosen = one_camera(chosen, options)
     problems = {pair_folder(Path(), k).name: options.problem(chosen, k) for k in range(count - 1)}
     # a pair that is solved otherwise ends the chain that it was part of
-    others = problems.keys() - kept_pairs(problems, folder)
-    stale = any((folder / PAIRS / key).exists() for key in others)
+    heads = {name: head(problem) for name, problem in problems.items()}
+    kept = {name for name, row in kept_rows(folder, heads).items() if not failed(row)}
+    stale = any((folder / PAIRS / name).exists() for name in problems.keys() - kept)
     if stale and is_file(folder / CHAIN) and not overwrite:
         raise DataError(
             "output folder holds a chain that was solved otherwise",
@@ -161,7 +158,8 @@ def solve_chain(
     with staged(folder, whole=stale, overwrite=overwrite, subject=subject):
         # from here on, the folder is this chain's
         pass
-    chain = make_chain(solve_pairs(problems, folder, workers, say))
+    solve_pairs(problems, folder, workers, say, heads)
+    chain = make_chain(read_pairs(folder, count - 1))
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
         return write_chain(new, chain, name, chosen.names)
 
@@ -202,70 +200,49 @@ class Options:
 
 
 def solve_pairs(
-    problems: Mapping[str, Problem], folder: Path, workers: int = 1, say: Say | None = None
-) -> list[Result]:
-    """Solve pairs in parallel processes; stored results are read.
+    problems: Mapping[str, Problem],
+    folder: Path,
+    workers: int = 1,
+    say: Say | None = None,
+    heads: Mapping[str, Row] | None = None,
+) -> None:
+    """Solve pairs in parallel processes into `pairs/000_001/` ...; those that are kept are not.
 
     Args:
         problems: Problems of the pairs, by the name of their folder.
-        folder: Output folder for `pairs/000_001/` ... and `pairs.jsonl`.
-        workers: Number of processes.
+        folder: Output folder.
+        workers: Number of processes; fewer run where their memory would not suffice.
         say: Called with (done, total, row) after every solve.
+        heads: `head` of every problem, where it is known.
 
     Raises:
         SolverError: a pair cannot be solved.
     """
-    kept, place, jobs = kept_pairs(problems, folder), folder.resolve() / PAIRS, list[Job]()
-    for key, problem in problems.items():
-        name = {"key": key, "identity": identity(problem)}
-        jobs.append(Job(name, partial(_solve, problem, place / key), stale=key not in kept))
-
-    def report(done: int, total: int, row: Row) -> None:
+    heads = heads or {name: head(problem) for name, problem in problems.items()}
+    done = {k: row for k, row in kept_rows(folder, heads).items() if not failed(row)}
+    todo = {
+        name: partial(solve_into, problem, folder.resolve())
+        for name, problem in problems.items()
+        if name not in done
+    }
+    if workers > 1 and todo:
+        workers = fitting(workers, needed_bytes(problems[next(iter(todo))]))
+    for name, result in each(todo, workers):
+        row = done[name] = {**heads[name], **result}
+        append_row(folder / ROWS, row)
         # those of a worker process would be printed as Python prints them
         for text in row.get("warnings", ()):
             warnings.warn(text, DataWarning, stacklevel=2)
         if say:
-            say(done, total, row)
-
-    rows = measure_all(jobs, folder / ROWS, workers, say=report)
-    failures = [row for row in rows if failed(row)]
+            say(len(done), len(problems), row)
+    failures = [done[name] for name in problems if failed(done[name])]
     if failures:
         raise SolverError(
-            f"{len(failures)} of {len(rows)} pairs cannot be solved",
+            f"{len(failures)} of {len(problems)} pairs cannot be solved",
             where=failures[0]["key"],
             found=failures[0]["error"],
             hint="the others are kept: the same command goes on",
         )
-    return [read_pair(place / key) for key in problems]
-
-
-def kept_pairs(problems: Mapping[str, Problem], folder: Path) -> set[str]:
-    """Names of the pairs whose results are stored and need not be solved again."""
-    # the last row of a pair describes its folder
-    last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
-    same = {
-        key: last.get(key, {}).get("identity") == identity(problem)
-        and last[key].get("code") == code_version()
-        and not failed(last[key])
-        and is_file(folder / PAIRS / key / "result.h5")
-        for key, problem in problems.items()
-    }
-    return {key for key, kept in same.items() if kept}
-
-
-def _solve(problem: Problem, folder: Path) -> Row:
-    """Solve a pair into its folder."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        solved = run(problem)
-        solved.save(folder)
-    texts = dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, DataWarning))
-    return {
-        "warnings": [*texts],
-        "converged": solved.solution.converged,
-        "components": len(solved.components),
-        "mre": solved.metrics["solution"].mre if "solution" in solved.metrics else None,
-    }
 
 
 def one_camera(frames: Frames, options: Options) -> Frames:

@@ -37,7 +37,6 @@ def each(
     cluster: str | None = None,
     fresh: bool = False,
     seconds: float | None = None,
-    begin: Callable[[], object] | None = None,
 ) -> Iterator[tuple[str, Row]]:
     """Names and rows of jobs, in the order in which they end.
 
@@ -52,7 +51,6 @@ def each(
         cluster: Address of the scheduler of a Dask cluster, tcp://HOST:PORT, instead.
         fresh: A new process for every job, also with one worker.
         seconds: Wall time after which the process of a job is killed.
-        begin: Called in every new process before its first job.
 
     Raises:
         ConfigError: Dask is not installed.
@@ -61,7 +59,7 @@ def each(
     if cluster is not None:
         yield from _on_cluster(jobs, cluster)
     elif fresh or workers > 1:
-        yield from _in_processes(jobs, min(workers, len(jobs)), fresh, seconds, begin)
+        yield from _in_processes(jobs, min(workers, len(jobs)), fresh, seconds)
     else:
         yield from ((name, attempt(work)) for name, work in jobs.items())
 
@@ -101,20 +99,14 @@ def peak_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def _prepare_worker(begin: Callable[[], object] | None) -> None:
+def _prepare_worker() -> None:
     end_with_parent()
     # the parent handles Ctrl-C and ends its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if begin:
-        begin()
 
 
 def _in_processes(
-    jobs: Mapping[str, Work],
-    workers: int,
-    fresh: bool,
-    seconds: float | None,
-    begin: Callable[[], object] | None,
+    jobs: Mapping[str, Work], workers: int, fresh: bool, seconds: float | None
 ) -> Iterator[tuple[str, Row]]:
     """Rows by threads that have a pool of one process each: if it dies, its job is known."""
     todo, done = SimpleQueue[tuple[str, Work]](), SimpleQueue[tuple[str, Row]]()
@@ -130,9 +122,7 @@ def _in_processes(
             except Empty:
                 break
             if number not in pools:
-                pools[number] = ProcessPoolExecutor(
-                    1, initializer=_prepare_worker, initargs=(begin,), env=ONE_THREAD
-                )
+                pools[number] = ProcessPoolExecutor(1, initializer=_prepare_worker, env=ONE_THREAD)
             row = _row(pools[number], work, seconds)
             if row.pop("ended", False) or fresh:
                 pools.pop(number).shutdown(kill_workers=True)

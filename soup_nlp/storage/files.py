@@ -4,6 +4,7 @@ import json
 import os
 import stat
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeVar
@@ -148,6 +149,10 @@ def parse_json(text: str) -> Any:
         raise ValueError("brackets are nested too deeply") from None
 
 
+_adapter: Callable[[Any], TypeAdapter[Any]] = lru_cache(TypeAdapter)
+"""Validator of a type; making one takes tens of milliseconds."""
+
+
 def read_json(
     path: PathLike, what: str, kind: type[Kind], *, error: type[SoupError] = DataError
 ) -> Kind:
@@ -164,7 +169,7 @@ def read_json(
     """
     try:
         value: Kind = parse_json(read_text(path, what, error=error))
-        TypeAdapter(kind).validate_python(value, strict=True)
+        _adapter(kind).validate_python(value, strict=True)
     except ValidationError as problem:
         first = problem.errors()[0]
         raise error(

@@ -23,12 +23,10 @@ class Job:
     Attributes:
         name: Entries that identify the row together with the code version; part of the row.
         work: Measures the row.
-        stale: Measure the row even if it is stored.
     """
 
     name: Mapping[str, Any]
     work: Callable[[], Row]
-    stale: bool = False
 
 
 def reason(row: Mapping[str, Any]) -> str:
@@ -114,7 +112,7 @@ def measure_all(
     stored = [r for r in read_rows(path) if r.get("code") == code]
     for job, name in zip(jobs, names, strict=True):
         rows = [r for r in stored if not failed(r) and _identity(r, job.name) == name]
-        if rows and not job.stale:
+        if rows:
             row_of[name] = rows[-1]
     todo = {name: job for name, job in zip(names, jobs, strict=True) if name not in row_of}
 

@@ -150,6 +150,8 @@ ReadTree: TypeAlias = dict[str, Any]
 
 DEEPEST = 16
 """Largest number of nested groups."""
+LARGE = 16 << 20
+"""Bytes of an array from which the free memory is looked at, which takes milliseconds."""
 MOST_COMPRESSION = 1100
 """Largest ratio of an array's bytes to its stored ones: deflate reaches 1032."""
 BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError)
@@ -198,7 +200,8 @@ def _read_group(group: h5py.Group, seen: set[object], level: int = 0) -> ReadTre
         if isinstance(item, h5py.Group):
             out[name] = _read_group(item, seen, level + 1)
         else:
-            require_memory(item.nbytes, "an array", where, "the file may be damaged")
+            if item.nbytes > LARGE:
+                require_memory(item.nbytes, "an array", where, "the file may be damaged")
             text = h5py.check_string_dtype(item.dtype)
             out[name] = np.asarray((item.asstr() if text else item)[()])
     return out

@@ -17,7 +17,7 @@ STUB = "SOUP-room-unit-offset-smooth-N100"
 
 def row(solver: str, start: str, objective: float, cpu: float = 1.0, verified: bool = True) -> dict:
     return {
-        "problem": f"room {start}", "superpixels": 100, "formulation": "f", "problem_hash": 4,
+        "problem": f"room {start}", "superpixels": 100, "formulation": "f", "identity": 4,
         "solver": solver, "start": start, "name": f"{STUB}-{start}", "best_known": 4.0,
         "objective": objective, "cpu": cpu, "verified": verified, "claimed": True, "n": 7, "m": 3,
         "status": "ok", "iterations": 3, "primal": 0.0, "dual": 0.0, "complementarity": 0.0,
@@ -64,7 +64,7 @@ def test_a_minimum_is_reached_when_it_is_verified_and_near(tmp_path):
     assert plain["reached"]
 
 
-LABEL = {"problem": "room easy", "superpixels": 100, "formulation": "f", "problem_hash": 4}
+LABEL = {"problem": "room easy", "superpixels": 100, "formulation": "f", "identity": 4}
 LABEL |= {"start": "easy", "name": f"{STUB}-easy", "best_known": 4.0}
 
 PROGRAM = """#!{python}

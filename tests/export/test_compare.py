@@ -14,18 +14,22 @@ from helpers_model import PAPER, Tiny
 
 from soup_nlp.cli import compare as command
 from soup_nlp.cli.main import main
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError, SolverError
-from soup_nlp.export.compare import compare, limit_process, page, verified
+from soup_nlp.export.compare import compare, limit_process, page, problem_task, verified
 from soup_nlp.export.sol import write_sol
 from soup_nlp.export.solvers import PLUGINS, Answer, Task, available, executable, find_solver
 from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.model.formulation import Formulation
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.report.figures import write_png
 from soup_nlp.storage.each import each
 from soup_nlp.storage.rows import read_rows
 
 LABEL = {
     "problem": "tiny",
-    "problem_hash": "0",
+    "identity": "0",
     "superpixels": 4,
     "formulation": "unit-offset/smooth",
     "start": "proposal",
@@ -223,6 +227,45 @@ def test_files_are_read_before_anything_runs(tmp_path, capsys):
     assert main(["compare", "orbit", *words, "--seconds", "-1"]) == 2
     assert main(["compare", "orbit", *words, "--solvers", "nothing"]) == 2
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_file_that_was_replaced_is_another_task(tmp_path):
+    pair = render_scene("orbit", 0, 96, 64)
+    files = {
+        "0.png": pair.image_ref, "1.png": pair.image_next, "flow.npy": pair.truth.flow,
+        "prior.npy": pair.truth.depth_ref, "K.txt": pair.K_ref,
+    }  # fmt: skip
+    raw = {
+        "input": {"kind": "files", "ref": "0.png", "next": "1.png", "intrinsics": "K.txt"},
+        "base": str(tmp_path),
+        "flow": {"source": "flow.npy"},
+        "depth_prior": {"source": "prior.npy", "kind": "relative"},
+        "segmentation": {"superpixels": 12, "neighbours": 4},
+    }
+
+    def write(name: str, values: np.ndarray) -> None:
+        if name.endswith(".npy"):
+            np.save(tmp_path / name, values)
+        elif name.endswith(".png"):
+            write_png(tmp_path / name, values)
+        else:
+            np.savetxt(tmp_path / name, values)
+
+    def identity() -> str:
+        return problem_task(prepare(make_problem(raw)), "matrix")[0]["identity"]
+
+    for name, values in files.items():
+        write(name, values)
+    first = identity()
+    for name, values in files.items():
+        changed = values[:, ::-1] if name.endswith(".png") else 1.01 * values
+        if name == "K.txt":
+            changed[2, 2] = 1
+        write(name, changed)
+        assert identity() != first, name
+        write(name, values)
+    assert identity() == first
 
 
 @pytest.mark.slow

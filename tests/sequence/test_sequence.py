@@ -227,7 +227,7 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert main(other) == 2
     assert "solved otherwise" in capsys.readouterr().err
     with monkeypatch.context() as m:
-        m.setattr(solving, "measure_all", ended)
+        m.setattr(solving, "each", ended)
         assert main([*other, "--overwrite"]) == 130
     assert main(["check", str(out)]) == 2
     assert "chain is not finished" in capsys.readouterr().err
@@ -240,7 +240,7 @@ def ended(*_, **__):
 
 @pytest.mark.parametrize("kind", ["rows", "link of rows", "link of pairs"])
 def test_a_chain_does_not_write_into_what_is_the_users(kind, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(solving, "measure_all", None)
+    monkeypatch.setattr(solving, "each", None)
     out, mine = tmp_path / "out", tmp_path / "mine"
     out.mkdir()
     if kind == "rows":
@@ -261,7 +261,8 @@ def test_a_chain_does_not_write_into_what_is_the_users(kind, tmp_path, monkeypat
 def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch, capsys):
     seen = []
 
-    def solve(problem, place):
+    def solve(problem, folder):
+        place = folder / "pairs" / problem.name
         if place.name == "001_002":
             raise DataError("no flow")
         seen.append(problem.seed)
@@ -273,10 +274,10 @@ def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch,
         frames, options = Frames(("a",) * (count + 1), scene="street"), Options({"seed": seed})
         return {f"{k:03d}_{k + 1:03d}": options.problem(frames, k) for k in range(count)}
 
-    monkeypatch.setattr(solving, "_solve", solve)
-    monkeypatch.setattr(solving, "read_pair", lambda place: place.name)
+    monkeypatch.setattr(solving, "solve_into", solve)
     for seed in (1, 1, 2, 1):
-        assert solving.solve_pairs(pairs(1, seed), tmp_path) == ["000_001"]
+        solving.solve_pairs(pairs(1, seed), tmp_path)
+        assert (tmp_path / "pairs" / "000_001" / "result.h5").is_file()
     assert seen == [1, 2, 1]
     with pytest.raises(SolverError, match="1 of 2 pairs"):
         solving.solve_pairs(pairs(2, 1), tmp_path)

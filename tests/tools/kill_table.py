@@ -40,7 +40,7 @@ TINY = [
     "input.width=64", "input.height=48", "flow.source=truth", "segmentation.superpixels=12",
     "segmentation.neighbours=4", "refine.rounds=1", "refine.particles=6", "output.page=false",
 ]  # fmt: skip
-NAMES = ("solve", "convert", "export", "import", "compare", "chain")
+NAMES = ("solve", "convert", "export", "import", "compare", "chain", "batch")
 SIGNALS: Mapping[str, Sequence[int]] = {
     "SIGKILL": [signal.SIGKILL],
     "SIGTERM": [signal.SIGTERM],
@@ -72,6 +72,7 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         # a pair that is solved again ends the chain that it was part of
         "chain": f"chain {clip(root)} --fov=50 -q --overwrite -o {out['chain']}".split()
         + overrides[6:],
+        "batch": f"batch {problem_files(root)} -q -o {out['batch']}".split() + overrides[4:],
         "convert": f"convert {root / 'solved'} --to glb,colmap,npy -o {out['convert']}".split(),
     }
     if "convert" in names:
@@ -83,6 +84,16 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         nlp, _ = case.nlp(case.formulation(hessian="exact"))
         write_sol(root / "a.sol", nlp.x0, None, *file_orders(nlp))
     return [Command(name, words[name], out[name]) for name in names]
+
+
+def problem_files(root: Path) -> Path:
+    """A folder of two problem files."""
+    folder = root / "problems"
+    folder.mkdir(exist_ok=True)
+    for scene in ("orbit", "street"):
+        text = f"input: {{kind: scene, scene: {scene}, width: 64, height: 48}}\n"
+        (folder / f"{scene}.yaml").write_text(text)
+    return folder
 
 
 def clip(root: Path) -> Path:

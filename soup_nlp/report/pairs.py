@@ -1,0 +1,91 @@
+"""Pairs of a batch or a chain: each is solved into a folder of its own, with a row in one file."""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import psutil
+
+from soup_nlp.config.identity import identity
+from soup_nlp.config.problem import Problem
+from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.pipeline.case import solve_bytes
+from soup_nlp.report.folder import run
+from soup_nlp.report.verdict import exit_code
+from soup_nlp.storage.each import Row
+from soup_nlp.storage.files import is_file
+from soup_nlp.storage.folders import read_sums
+from soup_nlp.storage.rows import failed, read_rows
+from soup_nlp.storage.versions import code_version
+
+PAIRS = "pairs"
+"""Folder with the results of the pairs."""
+ROWS = "pairs.jsonl"
+"""Every row that was ever made; the last one of a pair describes its folder."""
+
+
+def head(problem: Problem) -> Row:
+    """What a row says of a pair before it is solved: if all of it is the same, so is the result.
+
+    Raises:
+        SoupError: a file of the pair cannot be read.
+    """
+    own = {"key": problem.name, "pair": problem.name, "seed": problem.seed}
+    return {**own, "identity": identity(problem), "code": code_version()}
+
+
+def kept_rows(folder: Path, heads: Mapping[str, Row]) -> dict[str, Row]:
+    """Rows of the pairs that have been solved, or have failed, with the same input and code."""
+    last = {row.get("key"): row for row in read_rows(folder / ROWS)}
+    same = {
+        name: last[name]
+        for name, own in heads.items()
+        if name in last and all(last[name].get(k) == v for k, v in own.items())
+    }
+    # a command that was killed may have replaced a result before it wrote the row
+    stored = {name: _result(folder / PAIRS / name) for name in same}
+    return {k: row for k, row in same.items() if failed(row) or stored[k] == row.get("result", "")}
+
+
+def _result(place: Path) -> str | None:
+    """What the list of a result folder says of its arrays: a hash, or "" for none."""
+    sums = read_sums(place)
+    known = sums.files.get("result.h5", "") if sums else ""
+    return known if is_file(place / "result.h5") else None
+
+
+def needed_bytes(problem: Problem) -> float:
+    """Estimate of the memory of a solve.
+
+    Raises:
+        SoupError: the pair cannot be loaded.
+    """
+    return sum(size for size, _ in solve_bytes(problem, problem.load_pair()).values())
+
+
+def fitting(workers: int, needs: float) -> int:
+    """How many of some workers have room in the free memory, if each needs so many bytes."""
+    return max(1, min(workers, int(psutil.virtual_memory().available / max(needs, 1.0))))
+
+
+def solve_into(problem: Problem, folder: Path) -> Row:
+    """Solve a pair into its folder below the one of all pairs."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solved = run(problem)
+        solved.save(place := folder / PAIRS / problem.name)
+    code, why = exit_code(solved, problem.expected.mre_at_most)
+    texts = [str(w.message) for w in caught if issubclass(w.category, DataWarning)]
+    scores = {name: m.mre for name, m in solved.metrics.items()}
+    return {
+        "exit_code": code,
+        "reason": why,
+        "converged": solved.solution.converged,
+        "components": len(solved.components),
+        "mre": scores.get("solution"),
+        "constant": scores.get("constant"),
+        "guess": solved.confidence.guessed,
+        "superpixels": len(solved),
+        "result": _result(place),
+        "warnings": [*dict.fromkeys(texts)],
+    }
