@@ -176,11 +176,17 @@ def _refitted(
     flow: FlowFit, motions: list[Motion], label: Int, seen: Mask, bad: Mask, scale: float
 ) -> list[Motion]:
     """Motions with candidates for the superpixels of each, and for pieces that none explains."""
-    main = motions[int(np.argmax(np.bincount(label[seen], minlength=len(motions))))]
+    first = int(np.argmax(np.bincount(label[seen], minlength=len(motions))))
+    main = motions[first]
     piece = connected_pieces(bad, flow.seg)
     sizes = np.bincount(piece[bad], minlength=1)
     groups = [np.flatnonzero((label == c) & seen) for c in range(len(motions))]
     present: list[list[Motion]] = [[m] for m in motions]
+    # one motion may explain the superpixels of two, of which each was fitted to a part of them
+    for c in range(len(motions)):
+        if c != first:
+            groups.append(np.flatnonzero(((label == first) | (label == c)) & seen))
+            present.append([main, motions[c]])
     for c in np.argsort(-sizes)[:PIECES]:
         groups.append(np.flatnonzero(piece == c))
         present.append([])
