@@ -16,11 +16,12 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
 from soup_nlp.data.flow import sources
 from soup_nlp.data.scenes import catalogue
-from soup_nlp.evaluate import camera, confidence, evidence
+from soup_nlp.evaluate import confidence, evidence
 from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run
 from soup_nlp.pipeline.run import make_run, skipped
+from soup_nlp.start import camera_error
 
 # drawn cases are the same in every run, without a time limit on a busy machine
 settings.register_profile("fixed", derandomize=True, deadline=None)
@@ -49,7 +50,9 @@ inputs.render_scene = catalogue.render_scene = lru_cache(maxsize=128)(catalogue.
 sources.dis_flow, pipeline_case.propose = once(sources.dis_flow), once(pipeline_case.propose)
 pipeline_case.segment = once(pipeline_case.segment)
 pipeline_case.follow_flow = once(pipeline_case.follow_flow)
-confidence.evidence, evidence.camera_errors = map(once, (evidence.evidence, camera.camera_errors))
+confidence.evidence, evidence.camera_errors = map(
+    once, (evidence.evidence, camera_error.camera_errors)
+)
 
 
 def pytest_collection_finish() -> None:

@@ -6,13 +6,12 @@ systematic error determines the depth of a component only where neither a turn a
 depth explains it.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.evaluate.camera import KINDS, camera_errors, corrected
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
@@ -24,6 +23,13 @@ from soup_nlp.start.bending import (
     fit_robustly,
     trimmed_mean,
     turned,
+)
+from soup_nlp.start.camera_error import (
+    KINDS,
+    CameraError,
+    camera_errors,
+    corrected,
+    likeliest,
 )
 from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.settle import RELIEF
@@ -39,8 +45,6 @@ FEWEST = 3
 """Least number of superpixels with flow of a component whose depth can be known."""
 SMALL = 1e-4
 """Error of the camera by which derivatives are computed."""
-PIXELS = 3000
-"""Largest number of pixels whose flow shows errors of the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +58,7 @@ class Evidence:
         noise: Noise of the flow, pixels.
         sigma: (N,) standard deviation of log depth by errors of the camera.
         camera: Error of the given camera that the flow shows, one of `KINDS`, or None.
+        errors: What the flow says of each of them.
     """
 
     turn: Float
@@ -62,6 +67,7 @@ class Evidence:
     noise: float
     sigma: Float
     camera: str | None = None
+    errors: Mapping[str, CameraError] = field(default_factory=dict)
 
     @property
     def gap(self) -> Float:
@@ -116,10 +122,10 @@ def evidence(
     count = int(component.max()) + 1
     errors = np.full((3, count), np.nan)
     sigma = np.full(len(soup), np.inf)
-    camera, wrong = np.zeros(len(KINDS)), None
+    shown: dict[str, CameraError] = {}
     if rigid is not None and (rigid & valid).any():
-        main = np.argmax(np.bincount(component[rigid & valid]))
-        camera, wrong = _camera(data, rigid & valid & (component == main))
+        shown = camera_errors(_matches(data, rigid & valid))
+    camera = np.array([shown[kind].size if shown else 0.0 for kind in KINDS])
     # where the focal length is a guess its deviation is known
     camera[0] = focal_sigma or camera[0]
     for c in range(count):
@@ -131,15 +137,14 @@ def evidence(
         sigma[members] = 0.0
         if camera.any():
             sigma[members] = _by_camera(soup, data, members, valid[members], OPEN * noise, camera)
-    return Evidence(errors[0], errors[1], errors[2], noise, sigma, wrong)
+    return Evidence(errors[0], errors[1], errors[2], noise, sigma, likeliest(shown), shown)
 
 
-def _camera(data: EnergyData, at: Mask) -> tuple[Float, str | None]:
-    """Errors of the camera by the flow of superpixels, see `camera_errors`."""
+def _matches(data: EnergyData, at: Mask) -> Matches:
+    """Correspondences by the flow of superpixels."""
     ray, target = data.pixel_ray[at], rays(data.K_next, data.pixel_target[at])
     weight = data.pixel_weight[at].ravel() / data.pixel_weight[at].max()
-    matches = Matches(ray.reshape(-1, 3), target.reshape(-1, 3), weight, data.K_next[0, 0])
-    return camera_errors(matches.confident(PIXELS))
+    return Matches(ray.reshape(-1, 3), target.reshape(-1, 3), weight, data.K_next[0, 0])
 
 
 def _error(pixel: Float, data: EnergyData, at: Int | slice = slice(None)) -> Float:

@@ -20,8 +20,8 @@ from soup_nlp.pipeline.flow import with_flow
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
+from soup_nlp.start.camera_error import camera_error
 from soup_nlp.start.components import TIES, TOO_FAST
-from soup_nlp.start.focal_length import focal_length
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import in_order
 from soup_nlp.start.prior_evidence import LEAST_SIGMA, PIECES, PriorEvidence, judged
@@ -116,7 +116,8 @@ def _observed(
     done("segmentation", seg)
     if pair.focal_sigma >= GUESS_SIGMA:
         matches = _flow_fit(problem, pair, seg).views.matches()
-        better = focal_length(matches, pair.focal_sigma, problem.seed)
+        error = camera_error(matches, "focal length", pair.focal_sigma, seed=problem.seed)
+        better = float(np.exp(error.mean)), error.deviation
         full, pair = full.with_focal(*better), pair.with_focal(*better)
         if log:
             log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")

@@ -5,9 +5,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from soup_nlp.arrays import Float
+from soup_nlp.data.formats.cameras import written
 from soup_nlp.data.formats.images import interlaced
 from soup_nlp.evaluate.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
+from soup_nlp.start.camera_error import better_camera
 
 SHARES = {
     "flow": "by flow and parallax",
@@ -208,9 +210,10 @@ def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
     elif shares["flat"] >= SHARE:
         out.append("frames farther apart in time")
     if camera is not None:
-        out.append(
-            f"undistorted images and exact intrinsics: the flow suggests an error of {camera}"
-        )
+        said = f"undistorted images and exact intrinsics: the flow suggests an error of {camera}"
+        error = run.confidence.evidence.errors.get(camera)
+        fits = None if error is None else better_camera(run.pair.K_ref, camera, error.mean)
+        out.append(said if fits is None else f"{said}, and --intrinsics {written(fits)} would fit")
     if run.pair.focal_sigma > UNSURE_FOCAL and shares["weak"] >= SHARE:
         out.append("the focal length of the camera (--fov or --intrinsics)")
     if shares["scale"] + shares.get("unexplained", 0.0) >= SHARE:

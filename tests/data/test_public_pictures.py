@@ -307,6 +307,8 @@ def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
     [
         ((240, 240, 143.5, 95.5), True, "an image of 288 x 192", "80,80,47.5,31.5"),
         ((40, 40, 23.5, 15.5), False, "an image of 48 x 32", "80,80,47.5,31.5"),
+        # a principal point that is not exactly in the middle of an image of twice the size
+        ((160, 160, 98, 61), True, "an image of 197 x 123", "80,80,48.75,30.25"),
         ((80, 160, 47.5, 63.5), False, "an image of 96 x 128", "80,80,47.5,31.5"),
         ((80, 80, 31.5, 47.5), False, "cx and cy are exchanged", "80,80,47.5,31.5"),
         ((80, 80, 33, 44), False, "cx and cy are exchanged", "80,80,44,33"),

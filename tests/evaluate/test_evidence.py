@@ -7,7 +7,6 @@ import pytest
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair
-from soup_nlp.evaluate.camera import KINDS, camera_errors, corrected
 from soup_nlp.evaluate.evidence import LEAST_GAP_PX, Evidence, evidence
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
@@ -18,6 +17,13 @@ from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.report.findings import hints
 from soup_nlp.report.summary import certainty
 from soup_nlp.start.bending import ANY_TURN, PLAIN_TURN, fit_robustly, turned
+from soup_nlp.start.camera_error import (
+    KINDS,
+    better_camera,
+    camera_errors,
+    corrected,
+    likeliest,
+)
 from soup_nlp.start.epipolar import Matches
 
 NOISE = 0.05
@@ -130,8 +136,9 @@ def matches(seed: int = 0) -> Matches:
 
 def seen_by(kind: str, x: float, exact: Matches) -> Matches:
     """Correspondences by a camera that does not know its error x; inverts `corrected`."""
-    a, b = exact.ray, exact.target
-    for _ in range(50):
+    # the inverse itself but for distortion
+    a, b = corrected(kind, -x, exact.ray, exact.target)
+    for _ in range(50 * (kind == "lens distortion")):
         back = corrected(kind, x, a, b)
         a, b = a + (exact.ray - back[0]), b + (exact.target - back[1])
     return exact._replace(ray=a, target=b)
@@ -141,6 +148,8 @@ def seen_by(kind: str, x: float, exact: Matches) -> Matches:
     ("kind", "x"),
     [
         ("focal length", 0.3),
+        ("focal length", np.log(0.25)),
+        ("focal length", np.log(2.0)),
         ("principal point in x", 0.1),
         ("principal point in y", -0.1),
         ("lens distortion", -0.2),
@@ -148,20 +157,35 @@ def seen_by(kind: str, x: float, exact: Matches) -> Matches:
     ],
 )
 def test_the_error_of_a_camera_is_found(kind, x):
-    size, found = camera_errors(seen_by(kind, x, matches()))
-    assert found == kind
-    assert size[list(KINDS).index(kind)] == pytest.approx(x, rel=0.3)
+    found = camera_errors(seen_by(kind, x, matches()))
+    assert likeliest(found) == kind
+    assert found[kind].mean == pytest.approx(x, rel=0.3)
+    if abs(x) < 0.5:
+        assert found[kind].size == pytest.approx(abs(x), rel=0.3)
+    else:
+        # depth depends on the inverse square of a focal length
+        assert found[kind].size == pytest.approx(abs(np.expm1(-2 * x)) / 2, rel=0.3)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_right_camera_is_believed(seed):
-    size, found = camera_errors(matches(seed))
-    assert found is None
-    np.testing.assert_array_equal(size, 0.0)
+    found = camera_errors(matches(seed))
+    assert likeliest(found) is None
+    assert [error.size for error in found.values()] == [0.0] * len(KINDS)
+
+
+def test_a_better_camera_has_square_pixels():
+    K = np.array([[720.0, 0, 310], [0, 722, 93], [0, 0, 1]])
+    fits = better_camera(K, "focal length", np.log(0.5))
+    np.testing.assert_allclose(np.diag(fits)[:2], np.sqrt(720 * 722) / 2)
+    np.testing.assert_array_equal(fits[:2, 2], K[:2, 2])
+    shifted = better_camera(K, "principal point in y", 0.1)
+    np.testing.assert_allclose(shifted[:2, 2], [310, 93 + 0.1 * np.sqrt(720 * 722)])
+    assert better_camera(K, "lens distortion", 0.1) is None
 
 
 def test_too_few_matches_show_no_error():
-    assert camera_errors(matches().at(slice(7)))[1] is None
+    assert likeliest(camera_errors(matches().at(slice(7)))) is None
 
 
 def started(pair: Pair):

@@ -10,8 +10,8 @@ from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
 from soup_nlp.pipeline import case
+from soup_nlp.start.camera_error import camera_error
 from soup_nlp.start.epipolar import Matches, Motion
-from soup_nlp.start.focal_length import focal_length
 from soup_nlp.start.settle import MOST_RELIEF, cauchy, most_probable, relief
 
 FOCAL = 500.0
@@ -81,16 +81,17 @@ def correspondences(turn, shift, wrong, noise=0.05):
 @pytest.mark.parametrize("wrong", [0.7, 1.25])
 def test_a_turn_with_parallax_determines_the_focal_length(wrong):
     matched = correspondences((0.05, 0.1, 0.02), (0.4, 0.1, 0.2), wrong)
-    factor, sigma = focal_length(matched, GUESS_SIGMA)
-    assert abs(np.log(factor * wrong)) < 0.08
-    assert sigma < 0.15
+    error = camera_error(matched, "focal length", GUESS_SIGMA)
+    assert abs(error.mean + np.log(wrong)) < 0.08
+    assert error.deviation < 0.15
 
 
 def test_a_shift_without_a_turn_keeps_the_focal_length():
     """A longer lens and as much deeper a scene have the same flow."""
-    factor, sigma = focal_length(correspondences((0, 0, 0), (0.4, 0, 0), 1.25), GUESS_SIGMA)
-    assert factor == pytest.approx(1.0, abs=0.05)
-    assert sigma > 0.85 * GUESS_SIGMA
+    matched = correspondences((0, 0, 0), (0.4, 0, 0), 1.25)
+    error = camera_error(matched, "focal length", GUESS_SIGMA)
+    assert error.mean == pytest.approx(0.0, abs=0.05)
+    assert error.deviation > 0.85 * GUESS_SIGMA
 
 
 @pytest.mark.slow

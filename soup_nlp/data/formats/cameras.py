@@ -170,12 +170,12 @@ def check_cameras(
         if not problems:
             continue
         cause, fits = _explanation(K, size)
-        hint, (x, y) = f"{cause}; {_text(fits)} would fit", K[:2, 2]
+        hint, (x, y) = f"{cause}; {written(fits)} would fit", K[:2, 2]
         if not cropped and not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
             raise DataError(
                 "principal point is outside of the image",
                 where=where,
-                found=f"fx,fy,cx,cy {_text(K)} at {width} x {height}",
+                found=f"fx,fy,cx,cy {written(K)} at {width} x {height}",
                 expected="a principal point near the middle",
                 hint=f"{hint}. If the images were cropped, --set input.cropped=true accepts it, in"
                 " Python solve_pair(pair, cropped=True)",
@@ -184,7 +184,8 @@ def check_cameras(
         warnings.warn(text, DataWarning, stacklevel=2)
 
 
-def _text(K: Float) -> str:
+def written(K: Float) -> str:
+    """fx,fy,cx,cy as `--intrinsics` takes them."""
     return ",".join(f"{x:g}" for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
 
@@ -224,9 +225,18 @@ def _explanation(K: Float, size: Size) -> tuple[str, Float]:
     }
     # scale from the image that has its middle at the principal point to this image
     across, down = width / max(2 * cx + 1, 1e-9), height / max(2 * cy + 1, 1e-9)
-    # sizes keep their proportions, or the focal lengths show that they do not
-    if _ratio(across, down) < ALIKE or _ratio(fx * across, fy * down) < ALIKE:
-        other = f"intrinsics of an image of {2 * cx + 1:.0f} x {2 * cy + 1:.0f}"
+    other = f"intrinsics of an image of {2 * cx + 1:.0f} x {2 * cy + 1:.0f}"
+    if _ratio(across, down) < ALIKE:
+        # square pixels stay square, and images are mostly halved or doubled: the principal point
+        # is not exactly in the middle
+        scale = math.sqrt(across * down)
+        whole = float(round(max(scale, 1 / scale))) ** (1 if scale > 1 else -1)
+        scale = whole if _ratio(whole, scale) < ALIKE else scale
+        candidates[other] = intrinsics(
+            fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5
+        )
+    elif _ratio(fx * across, fy * down) < ALIKE:
+        # the focal lengths show that the sizes do not keep their proportions
         candidates[other] = intrinsics(fx * across, fy * down, *middle)
     for cause, fits in candidates.items():
         near = _off_middle(fits[0, 2], fits[1, 2], size) < 2 * NEAR_MIDDLE

@@ -1,0 +1,181 @@
+"""Errors of a camera that the flow shows: focal length, principal point, distortion, zoom.
+
+With a wrong camera hardly any rigid motion explains the flow of a rigid scene, unless its error
+acts as a motion does. Each kind of error is tried by itself, because several kinds together explain
+nearly any flow. A focal length that is a guess has an error for certain, which is all that
+distinguishes it from one that is given. See docs/confidence.md.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from soup_nlp.arrays import Float
+from soup_nlp.geometry.camera import intrinsics
+from soup_nlp.start.epipolar import Matches, Motion, essential_motion, refine_near
+
+KINDS = {
+    "focal length": (0.8, 0.25),
+    "principal point in x": (0.1, 0.02),
+    "principal point in y": (0.1, 0.02),
+    "lens distortion": (0.2, 0.02),
+    "zoom between the frames": (0.1, 0.02),
+}
+"""Standard deviation of every error of a given camera, and the probability of one without the flow:
+of a log focal length, which is mistaken more often than all else, of the principal point relative
+to the focal length, of k1, and of the log ratio of the focal lengths of the frames."""
+STEPS = np.linspace(-2.0, 2.0, 33)
+"""Errors that are tried, in standard deviations."""
+MEASUREMENTS = 200
+"""The flow counts as this many independent measurements: its errors are alike over parts of the
+image, so that its pixels are no independent ones."""
+PIXELS, NOISE_PX, ROUNDS = 2000, 0.05, 4
+"""Largest number of correspondences, the scale of their robust loss in pixels, and the rounds of a
+fit that begins at that of the error before."""
+LEAST_MEDIAN_PX = 0.005
+"""Least median error of a flow, pixels: that of a rendered flow is rounding."""
+
+
+class CameraError(NamedTuple):
+    """What a flow says of one kind of error of the camera.
+
+    Attributes:
+        mean: Its mean, if there is one.
+        deviation: Its standard deviation, if there is one.
+        effect: Root of the mean of the square of what it does to depth, if there is one: its own
+            size, but a focal length f acts by 1 / f^2, which is how much an image is bent.
+        log_odds: Logarithm of the probability that there is one, over that of none.
+    """
+
+    mean: float
+    deviation: float
+    effect: float
+    log_odds: float
+
+    @property
+    def size(self) -> float:
+        """Root of the mean square of its effect; 0 unless it is more probable than none."""
+        return self.effect * float(np.sqrt(special.expit(self.log_odds))) * (self.log_odds > 0)
+
+
+def corrected(kind: str, x: float, ref: Float, following: Float) -> tuple[Float, Float]:
+    """Rays (..., 3) of both frames if the camera has an error of a kind and size x."""
+    a, b = ref[..., :2], following[..., :2]
+    if kind == "focal length":
+        a, b = a * np.exp(-x), b * np.exp(-x)
+    elif kind == "lens distortion":
+        a, b = (v * (1 - x * np.sum(v**2, axis=-1, keepdims=True)) for v in (a, b))
+    elif kind == "zoom between the frames":
+        a, b = a * np.exp(x / 2), b * np.exp(-x / 2)
+    else:
+        shift = np.roll([x, 0.0], kind.endswith("y"))
+        a, b = a - shift, b - shift
+    pad = [(0, 0)] * (a.ndim - 1) + [(0, 1)]
+    return np.pad(a, pad, constant_values=1.0), np.pad(b, pad, constant_values=1.0)
+
+
+def camera_error(
+    matches: Matches, kind: str, deviation: float, wrong: float = 1.0, seed: int = 0
+) -> CameraError:
+    """What correspondences say of an error of the camera.
+
+    With s(x) the Sampson distances of the best motion if the error is x, and g the least of their
+    medians, the flow has the probability `exp(-MEASUREMENTS mean log(1 + (s(x) / g)^2))`, that of
+    errors with a Cauchy distribution. Errors are normal, with a probability `wrong` of one.
+
+    Args:
+        matches: Correspondences with the camera as it is.
+        kind: One of `KINDS`.
+        deviation: Standard deviation of the error.
+        wrong: Probability of an error, without the flow; 1 for a guess.
+        seed: Of the robust fits.
+    """
+    matches = matches.confident(PIXELS)
+    distance = _distances(matches, kind, deviation, seed)
+    prior = float(special.logit(wrong))
+    if distance is None:
+        return CameraError(0.0, deviation, deviation, prior)
+    noise = max(float(np.median(distance, axis=1).min()), LEAST_MEDIAN_PX)
+    against = MEASUREMENTS * np.mean(np.log1p((distance / noise) ** 2), axis=1)
+    gain = against[len(STEPS) // 2] - against - STEPS**2 / 2
+    density = special.softmax(gain)
+    x = deviation * STEPS
+    mean = float(density @ x)
+    spread = float(np.sqrt(density @ (x - mean) ** 2))
+    # the flow is so much more probable with an error
+    more = float(special.logsumexp(gain) - special.logsumexp(-(STEPS**2) / 2))
+    acts = (1 - np.exp(-2 * x)) / 2 if kind == "focal length" else x
+    return CameraError(mean, spread, float(np.sqrt(density @ acts**2)), prior + more)
+
+
+def _distances(matches: Matches, kind: str, deviation: float, seed: int) -> Float | None:
+    """(len(STEPS), M) Sampson distances of the best motion with every error, pixels, or None.
+
+    Motions change little from one error to the next. That of a focal length changes much from one
+    end to the other, and is sought from the ends as well.
+    """
+    of_focal = kind == "focal length"
+    errors, tried = deviation * STEPS, []
+    for x in errors:
+        rays = corrected(kind, x, matches.ray, matches.target)
+        tried.append(Matches(*rays, matches.weight, matches.focal * np.exp(x * of_focal)))
+    count, middle = len(STEPS), len(STEPS) // 2
+    ways = [range(middle, count), range(middle, -1, -1)]
+    if of_focal:
+        ways += [range(count), range(count - 1, -1, -1)]
+    best, least = np.zeros((count, len(matches.ray))), np.full(count, np.inf)
+    for way in ways:
+        motion = essential_motion(tried[way[0]], None, seed)
+        if motion is None:
+            continue
+        for k in way:
+            motion = refine_near(motion, tried[k], NOISE_PX, rounds=ROUNDS)
+            distance = _distance(tried[k], motion, kind, errors[k], matches)
+            error = float(np.mean(np.log1p((distance / NOISE_PX) ** 2)))
+            if error < least[k]:
+                best[k], least[k] = distance, error
+    return best if np.isfinite(least).all() else None
+
+
+def _distance(tried: Matches, motion: Motion, kind: str, x: float, given: Matches) -> Float:
+    """(M,) Sampson distances of corrected rays, in pixels of the images before the correction.
+
+    A correction that shrinks an image must not shrink its errors.
+    """
+    E = motion.essential()
+    by_q, by_r = (tried.ray @ E.T)[:, :2], (tried.target @ E)[:, :2]
+    miss = np.abs(np.sum(tried.target[:, :2] * by_q, axis=1) + tried.ray @ E[2])
+    if kind == "lens distortion":
+        for slope, v in ((by_q, given.target[:, :2]), (by_r, given.ray[:, :2])):
+            along = np.sum(v * slope, axis=1, keepdims=True)
+            slope -= x * (np.sum(v**2, axis=1, keepdims=True) * slope + 2 * along * v)
+    elif kind == "zoom between the frames":
+        by_q, by_r = by_q * np.exp(-x / 2), by_r * np.exp(x / 2)
+    elif kind == "focal length":
+        by_q, by_r = by_q * np.exp(-x), by_r * np.exp(-x)
+    squared = np.sum(by_q**2 + by_r**2, axis=1)
+    return given.focal * miss / np.sqrt(np.maximum(squared, 1e-24))
+
+
+def camera_errors(matches: Matches) -> dict[str, CameraError]:
+    """What correspondences say of every kind of error of a given camera, see `camera_error`."""
+    return {kind: camera_error(matches, kind, *prior) for kind, prior in KINDS.items()}
+
+
+def likeliest(errors: Mapping[str, CameraError]) -> str | None:
+    """The most probable error, if it is more probable than none."""
+    kind = max(errors, key=lambda kind: errors[kind].log_odds, default=None)
+    return kind if kind and errors[kind].log_odds > 0 else None
+
+
+def better_camera(K: Float, kind: str, x: float) -> Float | None:
+    """(3, 3) intrinsics with square pixels and without an error of size x; None where no pinhole
+    camera is without it."""
+    if kind not in ("focal length", "principal point in x", "principal point in y"):
+        return None
+    focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+    if kind == "focal length":
+        return intrinsics(focal * np.exp(x), focal * np.exp(x), *K[:2, 2])
+    return intrinsics(focal, focal, *(K[:2, 2] + np.roll([x * focal, 0.0], kind.endswith("y"))))
