@@ -14,6 +14,14 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "soup_nlp"
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
 PICTURE = re.compile(r"!\[[^\]]*\]\(([^)\s]+)\)")
+SLIDER = """
+
+<div class="slider"><img src="gallery/street_depth.jpg" alt="depth of the street">
+<img src="gallery/street_image.jpg" alt="image of the street">
+<input type="range" min="0" max="100" aria-label="share of the image beside its depth"
+ oninput="this.parentNode.style.setProperty('--at', this.value + '%')"></div>
+"""
+"""The reference image over its depth, below the moving picture; a slider uncovers either."""
 NAME = re.compile(r"`([A-Za-z_][\w.]*)`")
 
 
@@ -35,6 +43,9 @@ def on_files(files: Files, config: Any) -> Files:
     readme = re.sub(r"\]\(docs/", "](", readme).replace("](results/", "](../results/")
     readme = readme.replace("](CITATION.cff)", "](../CITATION.cff)")
     readme = readme.replace("](CONTRIBUTING.md)", "](../CONTRIBUTING.md)")
+    first = PICTURE.search(readme)
+    assert first is not None
+    readme = readme[: first.end()] + SLIDER + "\n" + readme[first.end() :].lstrip("\n")
     for link in PICTURE.findall(readme):
         picture = Path(link).name
         readme = readme.replace(f"]({link})", f"]({picture})")

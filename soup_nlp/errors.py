@@ -60,8 +60,8 @@ class SoupError(Exception):
         super().__init__("\n".join(parts))
 
 
-class ConfigError(SoupError):
-    """A problem file or an option is wrong."""
+class ConfigError(SoupError, ValueError):
+    """A problem file or an option is wrong; a ValueError, as pydantic's are."""
 
 
 class DataError(SoupError):

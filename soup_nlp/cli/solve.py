@@ -24,7 +24,7 @@ from soup_nlp.sequence.folder import SINGLE
 from soup_nlp.sequence.frames import IMAGES, VIDEOS, Frames
 from soup_nlp.sequence.score import chain_exit_code, chain_lines
 from soup_nlp.sequence.solve import AUTO, named, solve_chain
-from soup_nlp.storage.files import as_path, is_file
+from soup_nlp.storage.files import as_path, is_file, is_folder
 from soup_nlp.storage.folders import default_folder
 from soup_nlp.storage.progress import interruptible
 from soup_nlp.storage.rows import Row
@@ -108,7 +108,8 @@ def solve(
 
 def _from_file(problem: Path, pair: Mapping[str, Any], changes: Sequence[str]) -> Problem:
     """The problem of a file, which must come without options of a pair."""
-    if pair:
+    # a folder is refused with the command for it, whatever else was given
+    if pair and not is_folder(problem):
         raise ConfigError(
             "a problem file names its own pair",
             found=f"{problem} and {', '.join(f'--{key}' for key in pair)}",
