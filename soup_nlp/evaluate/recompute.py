@@ -78,8 +78,8 @@ def energy(s: State, e: Mapping[str, Any], w: Mapping[str, float]) -> dict[str, 
         return np.minimum(before, w["sigma_cont_ref"]) + np.minimum(after, w["sigma_cont"])
 
     def orient() -> Float:
-        turn = np.abs(1 - (s["n"][a] * s["n"][b]).sum(1))
-        return np.minimum(turn, w["sigma_orient"])
+        change = s["n"][a] - s["n"][b] - e.get("orient_turn", 0.0)
+        return np.minimum((change**2).sum(1) / 2, w["sigma_orient"])
 
     def prior() -> Float:
         reach = norm(e["anchor_ray"][i] - e["anchor_ray"][k], axis=-1)

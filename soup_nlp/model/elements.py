@@ -215,6 +215,8 @@ def _orient(data: EnergyData, w: Weights) -> Element:
         "weight": w.orient * data.orient_weight,
         **_truncations(len(data.pairs), sigma=w.sigma_orient),
     }
+    if data.orient_turn.any():
+        columns["turn"] = data.orient_turn
     return Element(data.pairs, columns, Norms(terms.orientation))
 
 

@@ -48,6 +48,8 @@ class EnergyData:
         pair_unit: (P,) length unit of the pair.
         orient_weight: (P,) weight of E_orient: 2, directed pairs folded into one, less at flow
             discontinuities of bending surfaces.
+        orient_turn: (P, 3) difference of the normals that costs nothing in E_orient: that of a
+            depth prior where it decides both.
         rim_ray: (N, V, 3) rays where visibility is imposed, the anchor first.
         local_units: edge_unit and pair_unit are shares of the depth of the two anchors, mostly the
             nearer one (E is then independent of scale, term by term), instead of lengths.
@@ -78,6 +80,7 @@ class EnergyData:
     pair_factor: Float
     pair_unit: Float
     orient_weight: Float
+    orient_turn: Float
     rim_ray: Float
     share: Float
     local_units: bool = False
@@ -191,6 +194,7 @@ def build_energy_data(
         pair_factor=np.sqrt(seg.boundary_length / max(1, seg.boundary.shape[1])),
         pair_unit=np.ones(len(seg.pairs)),
         orient_weight=np.full(len(seg.pairs), 2.0),
+        orient_turn=np.zeros((len(seg.pairs), 3)),
         rim_ray=np.concatenate([anchor[:, None], rim], axis=1),
         share=np.full(len(seg), 1.0 / len(seg)),
         arap_at_anchors=arap_at_anchors,

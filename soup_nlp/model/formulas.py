@@ -111,10 +111,11 @@ class Ends:
         """Values of the rows, (b, 1, 1), of an array of the graph."""
         return array[self.rows].astype(self.states.dtype)[:, None, None]
 
-    def distance(self, name: str) -> AnyFloat:
-        """(b, L, L) distances between a vector of the states of both ends, by pair of labels."""
+    def distance(self, name: str, given: AnyFloat | float = 0.0) -> AnyFloat:
+        """(b, L, L) distances between a vector of the states of both ends, by pair of labels, from
+        a given (3, b, 1) difference of the two."""
         vectors = getattr(self.states, name)
-        return _distance(vectors[:, self.i], vectors[:, self.k])
+        return _distance(vectors[:, self.i] - given, vectors[:, self.k])
 
     @cached_property
     def nearness(self) -> AnyFloat:
@@ -236,8 +237,10 @@ def continuity(e: Ends, weights: Weights) -> AnyFloat:
 
 
 def orientation(e: Ends, weights: Weights) -> AnyFloat:
-    """E_orient of a neighbour pair: `rho_n(1 - n_i . n_k)`; unit normals: `|n_i - n_k|^2 / 2`."""
-    return np.minimum(e.distance("n") ** 2 / 2, weights.sigma_orient)
+    """E_orient of a neighbour pair: `rho_n(|n_i - n_k - turn|^2 / 2)`, `rho_n(1 - n_i . n_k)` if
+    the normals are unit vectors and no turn is given."""
+    turn = e.data.orient_turn[e.rows].T[:, :, None].astype(e.states.dtype)
+    return np.minimum(e.distance("n", turn) ** 2 / 2, weights.sigma_orient)
 
 
 def prior(e: Ends, weights: Weights) -> AnyFloat:

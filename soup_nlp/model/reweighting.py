@@ -72,13 +72,16 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
     unseen = np.isinf(known.variance) & ~bends
     held = unseen[i] | unseen[k]
     by_prior, depth, change = np.zeros((3, len(i)))
+    turn = np.zeros((len(a), 3))
     if known.prior is not None:
         log_depth, opened, error = known.prior
         error = np.maximum(error[i], error[k])
         by_prior = np.where(group[i] == group[k], np.maximum(opened[i], opened[k]), 1.0)
         by_prior = np.where(np.isfinite(error), by_prior, 0.0)
         depth, change = by_prior * prior / error, log_depth[i] - log_depth[k]
-        # the flow holds no slopes where the prior decides, and a prior may have steps
+        # the flow holds no slopes where the prior decides: its own stay; it may have steps
+        tilted = np.flatnonzero((opened > 0.5)[data.pairs].all(axis=1) & ~(bends[a] | bends[b]))
+        turn[tilted] = (soup.n[a] - soup.n[b])[tilted]
         stiff |= opened > 0.5
         steps = gap & (opened > 0.5)[data.pairs].any(axis=1)
         touching = np.where(steps, options.across, touching)
@@ -104,6 +107,7 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
         depth_change=change,
         pair_weight=bending("cont", data.pairs) * touching * data.pair_weight,
         orient_weight=np.where(stiff[data.pairs].all(axis=1), steep, 1.0) * data.orient_weight,
+        orient_turn=turn,
         order_weight=order,
         order_step=step,
     )

@@ -76,9 +76,11 @@ def continuity(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
 def orientation(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     """E_orient of a neighbour pair, Eq. 6.
 
-    `1 - n_i . n_k = |n_i - n_k|^2 / 2` on the unit sphere; the square is convex off it too.
+    `1 - n_i . n_k = |n_i - n_k|^2 / 2` on the unit sphere; the square is convex off it too. A given
+    difference `row["turn"]` costs nothing.
     """
-    return [Norm("turn", row["weight"], a.n - b.n, eps, row.get("sigma"), kind="half_square")]
+    turn = a.n - b.n - row["turn"] if "turn" in row else a.n - b.n
+    return [Norm("turn", row["weight"], turn, eps, row.get("sigma"), kind="half_square")]
 
 
 def prior(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:

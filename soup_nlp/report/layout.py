@@ -51,6 +51,7 @@ energy/pair_weight        1     P       w4 of both directions, less where a comp
 energy/pair_factor        1     P       sqrt(boundary length / B): stands for the whole boundary
 energy/pair_unit          1     P       length unit of a pair, see local_units
 energy/orient_weight      1     P       weight of E_orient: 2 directions, other where regions bend
+energy/orient_turn        1     P,3     difference of normals that costs nothing in E_orient
 energy/rim_ray            1     N,V,3   rays where visibility is imposed, the anchor first
 energy/share              1     N       weights c of the length unit sum_i c_i D_i = 1
 energy/local_units        1     -       units are shares of the depths of two anchors, power mean -4

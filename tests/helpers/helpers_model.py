@@ -125,6 +125,9 @@ class Tiny:
         pairs = len(self.data.pairs)
         prior["order_weight"] = rng.choice([-0.7, 0.0, 1.0], pairs)
         prior["order_step"] = rng.uniform(0.0, 0.4, pairs)
+        # E_orient allows a turn at every third pair without cost
+        third = np.arange(pairs) % 3 == 0
+        prior["orient_turn"] = third[:, None] * rng.uniform(-0.2, 0.2, (pairs, 3))
         self.data = replace(self.data, prior_relief=relief, **prior)
         if units == "pixels":
             self.data = in_pixels(self.data, self.soup, self.seg)

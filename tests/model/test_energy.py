@@ -90,7 +90,8 @@ def test_turning_the_reference_frame_with_all_its_rays_changes_nothing(seed):
     soup, data = random_soup(seed, 12), problem.data
     Q = rotation.exp(np.random.default_rng(seed).normal(0, 0.5, 3))
     turned = replace(soup, n=soup.n @ Q.T, R=soup.R @ Q.T)
-    rays = {name: getattr(data, name) @ Q.T for name in ("anchor_ray", "pixel_ray", "boundary_ray")}
+    names = ("anchor_ray", "pixel_ray", "boundary_ray", "orient_turn")
+    rays = {name: getattr(data, name) @ Q.T for name in names}
     np.testing.assert_allclose(
         energies(turned, replace(data, **rays), weights),
         energies(soup, data, weights),
@@ -109,7 +110,7 @@ def test_the_order_of_the_superpixels_does_not_matter():
     data = build_energy_data(seg, problem.flow, K_REF, K_NEXT, 3, 0)
     none = 0 * problem.data.prior_relief
     s, own = problem.soup, replace(problem.data, prior_relief=none, depth_weight=none)
-    own = replace(own, order_weight=0 * own.order_weight)
+    own = replace(own, order_weight=0 * own.order_weight, orient_turn=0 * own.orient_turn)
     soup = Soup(s.lam[order], s.n[order], s.d[order], s.R[order], s.t[order])
     np.testing.assert_allclose(energies(soup, data, weights), energies(s, own, weights), rtol=1e-12)
 
@@ -343,6 +344,19 @@ def test_weights_are_shares_across_components_and_factors_where_surfaces_bend():
     np.testing.assert_allclose(found.pair_weight, factor["cont"][1] * meets * data.pair_weight)
     steep = np.where(factor["orient"][1] > 1, count / 1000 * BENDING["orient"], 1.0)
     np.testing.assert_allclose(found.orient_weight, steep * data.orient_weight)
+
+
+def test_what_a_prior_decides_keeps_its_slopes():
+    data, soup = tiny("pixels").data, tiny().soup
+    opened = np.where(np.arange(len(soup)) < 7, 1.0, 0.0)
+    prior = np.log(soup.depth_at(data.anchor_ray)), opened, np.full(len(soup), 0.12)
+    known = of_scene(len(soup), prior=prior)
+    found = weighted(replace(data, orient_turn=0 * data.orient_turn), soup, known, EnergyOptions())
+    held = opened[data.pairs].all(axis=1)
+    assert 0 < held.sum() < len(held)
+    cost = oracle.values("orient", soup, found, Weights())
+    np.testing.assert_allclose(cost[held], 0.0, atol=1e-12)
+    assert not found.orient_turn[~held].any()
 
 
 def test_what_is_not_seen_keeps_the_relief_of_the_start():
