@@ -73,6 +73,8 @@ class PriorEvidence:
             to the spread of the log of that depth; NaN where the flow is no evidence.
         sigma: Standard deviation of its log depth in the whole image; inf where it is not used.
         determined: Whether the flow determines the depth of the scene.
+        margin: Standard deviations by which it follows the edges of the image better than by
+            chance, see `edge_margin`; NaN where the flow decides.
     """
 
     kind: Kind
@@ -80,12 +82,16 @@ class PriorEvidence:
     ratio: float
     sigma: float
     determined: bool
+    margin: float = np.nan
 
     def __str__(self) -> str:
+        by_flow = f"it differs by {self.ratio:.0%} of the relief by flow, limit {CONFIRMED:.0%}"
+        by_edges = f"it follows edges by {self.margin:.1f} deviations from chance, limit {LEAST:g}"
+        why = by_flow if np.isnan(self.margin) else by_edges
         if not self.used:
-            return "the depth prior is not used: flow or edges of the image contradict it"
+            return f"the depth prior is not used: {why}"
         flow = "the flow confirms it" if self.confirmed else "no flow confirms it"
-        return f"depth prior ({self.kind}): {flow}; its sigma is {self.sigma:.0%}"
+        return f"depth prior ({self.kind}): {flow}; its sigma is {self.sigma:.0%} ({why})"
 
     __repr__ = __str__
 
@@ -235,8 +241,9 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
         evidence = PriorEvidence(kind, shifted, ratio, sigma, determined)
         if evidence.confirmed:
             return evidence
-    right = not determined and follows_edges(log_depth(whole), pair.image_ref)
-    return PriorEvidence(kind, log_depth, ratio, UNCONFIRMED if right else np.inf, determined)
+    margin = np.nan if determined else edge_margin(log_depth(whole), pair.image_ref)
+    sigma = UNCONFIRMED if margin > LEAST else np.inf
+    return PriorEvidence(kind, log_depth, ratio, sigma, determined, margin)
 
 
 def as_log_depth(kind: Kind, value: Float, shift: float = 0.0) -> Callable[[Float], Float]:
@@ -256,8 +263,9 @@ def as_log_depth(kind: Kind, value: Float, shift: float = 0.0) -> Callable[[Floa
     return np.log
 
 
-def follows_edges(values: Float, image: Image) -> bool:
-    """Whether a map (H, W) follows superpixels and edges of its image better than by chance."""
+def edge_margin(values: Float, image: Image) -> float:
+    """Standard deviations by which a map (H, W) follows superpixels and edges of its image better
+    than by chance; -inf for one that varies within superpixels, or not at all."""
     rows, columns = (max(8, round(n * SIDE / max(values.shape))) for n in values.shape)
 
     def resized(values: Any) -> Any:
@@ -265,7 +273,7 @@ def follows_edges(values: Float, image: Image) -> bool:
 
     small = ndimage.median_filter(resized(values).astype(float), 3)
     if np.ptp(small) < 1e-9:
-        return False
+        return -np.inf
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(float), (0, 0), 1.5)
     edges, steps = _ranks(resized(_gradient(grey))), _ranks(_gradient(small))
     superpixel = segment(resized(image), PIECES)
@@ -294,7 +302,7 @@ def follows_edges(values: Float, image: Image) -> bool:
     chance = np.array(trials)
     unshifted = np.array(scores(0, 0.0, 0.0))
     better = (unshifted - chance.mean(axis=0)) / np.maximum(chance.std(axis=0), 1e-12)
-    return bool(unshifted[0] <= WITHIN and better @ [-2.0, 1.0] > LEAST)
+    return float(better @ [-2.0, 1.0]) if unshifted[0] <= WITHIN else -np.inf
 
 
 def _gradient(values: Float) -> Float:

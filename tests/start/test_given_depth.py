@@ -25,7 +25,7 @@ from soup_nlp.report.summary import certainty, summary
 from soup_nlp.start import prior_evidence
 from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
-from soup_nlp.start.prior_evidence import CONFIRMED, follows_edges, judged
+from soup_nlp.start.prior_evidence import CONFIRMED, LEAST, edge_margin, judged
 from soup_nlp.start.propose import Start, propose
 
 WAVE = np.sin(np.mgrid[0:240, 0:320] / 40.0).prod(axis=0)
@@ -247,18 +247,18 @@ def test_steps_on_image_edges_tell_a_map_of_it(monkeypatch):
         image[y : y + h + 9, x : x + w + 9] = rng.integers(0, 255, 3)
         depth[y : y + h + 9, x : x + w + 9] = rng.uniform(1, 5)
     log = np.log(depth)
-    assert follows_edges(log, image)
+    assert edge_margin(log, image) > LEAST
     # what is so blurred follows the edges, but the superpixels hardly better than by chance
     for width in (1.5, 3.5):
-        assert follows_edges(cv2.GaussianBlur(log, (0, 0), width), image)
-    assert not follows_edges(np.roll(log, (31, 47), axis=(0, 1)), image)
-    assert not follows_edges(np.ones_like(log), image)
+        assert edge_margin(cv2.GaussianBlur(log, (0, 0), width), image) > LEAST
+    assert edge_margin(np.roll(log, (31, 47), axis=(0, 1)), image) <= LEAST
+    assert edge_margin(np.ones_like(log), image) <= LEAST
     # independent pixels: with a trace of the depth, the 8 of 20 maps that follow its edges or the
     # superpixels best, and with so much of it that they follow both
     for share, seeds in ((0.5, (0, 7, 11, 13, 14, 15, 17, 18)), (1.4, (0, 3, 5))):
         for seed in seeds:
             pixels = np.random.default_rng(seed).standard_normal(log.shape) + share * log
-            assert not follows_edges(pixels, image)
+            assert edge_margin(pixels, image) <= LEAST
 
 
 # --- files -------------------------------------------------------------------------------------
