@@ -1,5 +1,6 @@
 """Solvers by name: CasADi's plug-ins, programs that read .nl, and this package."""
 
+import os
 import shlex
 import shutil
 import signal
@@ -264,7 +265,7 @@ def executable(command: str, task: Task, options: Sequence[str] = ()) -> Answer:
                 stderr=subprocess.STDOUT,
                 timeout=WALL_PER_CPU * max(1.0, task.limits.seconds),
                 check=False,
-                preexec_fn=end_with_parent,
+                preexec_fn=partial(end_with_parent, os.getpid()),
             ).returncode
         except subprocess.TimeoutExpired:
             return Answer(None, None, "Time_Limit", False)

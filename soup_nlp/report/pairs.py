@@ -3,8 +3,10 @@
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Required
 
 import psutil
+from typing_extensions import TypedDict
 
 from soup_nlp.config.identity import identity
 from soup_nlp.config.problem import Problem
@@ -13,7 +15,7 @@ from soup_nlp.pipeline.case import solve_bytes
 from soup_nlp.report.folder import run
 from soup_nlp.report.verdict import exit_code
 from soup_nlp.storage.each import Row
-from soup_nlp.storage.files import is_file
+from soup_nlp.storage.files import fits, is_file
 from soup_nlp.storage.folders import read_sums
 from soup_nlp.storage.rows import failed, read_rows
 from soup_nlp.storage.versions import code_version
@@ -22,6 +24,23 @@ PAIRS = "pairs"
 """Folder with the results of the pairs."""
 ROWS = "pairs.jsonl"
 """Every row that was ever made; the last one of a pair describes its folder."""
+
+
+class Stored(TypedDict, total=False):
+    """What is read back of a row."""
+
+    key: Required[str]
+    error: str | None
+    exit_code: int
+    reason: str
+    mre: float | None
+    constant: float | None
+    guess: float | None
+    seconds: float
+    cpu_seconds: float
+    peak_bytes: float
+    superpixels: int
+    result: str
 
 
 def head(problem: Problem) -> Row:
@@ -36,7 +55,7 @@ def head(problem: Problem) -> Row:
 
 def kept_rows(folder: Path, heads: Mapping[str, Row]) -> dict[str, Row]:
     """Rows of the pairs that have been solved, or have failed, with the same input and code."""
-    last = {row.get("key"): row for row in read_rows(folder / ROWS)}
+    last = {row["key"]: row for row in read_rows(folder / ROWS) if fits(row, Stored)}
     same = {
         name: last[name]
         for name, own in heads.items()

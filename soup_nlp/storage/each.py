@@ -1,5 +1,6 @@
 """Many jobs: here, in worker processes of this machine (loky), or on a cluster (Dask)."""
 
+import logging
 import os
 import re
 import resource
@@ -99,8 +100,8 @@ def peak_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def _prepare_worker() -> None:
-    end_with_parent()
+def _prepare_worker(parent: int) -> None:
+    end_with_parent(parent)
     # the parent handles Ctrl-C and ends its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -122,7 +123,9 @@ def _in_processes(
             except Empty:
                 break
             if number not in pools:
-                pools[number] = ProcessPoolExecutor(1, initializer=_prepare_worker, env=ONE_THREAD)
+                pools[number] = ProcessPoolExecutor(
+                    1, initializer=_prepare_worker, initargs=(os.getpid(),), env=ONE_THREAD
+                )
             row = _row(pools[number], work, seconds)
             if row.pop("ended", False) or fresh:
                 pools.pop(number).shutdown(kill_workers=True)
@@ -168,6 +171,8 @@ def died(signal_name: str | None) -> str:
 def _on_cluster(jobs: Mapping[str, Work], address: str) -> Iterator[tuple[str, Row]]:
     """Rows from the workers of a Dask cluster, which solves the job of a lost worker elsewhere."""
     distributed = optional("distributed", "cluster")
+    # it would print the traceback of every lost connection
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with distributed.Client(address) as client:
         futures = {
             client.submit(attempt, work, key=f"soup-nlp {name} {os.getpid()}", pure=False): name

@@ -153,6 +153,15 @@ _adapter: Callable[[Any], TypeAdapter[Any]] = lru_cache(TypeAdapter)
 """Validator of a type; making one takes tens of milliseconds."""
 
 
+def fits(value: object, kind: Any) -> bool:
+    """Whether a value of JSON has a type, such as a TypedDict; further entries stay."""
+    try:
+        _adapter(kind).validate_python(value, strict=True)
+    except ValidationError:
+        return False
+    return True
+
+
 def read_json(
     path: PathLike, what: str, kind: type[Kind], *, error: type[SoupError] = DataError
 ) -> Kind:

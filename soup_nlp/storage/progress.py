@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
+from soup_nlp.errors import StoppedError
 from soup_nlp.storage.system import SIGNALS, handling
 
 
@@ -106,7 +107,8 @@ class interruptible:  # noqa: N801
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._handling.__exit__(None, None, None)
-        if self.aborted and isinstance(error, Exception):
+        # a StoppedError already says what is kept
+        if self.aborted and isinstance(error, Exception) and not isinstance(error, StoppedError):
             raise KeyboardInterrupt from error
 
 

@@ -114,11 +114,14 @@ def deferred_signals() -> Iterator[None]:
             signal.raise_signal(came[0])
 
 
-def end_with_parent() -> None:
-    """Have the kernel end this process when its parent is killed; Linux only."""
+def end_with_parent(parent: int) -> None:
+    """Have the kernel end this process when its parent, a process id, is killed; Linux only."""
     if sys.platform == "linux":
         pr_set_pdeathsig = 1
         ctypes.CDLL(None).prctl(pr_set_pdeathsig, int(signal.SIGKILL))
+        if os.getppid() != parent:
+            # it was killed before
+            os._exit(1)
 
 
 @contextmanager

@@ -37,6 +37,9 @@ def heard():
     signal.signal(signal.SIGINT, before)
 
 
+OWNER = {"batch": "batches.run", "chain": "sequence.solve"}
+
+
 def solve(out: Path) -> int:
     return cli.main(["solve", "orbit", "--out", str(out), "-q", *SMALL])
 
@@ -92,6 +95,18 @@ def test_an_interrupt_that_a_library_turns_into_another_error(tmp_path, monkeypa
     # also where a command has no answer to signals of its own
     assert cli.main(["export", "orbit", "-o", str(tmp_path / "export"), *SMALL]) == 130
     assert "bug" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["batch", "chain"])
+def test_an_interrupt_says_what_is_kept(command, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(f"soup_nlp.{OWNER[command]}.each", lambda *_, **__: ctrl_c())
+    source = {"batch": "problems/orbit.yaml", "chain": "scene:orbit"}[command]
+    words = [command, source, "-o", str(tmp_path / "out"), "-q", *SMALL[4:]]
+    assert cli.main(words) == 130
+    error = capfd.readouterr().err
+    assert "are kept" in error
+    assert "the same command goes on" in error
+    assert "no result" not in error
 
 
 def test_a_second_interrupt_aborts_with_a_message(tmp_path, monkeypatch, capfd):

@@ -126,3 +126,19 @@ def test_after_ctrl_c_no_worker_is_left():
 def test_a_missing_package_is_named_with_its_extra():
     with pytest.raises(ConfigError, match=r"pip install 'soup-nlp\[cluster\]'"):
         optional("no_such_package_of_ours", "cluster")
+
+
+def test_a_worker_whose_parent_was_killed_before_it_began_ends():
+    code = """if True:
+        import os, time
+        from soup_nlp.storage.system import end_with_parent
+        parent = os.getpid()
+        if os.fork() == 0:
+            while os.getppid() == parent:
+                time.sleep(0.01)
+            end_with_parent(parent)
+            print("alive", flush=True)
+    """
+    # the pipe is open until both processes have ended
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("", "")
