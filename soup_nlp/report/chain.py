@@ -89,7 +89,8 @@ class Brief(NamedTuple):
         true = truth.get("motions")
         return cls(
             pair.components.members,
-            pair.depths[0].ravel()[::step],
+            # a view would keep the whole map
+            pair.depths[0].ravel()[::step].copy(),
             pair.summary["certainty"],
             pair.parallax_px,
             bool({"depth_ref", "depth_next"} & truth.keys()),

@@ -168,6 +168,11 @@ def died(signal_name: str | None) -> str:
     return f"the process died{by} (out of memory, a time limit, or a crash of native code)"
 
 
+def _alone(work: Work) -> Row:
+    """The row of a job in a process of its own, whose memory ends with it."""
+    return next(_in_processes({"": work}, 1, True, None))[1]
+
+
 def _on_cluster(jobs: Mapping[str, Work], address: str) -> Iterator[tuple[str, Row]]:
     """Rows from the workers of a Dask cluster, which solves the job of a lost worker elsewhere."""
     distributed = optional("distributed", "cluster")
@@ -175,7 +180,7 @@ def _on_cluster(jobs: Mapping[str, Work], address: str) -> Iterator[tuple[str, R
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with distributed.Client(address) as client:
         futures = {
-            client.submit(attempt, work, key=f"soup-nlp {name} {os.getpid()}", pure=False): name
+            client.submit(_alone, work, key=f"soup-nlp {name} {os.getpid()}", pure=False): name
             for name, work in jobs.items()
         }
         for future in distributed.as_completed(list(futures)):
