@@ -30,6 +30,9 @@ def export(
         bool, option("Start at the presolve's answer, with its multipliers.", "--presolve")
     ] = False,
     suffixes: Annotated[bool, option("Write suffixes; CasADi reads none.", "--suffixes")] = False,
+    lift: Annotated[
+        bool, option("Shared expressions as variables with rows, as SCIP needs them.", "--lift")
+    ] = False,
     overrides: options.Set = None,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
@@ -64,7 +67,7 @@ def export(
         written.add(name)
         folder = out / name if several else out
         manifest = export_case(
-            here, style, folder, format_ or ["nl"], presolve, overwrite, suffixes
+            here, style, folder, format_ or ["nl"], presolve, overwrite, suffixes, lift
         )
         s = manifest["sizes"]
         if not quiet:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NotRequired, get_args
 
 import casadi as ca
 import numpy as np
@@ -110,6 +110,7 @@ def export_case(
     presolved: bool = False,
     overwrite: bool = False,
     suffixes: bool = False,
+    lift: bool = False,
 ) -> dict[str, Any]:
     """Write soup.nl with names, problem.yaml and manifest.json; returns the manifest.
 
@@ -123,6 +124,7 @@ def export_case(
         presolved: The case starts at the answer of the presolve (for the manifest).
         overwrite: Overwrite files that the program did not make.
         suffixes: Write the suffixes of `nl.suffixes_of`, which CasADi's reader does not accept.
+        lift: See `nl.write_nl`.
 
     Raises:
         ConfigError: a format is unknown.
@@ -144,7 +146,7 @@ def export_case(
             duals = None
         kinds, segments = suffixes_of(nlp)
         lam_g = None if duals is None else duals.lam_g
-        file = write_nl(new / f"{STUB}.nl", nlp, lam_g, segments if suffixes else ())
+        file = write_nl(new / f"{STUB}.nl", nlp, lam_g, segments if suffixes else (), lift)
         if "casadi" in formats:
             graph = Graph(nlp)
             for function in FUNCTIONS:
@@ -157,6 +159,7 @@ def export_case(
             **_description(case, form, nlp, layout, file),
             "start": "presolve" if presolved else "proposal",
             "initial_duals": duals is not None,
+            "lifted": file.lifted,
             "kinds": kinds,
         }
         # the functions also need parameters, start and bounds
@@ -275,6 +278,7 @@ class Manifest(TypedDict):
     smoothing: Smoothing
     fingerprint: Fingerprint
     exact_energy_at_start: Energy
+    lifted: NotRequired[int]
 
 
 def read_manifest(folder: Path) -> Manifest:

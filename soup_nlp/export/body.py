@@ -1,11 +1,16 @@
-"""The `V`, `C` and `O` segments of a .nl file: templates filled in for every element."""
+"""The `V`, `C` and `O` segments of a .nl file: templates filled in for every element.
+
+A lifted file has a variable and a row, `expression - variable = 0`, in the place of every defined
+variable; they precede the others. SCIP expands defined variables a hundredfold, but not these.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import sparse
 
-from soup_nlp.arrays import Int
+from soup_nlp.arrays import Float, Int
 from soup_nlp.export.program import Program
 from soup_nlp.export.template import DEFINED, NUMBER, PLUS, SUM, VARIABLE, Template, Text, number
 
@@ -36,19 +41,26 @@ class _Part:
                 column = self.identity[slot][elements]
                 column = column if final is None else final[column]
             else:
-                values = np.ascontiguousarray(self.template.numbers[slot], float)
+                values = np.ascontiguousarray(self.template.graph.number[slot], float)
                 column = values.view(np.int64)[elements]
             out.append(column)
         return out
 
-    def write(self, text: Text, elements: Int | slice, final: Int) -> list[str]:
-        """Texts of elements, with the numbers `final` of the defined variables."""
+    def write(self, text: Text, elements: Int | slice, final: Int, shift: int) -> list[str]:
+        """Texts of elements.
+
+        Args:
+            text: With holes.
+            elements: Which.
+            final: Numbers of the defined variables in the file.
+            shift: Number of the first of the other variables.
+        """
         columns: list[list[object]] = []
         for (kind, _), column in zip(text.holes, self.columns(text, elements, final)):
             if kind == NUMBER:
                 columns.append(list(map(repr, column.view(np.float64).tolist())))
             else:
-                columns.append(column.tolist())
+                columns.append((column + shift * (kind == VARIABLE)).tolist())
         if not columns:
             return [text.pattern] * len(np.arange(len(self.index))[elements])
         return [text.pattern % values for values in zip(*columns)]
@@ -63,19 +75,21 @@ class NlBody:
     Attributes:
         classes: Defined variables by use: both, constraints, objective (several), one constraint,
             the objective alone.
+        lifted: Variables, and rows, that stand before the others.
     """
 
-    def __init__(self, program: Program, column: Int, row: Int) -> None:
+    def __init__(self, program: Program, column: Int, row: Int, lift: bool = False) -> None:
         """Number the defined variables.
 
         Args:
             program: The NLP in parts.
             column: (nx,) index in the file of every variable.
             row: (ng,) index in the file of every row.
+            lift: Write variables with rows instead of defined variables.
         """
         # the objective is the last row
         last, goals = len(row), np.append(row, len(row))
-        self._program, self._row, self._first = program, goals, len(column)
+        self._program, self._row = program, goals
         self._known: dict[str, dict[bytes, int]] = {}
         self._count = 0
         self._nodes: list[tuple[_Part, int, Text, Int]] = []
@@ -92,8 +106,10 @@ class NlBody:
         self._order = np.lexsort((np.arange(len(kind)), owner, kind))
         self._owner = owner[self._order]
         self._shared = int((kind < 3).sum())
+        self.lifted = self._count if lift else 0
+        self._first = 0 if lift else len(column)
         self._final = self._first + np.argsort(self._order)
-        b, c, o, c1, o1 = (int((kind == k).sum()) for k in range(5))
+        b, c, o, c1, o1 = (0 if lift else int((kind == k).sum()) for k in range(5))
         self.classes = (b, c, o, c1, o1)
 
     def _identify(self, part: _Part, node: int, text: Text) -> None:
@@ -135,7 +151,7 @@ class NlBody:
         rows: list[list[str]] = [[] for _ in self._row]
         for part in self._parts:
             for k, root in enumerate(part.template.roots):
-                texts = part.write(root, slice(None), self._final) if root else []
+                texts = part.write(root, slice(None), self._final, self.lifted) if root else []
                 for r, text in zip(part.goal[:, k].tolist(), texts):
                     rows[r].append(text)
         constant = np.zeros(len(rows))
@@ -143,18 +159,58 @@ class NlBody:
         written = [
             text
             for part, _, pattern, first in self._nodes
-            for text in part.write(pattern, first, self._final)
+            for text in part.write(pattern, first, self._final, self.lifted)
         ]
         order, owner = self._order.tolist(), self._owner.tolist()
-        for k in range(self._shared):
-            yield f"V{self._first + k} 0 0\n{written[order[k]]}"
-        k = self._shared
+        shared = self.lifted or self._shared
+        for k in range(shared):
+            head = f"C{k}" if self.lifted else f"V{self._first + k} 0 0"
+            yield f"{head}\n{written[order[k]]}"
+        k = shared
         for r in range(len(rows)):
             while k < len(owner) and owner[k] == r:
                 yield f"V{self._first + k} 0 {r + 1}\n{written[order[k]]}"
                 k += 1
-            head = f"C{r}" if r < len(rows) - 1 else "O0 0"
+            head = f"C{self.lifted + r}" if r < len(rows) - 1 else "O0 0"
             yield f"{head}\n{_total(rows[r], constant[r])}"
+
+    def lifted_values(self, x: Float) -> Float:
+        """(lifted,) values of the lifted variables at a point x (nx,) in the order of the file."""
+        out, found = np.empty(self.lifted), dict[int, dict[int, Float]]()
+        for part, node, _, first in self._nodes if self.lifted else ():
+            if id(part) not in found:
+                found[id(part)] = part.template.graph.values(x[part.index])
+            out[self._final[part.identity[node][first]]] = found[id(part)][node][first]
+        return out
+
+    def with_lifted(self, linear: sparse.spmatrix) -> sparse.csr_matrix:
+        """Entries of the rows of the file, 0 where they are nonlinear.
+
+        `linear` (ng + 1, nx) has those of a file without lifted variables.
+        """
+        k = self.lifted
+        given = linear.tocoo()
+        # what is nonlinear moves to other rows
+        kept = given.data != 0 if k else slice(None)
+        triplets = [(given.data[kept], given.row[kept] + k, given.col[kept] + k)]
+        triplets.append((-np.ones(k), np.arange(k), np.arange(k)))
+
+        def add(part: _Part, text: Text, elements: Int | slice, row: Int) -> None:
+            for (kind, _), column in zip(text.holes, part.columns(text, elements, self._final)):
+                if kind != NUMBER:
+                    triplets.append((np.zeros(len(row)), row, column + k * (kind == VARIABLE)))
+
+        for part, node, text, first in self._nodes if k else ():
+            add(part, text, first, self._final[part.identity[node][first]])
+        for part in self._parts if k else ():
+            for j, root in enumerate(part.template.roots):
+                if root:
+                    add(part, root, slice(None), k + part.goal[:, j])
+        value, row, column = (np.concatenate(c) for c in zip(*triplets))
+        size = k + linear.shape[0], k + linear.shape[1]
+        out = sparse.csr_matrix((value, (row, column)), size)
+        out.sort_indices()
+        return out
 
 
 def _total(terms: list[str], constant: float) -> str:

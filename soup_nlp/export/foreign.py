@@ -91,7 +91,8 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
                 expected=repr(then),
                 hint="its images, its problem.yaml or the program have changed; export again",
             )
-    answer = read_sol(sol, *file_orders(nlp))
+    more = manifest.get("lifted", 0)
+    answer = read_sol(sol, *file_orders(nlp, more > 0), more)
     # values at an arbitrary point may be infinite or NaN; such an answer is not verified
     with np.errstate(all="ignore"):
         r = examine(nlp, answer.x, answer.lam_g)

@@ -8,7 +8,7 @@ Gay, "Writing .nl files" (2005), and the AMPL/MP reader.
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from scipy import sparse
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError
 from soup_nlp.export.body import NlBody
-from soup_nlp.export.program import Program, make_program, orders
+from soup_nlp.export.program import Program, lifted, make_program, orders
 from soup_nlp.export.template import number
 from soup_nlp.model.nlp import NLP
 from soup_nlp.storage.files import as_path, write_bytes, write_text
@@ -36,6 +36,7 @@ class NLFile:
         variables: (nx,) variable of the NLP for each variable of the file.
         rows: (ng,) constraint of the NLP for each row of the file.
         counts: Nonzeros and nonlinear parts, for the manifest and the index of the family.
+        lifted: Variables, and rows, of the file alone, which stand before the others.
     """
 
     path: Path
@@ -44,6 +45,7 @@ class NLFile:
     variables: Int = field(repr=False)
     rows: Int = field(repr=False)
     counts: dict[str, Any]
+    lifted: int
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ def write_nl(
     nlp: NLP,
     lam_g: Float | None = None,
     suffixes: Sequence[Suffix] = (),
+    lift: bool = False,
 ) -> NLFile:
     """Write an NLP of kernels and tables; names go to `.col` and `.row` beside the file.
 
@@ -74,6 +77,7 @@ def write_nl(
         nlp: The NLP; its Hessian does not matter.
         lam_g: (ng,) multipliers of the start in CasADi's sign, for the segment of initial duals.
         suffixes: Suffixes of variables and rows.
+        lift: Write shared expressions as variables with rows, not as defined variables, see `body`.
 
     Raises:
         ExportError: an operation has no opcode, or a number is not finite.
@@ -82,28 +86,46 @@ def write_nl(
     path = as_path(path, "file", error=ExportError)
     names = nlp.x_names(), nlp.g_names()
     program = make_program(nlp.groups, nlp.nx, nlp.ng, nlp.thetas())
+    program = lifted(program) if lift else program
     variables, rows = orders(program)
-    body = NlBody(program, np.argsort(variables), np.argsort(rows))
+    body = NlBody(program, np.argsort(variables), np.argsort(rows), lift)
+
+    def after(front: object, values: Any, order: Int) -> Any:
+        """Values in the order of the file, after those of what is lifted."""
+        return np.append(np.full(body.lifted, front), values[order])
+
     # the objective stays the last row
-    entries = program.linear[np.append(rows, nlp.ng)][:, variables].tocsr()
-    entries.sort_indices()
-    x0, lbx, ubx = (v[variables] for v in (nlp.x0, nlp.lbx, nlp.ubx))
-    lbg, ubg = nlp.lbg[rows], nlp.ubg[rows]
-    longest = [max(map(len, n), default=0) for n in (names[1], names[0])]
+    last = np.append(rows, nlp.ng)
+    entries = body.with_lifted(program.linear[last][:, variables])
+    x0 = after(0.0, nlp.x0, variables)
+    x0[: body.lifted] = body.lifted_values(nlp.x0[variables])
+    lbg, ubg = (after(0.0, v, rows) for v in (nlp.lbg, nlp.ubg))
+    w = [f"w[{k}]" for k in range(body.lifted)]
+    x_names, g_names = (
+        w + [axis[k] for k in order] for axis, order in zip(names, (variables, rows))
+    )
+    program = replace(
+        program,
+        linear=entries,
+        in_rows=after(True, program.in_rows, variables),
+        in_objective=after(True, program.in_objective, variables),
+        curved=after(True, program.curved, last),
+    )
+    longest = [max(map(len, n), default=0) for n in (g_names, x_names)]
+    places = {"variables": variables, "rows": rows}
     lines = chain(
         header(program, (lbg, ubg), longest, body.classes),
-        *(suffix_segment(s, variables if s.of == "variables" else rows) for s in suffixes),
+        *(suffix_segment(replace(s, values=after(0, s.values, places[s.of]))) for s in suffixes),
         body.segments(),
         # AMPL's multipliers have the other sign
-        [] if lam_g is None else start(-lam_g[rows], "d"),
+        [] if lam_g is None else start(-after(0.0, lam_g, rows), "d"),
         start(x0),
         bounds("r", lbg, ubg),
-        bounds("b", lbx, ubx),
+        bounds("b", after(-np.inf, nlp.lbx, variables), after(np.inf, nlp.ubx, variables)),
         linear(entries),
     )
     data = ("\n".join(lines) + "\n").encode("ascii")
     write_bytes(path, data)
-    x_names, g_names = ([axis[k] for k in order] for axis, order in zip(names, (variables, rows)))
     write_text(path.with_suffix(".col"), "".join(f"{name}\n" for name in x_names))
     # the objective's name follows those of the rows
     write_text(path.with_suffix(".row"), "".join(f"{name}\n" for name in [*g_names, "E"]))
@@ -120,7 +142,9 @@ def write_nl(
             "nonlinear_rows": int(program.curved[:-1].sum()),
             "nonlinear_variables": {key: int(mask.sum()) for key, mask in nonlinear.items()},
             "defined_variables": sum(body.classes),
+            "lifted_variables": body.lifted,
         },
+        lifted=body.lifted,
     )
 
 
@@ -160,9 +184,9 @@ def header(
     ]
 
 
-def suffix_segment(suffix: Suffix, order: Int) -> Iterator[str]:
-    """`S` segment of a suffix, for variables or rows in the order of the file."""
-    values = np.asarray(suffix.values)[order]
+def suffix_segment(suffix: Suffix) -> Iterator[str]:
+    """`S` segment of a suffix, whose values are in the order of the file."""
+    values = np.asarray(suffix.values)
     real = not np.issubdtype(values.dtype, np.integer)
     nonzero = np.flatnonzero(values)
     if len(nonzero):

@@ -1,7 +1,7 @@
 """Conversion of an NLP of kernels and tables to the parts of a .nl file."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -48,7 +48,7 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
     for group in groups:
         parts = split(group, theta)
         template = make_template(parts.nonlinear, group, theta)
-        for values in (*template.numbers.values(), parts.coefficient):
+        for values in (*template.graph.number.values(), parts.coefficient):
             if not np.isfinite(values).all():
                 raise ExportError(
                     "number of an expression is not finite",
@@ -78,6 +78,12 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
     return Program(tuple(stamped), matrix, in_rows, in_objective, curved, constant)
 
 
+def lifted(program: Program) -> Program:
+    """The same where defined variables are variables with rows, in which every other may be."""
+    both = program.in_rows | program.in_objective
+    return replace(program, in_rows=both, in_objective=both)
+
+
 def orders(program: Program) -> tuple[Int, Int]:
     """Variables and rows in the order of the format.
 
@@ -93,9 +99,10 @@ def orders(program: Program) -> tuple[Int, Int]:
     return variables, np.argsort(~program.curved[:-1], kind="stable")
 
 
-def file_orders(nlp: NLP) -> tuple[Int, Int]:
-    """Variables (nx,) and rows (ng,) of an NLP in the order of its .nl file."""
-    return orders(make_program(nlp.groups, nlp.nx, nlp.ng, nlp.thetas()))
+def file_orders(nlp: NLP, lift: bool = False) -> tuple[Int, Int]:
+    """Variables (nx,) and rows (ng,) of an NLP in the order of its .nl file, see `write_nl`."""
+    program = make_program(nlp.groups, nlp.nx, nlp.ng, nlp.thetas())
+    return orders(lifted(program) if lift else program)
 
 
 @dataclass(frozen=True)

@@ -56,10 +56,10 @@ class Sol:
         return CLASSES[self.code // 100] if 0 <= self.code < 600 else "unknown"
 
 
-def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
+def read_sol(path: str | Path, variables: Int, rows: Int, lifted: int = 0) -> Sol:
     """Read a .sol file.
 
-    `variables` (nx,) and `rows` (ng,) are the orders of the .nl file, see `NLFile`.
+    `variables` (nx,), `rows` (ng,) and `lifted` are those of the .nl file, see `NLFile`.
 
     Raises:
         ExportError: the file is missing, is not a .sol in text format, has no point, or belongs to
@@ -108,18 +108,19 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
     take(count - 2 * tolerance, "an option", str)
     sizes = take(4, "number of constraints, duals, variables, values", int)
     take(int(tolerance), "tolerance", float)
-    if (sizes[0], sizes[2]) != (len(rows), len(variables)):
+    wanted = len(rows) + lifted, len(variables) + lifted
+    if (sizes[0], sizes[2]) != wanted:
         raise ExportError(
             "solution is for another problem",
             where=path,
             found=f"{sizes[2]} variables, {sizes[0]} constraints",
-            expected=f"{len(variables)} variables, {len(rows)} constraints",
+            expected=f"{wanted[1]} variables, {wanted[0]} constraints",
         )
-    if sizes[1] not in (0, len(rows)) or sizes[3] != len(variables):
+    if sizes[1] not in (0, wanted[0]) or sizes[3] != wanted[1]:
         raise ExportError(
             "solution holds no point",
             where=path,
-            found=f"{sizes[3]} of {len(variables)} values, {sizes[1]} duals",
+            found=f"{sizes[3]} of {wanted[1]} values, {sizes[1]} duals",
             hint="; ".join(said) or None,
         )
     y = np.array(take(sizes[1], "a dual value", float))
@@ -136,11 +137,11 @@ def read_sol(path: str | Path, variables: Int, rows: Int) -> Sol:
             except (IndexError, ValueError):
                 raise wrong(line, "objno, objective, code") from None
     x = np.empty(len(variables))
-    x[variables] = z
+    x[variables] = z[lifted:]
     lam_g = None
     if sizes[1]:
         lam_g = np.empty(len(rows))
-        lam_g[rows] = -y
+        lam_g[rows] = -y[lifted:]
     return Sol("\n".join(said), code, x, lam_g)
 
 

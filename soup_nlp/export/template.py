@@ -74,6 +74,15 @@ class _Graph:
         with np.errstate(all="ignore"):
             return self.constant(key, OPERATIONS[op].numpy(*(self.number[a] for a in args)))
 
+    def values(self, x: Float) -> dict[int, Float]:
+        """Value of every node at the local variables x (E, nx)."""
+        out = {**self.number, **{node: x[:, slot] for node, slot in self.variable.items()}}
+        with np.errstate(all="ignore"):
+            for node, args in enumerate(self.args):
+                if self.op[node] >= 0:
+                    out[node] = OPERATIONS[self.op[node]].numpy(*(out[a] for a in args))
+        return out
+
 
 def trace(outputs: ca.SX, group: Group, theta: Float) -> _Graph:
     """Expression graph of the outputs; numbers are scalars, or (E,) if they depend on data.
@@ -116,13 +125,13 @@ class Template:
         defined: Node and text of every defined variable, dependencies first.
         roots: Text of every output; None for a number.
         constants: Value of every output that is a number, scalar or (E,); 0 for the others.
-        numbers: Scalar or (E,) values by node.
+        graph: What the texts are made from; its numbers are scalars or (E,) by node.
     """
 
     defined: tuple[tuple[int, Text], ...]
     roots: tuple[Text | None, ...]
     constants: tuple[Float, ...]
-    numbers: dict[int, Float]
+    graph: _Graph
 
 
 def make_template(outputs: ca.SX, group: Group, theta: Float) -> Template:
@@ -143,7 +152,7 @@ def make_template(outputs: ca.SX, group: Group, theta: Float) -> Template:
         constants.append(np.asarray(0.0 if value is None else value))
     for node, values in graph.number.items():
         graph.number[node] = np.asarray(values)
-    return Template(defined, tuple(roots), tuple(constants), graph.number)
+    return Template(defined, tuple(roots), tuple(constants), graph)
 
 
 def _defined(graph: _Graph, group: Group) -> set[int]:

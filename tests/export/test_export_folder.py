@@ -13,6 +13,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol
+from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import write_sol
 from soup_nlp.model import oracle
 from soup_nlp.model.layout import TangentLayout
@@ -132,6 +133,19 @@ def test_an_answer_in_tangent_coordinates_becomes_a_result(exported, tmp_path, c
     out = tmp_path / "out"
     assert main(["import", str(exported), str(path), "-o", str(out)]) == 0
     assert main(["check", str(out)]) == 0
+    # the same answer to the file with lifted variables
+    lifted = tmp_path / "lifted"
+    words = ["--superpixels", "16", "--coordinates", "tangent", "--lift", "--suffixes"]
+    assert write(lifted, *words) == 0
+    _, nlp, *_ = problem_of(exported)
+    write_sol(path, layout.pack(solved.soup), None, *file_orders(nlp, lift=True), "elsewhere", 0)
+    lines, more = path.read_text().splitlines(), problem_of(lifted)[-1]["lifted"]
+    at = lines.index("Options") + 5
+    lines[at : at + 4] = [str(nlp.ng + more), "0", *[str(nlp.nx + more)] * 2]
+    lines[at + 4 : at + 4] = ["0"] * more
+    path.write_text("\n".join(lines))
+    assert main(["check", str(path), "--export", str(lifted)]) == 0
+    assert main(["check", str(path), "--export", str(exported)]) == 2
     # a point that moves the length unit is refused
     bad = layout.pack(solved.soup)
     bad[::9] *= 1.5

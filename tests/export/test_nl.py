@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from helpers_nl import ReadBack, close, defined_variables
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.errors import ExportError
 from soup_nlp.export.nl import NLFile, write_nl
+from soup_nlp.export.sol import read_sol
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.matrix import build_matrix_nlp
@@ -215,6 +218,48 @@ def test_scip_reads_it(written):
     at = file.variables.tolist().index(0)
     name = file.path.with_suffix(".col").read_text().split()[at]
     assert named[name].getLbOriginal() == pytest.approx(nlp.lbx[0])
+
+
+def structure(path: Path) -> set[tuple[int, int]]:
+    """Rows and variables of the `J` segments."""
+    lines, found = iter(path.read_text().splitlines()), set()
+    for line in lines:
+        if line[0] == "J":
+            row, count = map(int, line[1:].split())
+            found |= {(row, int(next(lines).split()[0])) for _ in range(count)}
+    return found
+
+
+@pytest.mark.parametrize("norm", NORMS)
+def test_lifted_expressions_are_variables_with_rows(norm, tmp_path):
+    weights = TRUNCATED if norm == "epigraph" else PAPER
+    nlp, _ = tiny().nlp(weights, Formulation(norm=norm))
+    plain = write_nl(tmp_path / "plain.nl", nlp)
+    file = write_nl(tmp_path / "soup.nl", nlp, np.ones(nlp.ng), lift=True)
+    assert plain.lifted == 0
+    assert defined_variables(file) == [0] * 5
+    k, v, r = file.lifted, file.variables, file.rows
+    assert k == plain.counts["defined_variables"] > 0
+    back = ReadBack(file.path)
+    f, g, grad, J = map(np.asarray, back.values(back.x0))
+    # the start is on their rows
+    close(f, nlp.value(nlp.x0))
+    close(g, np.append(np.zeros(k), nlp.constraints(nlp.x0)[r])[:, None])
+    assert {*zip(*map(np.ndarray.tolist, np.nonzero(J)))} <= structure(file.path)
+    # without them the derivatives are those of the program
+    way = np.linalg.solve(J[:k, :k], -J[:k, k:])
+    close(grad[k:] + way.T @ grad[:k], nlp.gradient(nlp.x0)[v][:, None])
+    close(J[k:, k:] + J[k:, :k] @ way, nlp.jacobian(nlp.x0).toarray()[np.ix_(r, v)])
+    # and an answer has the point and the multipliers of the program behind those of the rows
+    sizes = [len(g), len(g), len(back.x0), len(back.x0)]
+    duals = np.append(np.full(k, 7.0), -np.arange(float(nlp.ng))[r])
+    numbers = ["Options", 3, 1, 1, 0, *sizes, *duals.tolist(), *back.x0.tolist()]
+    (tmp_path / "a.sol").write_text("\n".join(["done", "", *map(str, numbers)]))
+    sol = read_sol(tmp_path / "a.sol", v, r, k)
+    assert np.array_equal(sol.x, nlp.x0)
+    assert np.array_equal(sol.lam_g, np.arange(nlp.ng))
+    with pytest.raises(ExportError, match="another problem"):
+        read_sol(tmp_path / "a.sol", v, r)
 
 
 # --- terms that only some pairs have -------------------------------------------------------------
