@@ -149,6 +149,7 @@ SQP = {
 }
 PLUGINS: Mapping[str, Plugin] = {
     "ipopt": Plugin("ipopt", TOLERANCES, COMMON),
+    "ipopt-adaptive": Plugin("ipopt", TOLERANCES, {**COMMON, "mu_strategy": "adaptive"}),
     "ipopt-soup": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COMMON}, "gauss-newton"),
     "ipopt-tuned": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COMMON}),
     "ipopt-lbfgs": Plugin(
@@ -160,7 +161,8 @@ PLUGINS: Mapping[str, Plugin] = {
     "fatrop-tuned": Plugin("fatrop", TWO_LIMITS, {**QUIET, "mu_init": NEAR_START["mu_init"]}),
     "bonmin-tuned": Plugin("bonmin", TWO_LIMITS, {**QUIET, **NEAR_START}),
 }
-""""ipopt" has the default options of Ipopt. "ipopt-soup" has the options of `solve` for a start
+""""ipopt" has the default options of Ipopt, "ipopt-adaptive" one other: the strategy of the
+barrier. "ipopt-soup" has the options of `solve` for a start
 that is no KKT point, and "ipopt-tuned" the same with the exact Hessian. Other names with "-tuned"
 have the options for a start near the minimum. blocksqp is left out, since it needs a linear solver
 (ma27) that the wheel of CasADi lacks."""

@@ -1,5 +1,9 @@
 """The NLP in CasADi's words: `nlpsol` solves it from a few lines and finds the same minimum."""
 
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -8,8 +12,10 @@ import soup_nlp
 from soup_nlp.errors import ModelError
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.model import oracle
+from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.stages import solve_soup
 
+ROOT = Path(__file__).resolve().parents[2]
 SMALL = [
     "input.width=192", "input.height=96", "flow.source=truth",
     "segmentation.neighbours=6", "energy.pixel_samples=4",
@@ -48,6 +54,40 @@ def test_casadi_derives_the_constrained_nlp_by_itself():
     assert max(found.values()) < 1e-6
     first = nlp.record.value(nlp.record.x0)
     assert float(answer["f"]) == pytest.approx(first, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_the_sensitivity_of_the_guide_is_that_of_a_second_solve():
+    nlp = soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL, presolve=True)
+
+    def solved(program, x0):
+        functions = Functions(program)
+        exact = {k: getattr(functions, k) for k in ("grad_f", "jac_g", "hess_lag")}
+        close = {"ipopt.mu_init": 1e-9, "ipopt.tol": 1e-10, "ipopt.bound_push": 1e-9}
+        options = {**QUIET, **close, **exact, "no_nlp_grad": True, "calc_lam_p": False}
+        solver = ca.nlpsol("s", "ipopt", functions.oracle, options)
+        answer = solver(**{**nlp.start, "x0": x0})
+        assert solver.stats()["success"]
+        return answer
+
+    answer = solved(nlp.record, nlp.record.x0)
+    names = {"nlp": nlp, "np": np, "answer": answer}
+    section = (ROOT / "docs/python.md").read_text().partition("### Sensitivity")[2]
+    exec(re.search(r"```python\n(.*?)```", section, re.DOTALL)[1], names)
+    depth = [nlp.soup(answer["x"]).depth_at(nlp.case.data.anchor_ray)]
+    factor = 1 + 1e-4
+    groups = [
+        replace(g, data=g.data * np.where(np.arange(g.data.shape[1]) == 0, factor, 1.0))
+        if g.kernel.name == "prior"
+        else g
+        for g in nlp.record.groups
+    ]
+    other = solved(replace(nlp.record, groups=tuple(groups)), answer["x"])
+    depth.append(nlp.soup(other["x"]).depth_at(nlp.case.data.anchor_ray))
+    change = np.log(depth[1] / depth[0]) / np.log(factor)
+    largest = np.abs(change).max()
+    assert largest > 1e-3
+    np.testing.assert_allclose(names["change"], change, atol=0.02 * largest)
 
 
 def test_the_symbols_are_the_program():
