@@ -25,7 +25,7 @@ from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import read_sol, write_sol
 from soup_nlp.export.solvers import Task
-from soup_nlp.export.verify import Limits, examine
+from soup_nlp.export.verify import Limits, Residuals, examine
 from soup_nlp.model.nlp import NLP
 from soup_nlp.storage.files import read_json, write_json, write_text
 
@@ -74,8 +74,9 @@ def write_family(
             best = build_instance(case, record, instance.formulation, "best")[0]
             order = file.variables, file.rows
             message = f"SOUP {VERSION}: best known point of {instance.problem}"
-            write_sol(folder / f"{instance.problem}.sol", best.x0, None, *order, message)
-            entries.append(_entry(instance, len(case), nlp, best, file, known))
+            r = examine(best, best.x0, None)
+            write_sol(folder / f"{instance.problem}.sol", best.x0, r.lam_g, *order, message)
+            entries.append(_entry(instance, len(case), nlp, best.value(best.x0), r, file, known))
             changed = "  NOT the published bytes" * (entries[-1]["published"] is False)
             say(f"{file.path.name:<52} n {nlp.nx:>6}  m {nlp.ng:>6}{changed}")
     index = {"set": "SOUP", "version": VERSION, "generator": f"soup_nlp {__version__}"}
@@ -90,7 +91,8 @@ def _entry(
     instance: Instance,
     superpixels: int,
     nlp: NLP,
-    best: NLP,
+    best: float,
+    r: Residuals,
     file: NLFile,
     known: Mapping[str, Any],
 ) -> Entry:
@@ -98,7 +100,6 @@ def _entry(
     sha = known["sha256"].get(instance.name)
     solved = dict(known["solved"].get(instance.problem, {}))
     runs = solved.pop("runs", {}).get(instance.start, {})
-    r = examine(best, best.x0, None)
     return {
         **{"name": instance.name, "file": file.path.name, "scene": instance.scene},
         **{"formulation": instance.formulation, "size": instance.size, "start": instance.start},
@@ -107,7 +108,7 @@ def _entry(
         "bounded_variables": int((np.isfinite(nlp.lbx) | np.isfinite(nlp.ubx)).sum()),
         **file.counts,
         "best_known": {
-            "objective": _short(best.value(best.x0)),
+            "objective": _short(best),
             "sol": f"{instance.problem}.sol",
             **{k: _short(getattr(r, k), 2) for k in ("primal", "dual", "complementarity")},
             **solved,

@@ -6,7 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from soup_nlp.geometry.constraints import DEFINITIONS, constraints
 from soup_nlp.report import findings
+from soup_nlp.report.check import _constraints
 from soup_nlp.report.summary import certainty
 from soup_nlp.report.verdict import exit_code, facts
 
@@ -150,3 +152,20 @@ def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
     result = exit_code(fake, 0.2)
     assert result[0] == code
     assert part in result[1]
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_a_folder_has_the_limits_of_our_answers(factor):
+    # rotations that are off by so much, and a folder that says so
+    R = (1 + factor * DEFINITIONS["so3"].limit / 2) * np.eye(3)
+    soup = {"lam": [0.5, 0.5], "n": [[0, 0, -1.0]] * 2, "d": [1.0, 1.0], "R": [R, np.eye(3)]}
+    soup |= {"t": np.zeros((2, 3))}
+    tree = {"energy": {"rim_ray": np.ones((2, 1, 3))}, "weights": {"min_facing": 0.1}}
+    claims = {"residuals": constraints(soup).largest | {"visible": 0.0}, "status": "Skipped"}
+    claims |= {"delivered": "start"}
+    stored = SimpleNamespace(tree=tree, claims=claims, soup=lambda which: soup)
+    found = {claim.name: claim.ok for claim in _constraints(stored)}
+    assert found.pop("solution so3") == (factor < 1)
+    # |det R - 1| is three halves of it
+    found.pop("solution det")
+    assert all(found.values())
