@@ -200,7 +200,8 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
     The largest region of the scene and those fixed in the image stay. The others are placed one
     after the other, the one with the most votes against placed regions first. Where the median step
     of log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
-    that step is `IN_FRONT`.
+    that step is `IN_FRONT`. The lower outline does not count where the rest has votes: what stands
+    on something has no step there.
 
     Args:
         flow: The flow of every superpixel.
@@ -225,6 +226,8 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
         # c recedes behind regions that cover it, and comes in front of those that it covers
         for sign in (1.0, -1.0):
             counted = use & (a == c) & (sign * behind > 0)
+            rest = counted & ~(around.below & flow.options.upright)
+            counted = rest if rest.any() else counted
             now = sign * (step - shift[b])
             gap = quantile(now[counted], length[counted], 0.5) if counted.any() else IN_FRONT
             shift[c] += sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0

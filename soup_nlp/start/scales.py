@@ -7,8 +7,9 @@ pair of neighbours and x the log scales, the program adds up
   the quantile `STANDS` below it, where it stands, and `HIDES` elsewhere, where it hides what is
   behind it;
 * pace: what a component moves farther than the scene, and a little of what it moves less;
-* ground: how far a component reaches below the ground of the scene;
-* order: how far a component in front is from being nearer by `STEP`.
+* ground: how far a component reaches below the ground of the scene.
+
+The order by occlusion changes scales afterwards (`soup_nlp.start.occlusion`).
 """
 
 from typing import NamedTuple
@@ -33,9 +34,6 @@ FREE = 1.0
 """Log units by which a component that stands on something may move farther than the scene."""
 UNDER = 2.0
 """Price of a log unit by which a component lies below the ground."""
-ORDER, STEP = 2.0, 0.35
-"""Price of a log unit by which the step along an outline falls short, and the step: a guess; true
-steps along such outlines have medians of 0.2 to 1.9."""
 UNKNOWN = np.log(100.0)
 """If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
 MOST = 6.0
