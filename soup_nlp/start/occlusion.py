@@ -39,10 +39,9 @@ MOST_GREY = 40.0
 """Limit of the cost of a pixel, grey levels."""
 SURE = 0.8
 """Probability from which the order along an outline counts."""
-LEAST_STEP, IN_FRONT = 0.1, 0.35
-"""Steps of log depth across the outline of a region, medians along it. A step below the first does
-not agree with the order; the region is then placed so that the step is the second, a guess. True
-steps along such outlines have medians of 0.2 to 1.9."""
+IN_FRONT = 0.35
+"""Median step of log depth along the outline of a region that is placed, a guess: true steps have
+medians of 0.2 to 1.9. A step of less than half of it does not agree with the order."""
 
 
 def covering(pair: Pair, flow: FlowFit) -> Float:
@@ -199,8 +198,8 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
 
     The largest region of the scene and those fixed in the image stay. The others are placed one
     after the other, the one with the most votes against placed regions first. Where the median step
-    of log depth across its outlines is below `LEAST_STEP`, the region comes nearer or recedes until
-    that step is `IN_FRONT`. The lower outline does not count where the rest has votes: what stands
+    of log depth across its outlines is less than half of `IN_FRONT`, the region comes nearer or
+    recedes until it is that. The lower outline does not count where the rest has votes: what stands
     on something has no step there.
 
     Args:
@@ -230,6 +229,6 @@ def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Fl
             counted = rest if rest.any() else counted
             now = sign * (step - shift[b])
             gap = quantile(now[counted], length[counted], 0.5) if counted.any() else IN_FRONT
-            shift[c] += sign * (IN_FRONT - gap) if gap < LEAST_STEP else 0.0
+            shift[c] += sign * (IN_FRONT - gap) if gap < IN_FRONT / 2 else 0.0
         done[c] = True
     return np.exp(shift)[region]
