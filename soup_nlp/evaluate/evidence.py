@@ -31,6 +31,7 @@ from soup_nlp.start.camera_error import (
     corrected,
     likeliest,
 )
+from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.settle import RELIEF
 
@@ -123,8 +124,10 @@ def evidence(
     errors = np.full((3, count), np.nan)
     sigma = np.full(len(soup), np.inf)
     shown: dict[str, CameraError] = {}
-    if rigid is not None and (rigid & valid).any():
-        shown = camera_errors(_matches(data, rigid & valid))
+    scene = None if rigid is None else rigid & valid & (component == SCENE)
+    if scene is not None and scene.any():
+        # what moves by itself has another motion
+        shown = camera_errors(_matches(data, scene))
     camera = np.array([shown[kind].size if shown else 0.0 for kind in KINDS])
     # where the focal length is a guess its deviation is known
     camera[0] = focal_sigma or camera[0]

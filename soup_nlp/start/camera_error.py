@@ -28,9 +28,11 @@ of a log focal length, which is mistaken more often than all else, of the princi
 to the focal length, of k1, and of the log ratio of the focal lengths of the frames."""
 STEPS = np.linspace(-2.0, 2.0, 33)
 """Errors that are tried, in standard deviations."""
-MEASUREMENTS = 200
+MEASUREMENTS = 80
 """The flow counts as this many independent measurements: its errors are alike over parts of the
 image, so that its pixels are no independent ones."""
+LEAST_ODDS = 3.0
+"""Log odds from which there is an error: twenty to one."""
 PIXELS, NOISE_PX, ROUNDS = 2000, 0.05, 4
 """Largest number of correspondences, the scale of their robust loss in pixels, and the rounds of a
 fit that begins at that of the error before."""
@@ -56,8 +58,9 @@ class CameraError(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Root of the mean square of its effect; 0 unless it is more probable than none."""
-        return self.effect * float(np.sqrt(special.expit(self.log_odds))) * (self.log_odds > 0)
+        """Root of the mean square of its effect; 0 below `LEAST_ODDS`."""
+        probability = float(special.expit(self.log_odds))
+        return self.effect * probability**0.5 * (self.log_odds > LEAST_ODDS)
 
 
 def corrected(kind: str, x: float, ref: Float, following: Float) -> tuple[Float, Float]:
@@ -165,9 +168,9 @@ def camera_errors(matches: Matches) -> dict[str, CameraError]:
 
 
 def likeliest(errors: Mapping[str, CameraError]) -> str | None:
-    """The most probable error, if it is more probable than none."""
+    """The most probable error, if its odds are at least `LEAST_ODDS`."""
     kind = max(errors, key=lambda kind: errors[kind].log_odds, default=None)
-    return kind if kind and errors[kind].log_odds > 0 else None
+    return kind if kind and errors[kind].log_odds > LEAST_ODDS else None
 
 
 def better_camera(K: Float, kind: str, x: float) -> Float | None:
