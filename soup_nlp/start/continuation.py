@@ -12,7 +12,7 @@ from scipy.sparse.linalg import spsolve
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation
 
-CONTRAST = 10.0
+CONTRAST = 3.0
 """Fall-off of the weight of a pair with the difference of its colours in [0, 1]."""
 JOINED = 1e-6
 """Weight of pairs across components, relative to those inside: it keeps the system regular."""

@@ -10,9 +10,10 @@ flow, and w the price of a change of motion where the flow is continuous. Large 
 flow share an error s. It is no evidence of another motion, however many superpixels have it, so
 that errors up to s cost nothing.
 
-Motions are proposed from the whole image, around single superpixels and for pieces that no motion
-explains. Those that do not pay are removed, and the others are fitted to their superpixels, as in
-PEARL (H. Isack, Y. Boykov, IJCV 97, 2012) and Progressive-X (D. Barath, J. Matas, ICCV 2019).
+Motions are proposed from the whole image, for surfaces, for what two motions explain and for pieces
+that no motion explains. Those that do not pay are removed, and the others are fitted to their
+superpixels, as in PEARL (H. Isack, Y. Boykov, IJCV 97, 2012) and Progressive-X (D. Barath,
+J. Matas, ICCV 2019).
 """
 
 from dataclasses import dataclass
@@ -28,7 +29,6 @@ from soup_nlp.start.continuation import belonging
 from soup_nlp.start.epipolar import (
     SIDEWAYS,
     Motion,
-    essential_motion,
     estimate,
     fit_translation,
     refine_near,
@@ -47,9 +47,9 @@ MOST, CHANGE, PRICE = 8.0, 6.0, 0.04
 """Largest cost of a superpixel, half the cost of one that differs from all its neighbours, and
 price of a motion by the number of superpixels: half a percent of them, if no other motion explains
 them, and at least one, pay for it."""
-DOMINANT, LOCAL, PIECES, ROUNDS = 5, 12, 6, 3
-"""Largest numbers of proposals from the whole image, around superpixels and for pieces that no
-motion explains, and of rounds of proposals."""
+DOMINANT, SURFACES, PIECES, ROUNDS = 5, 12, 6, 3
+"""Largest numbers of motions from the whole image, and of surfaces and of pieces that no motion
+explains for which motions are proposed, and of rounds of proposals."""
 PIECE_SIZE = 4
 """Least number of superpixels that determine a motion."""
 UNEXPLAINED = 0.25
@@ -102,16 +102,17 @@ class Labelling:
         return _price(self.excess, self.shared) > UNEXPLAINED * MOST
 
 
-def labelled(flow: FlowFit, motions: list[Motion]) -> Labelling:
+def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
     """The labelling of least energy among the given motions and those that are proposed here.
+
+    A surface (N,) is a connected part with continuous flow.
 
     Superpixels without usable flow take the motion of the surface that they continue.
     """
     views, seen = flow.views, flow.views.usable & ~flow.poor
     if not seen.any():
         return Labelling.of(flow, motions[:1], np.zeros(len(flow.seg), np.int64), LEAST_SHARED)
-    noise = limited_noise(flow.residual[seen])
-    motions = motions + _around(flow, seen, noise)
+    motions = motions + _of_surfaces(flow, seen, surface, motions)
     for left in reversed(range(ROUNDS + 1)):
         error = views.fit(motions).penalised() - flow.residual[:, None]
         excess = np.maximum(error, 0.0)
@@ -147,13 +148,13 @@ def dominant(flow: FlowFit) -> list[Motion]:
     return motions or [SIDEWAYS]
 
 
-def _around(flow: FlowFit, seen: Mask, noise: float) -> list[Motion]:
-    """Motions of the neighbourhoods of a few superpixels."""
-    seed, at = flow.options.seed, np.flatnonzero(seen)
-    chosen = np.random.default_rng(seed).choice(at, min(len(at), LOCAL), replace=False)
-    near = (flow.views.subset(np.append(i, flow.seg.knn[i])).matches(PIXELS) for i in chosen)
-    found = ((essential_motion(m, max(3 * noise, 0.3), seed), m) for m in near)
-    return [refine_near(motion, m, noise) for motion, m in found if motion is not None]
+def _of_surfaces(flow: FlowFit, seen: Mask, surface: Int, motions: list[Motion]) -> list[Motion]:
+    """Motions of the surfaces (N,) with the most superpixels that are seen."""
+    scale = limited_noise(flow.residual[seen])
+    count = np.bincount(surface[seen])
+    groups = (np.flatnonzero((surface == c) & seen) for c in np.argsort(-count)[:SURFACES])
+    found = (candidates(flow, at, motions[0], [], scale) for at in groups if len(at) >= PIECE_SIZE)
+    return [motion for several in found for motion in several]
 
 
 def candidates(

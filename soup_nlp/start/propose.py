@@ -149,7 +149,7 @@ def propose(flow: FlowFit) -> Start:
     jumping = torn(flow, surface, bends)
     # the flow of bending regions is no evidence of the motions of rigid ones
     rigid = flow.without(bends)
-    choice = None if bends.all() else labelled(rigid, motions)
+    choice = None if bends.all() else labelled(rigid, motions, surface)
     turn = turn_alone(rigid, choice) if o.bending and choice is not None else None
     if choice is None or turn is not None:
         soup, error = constant_depth(flow.views, turn)
