@@ -146,6 +146,8 @@ def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Flo
     X = fit.basis(which, u, v)
     Y = flow.uv[v, u].astype(np.float64)
     C, weight = fit.coefficients, np.ones(len(which))
+    if not len(which):
+        return fit, weight
     C[:, 0] = np.stack([median(y, which, np.arange(n)) for y in flow.uv[v, u].T], axis=1)
     for k in range(ROUNDS):
         C = _weighted(which, X, Y, base * weight, n) if k else C
