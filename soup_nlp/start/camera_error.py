@@ -106,7 +106,8 @@ def camera_error(
     density = special.softmax(gain)
     x = deviation * STEPS
     mean = float(density @ x)
-    spread = float(np.sqrt(density @ (x - mean) ** 2))
+    # no finer than the errors that are tried
+    spread = max(float(np.sqrt(density @ (x - mean) ** 2)), deviation * (STEPS[1] - STEPS[0]))
     # the flow is so much more probable with an error
     more = float(special.logsumexp(gain) - special.logsumexp(-(STEPS**2) / 2))
     acts = (1 - np.exp(-2 * x)) / 2 if kind == "focal length" else x
