@@ -171,7 +171,7 @@ def stored_scores() -> dict[tuple[str, ...], list[str]]:
     """MRE of solution and constant depth by pair and flow."""
     out = {}
     for page in RESULTS:
-        head, *rows = cells(page, "| pair, flow | solution |")
+        head, *rows = cells(page, "| pair, flow |")
         at = [head.index("solution"), head.index("constant")]
         out |= {tuple(row[0].rsplit(", ", 1)): [row[k] for k in at] for row in rows}
     return out
