@@ -58,8 +58,7 @@ class Evidence:
         solution: (C,) mean error of the answer.
         noise: Noise of the flow, pixels.
         sigma: (N,) standard deviation of log depth by errors of the camera.
-        camera: Error of the given camera that the flow shows, one of `KINDS`, or None.
-        errors: What the flow says of each of them.
+        errors: What the flow says of every error of the given camera.
     """
 
     turn: Float
@@ -67,8 +66,12 @@ class Evidence:
     solution: Float
     noise: float
     sigma: Float
-    camera: str | None = None
     errors: Mapping[str, CameraError] = field(default_factory=dict)
+
+    @property
+    def camera(self) -> str | None:
+        """Error of the given camera that the flow shows, one of `KINDS`, or None."""
+        return likeliest(self.errors)
 
     @property
     def gap(self) -> Float:
@@ -140,7 +143,7 @@ def evidence(
         sigma[members] = 0.0
         if camera.any():
             sigma[members] = _by_camera(soup, data, members, valid[members], OPEN * noise, camera)
-    return Evidence(errors[0], errors[1], errors[2], noise, sigma, likeliest(shown), shown)
+    return Evidence(errors[0], errors[1], errors[2], noise, sigma, shown)
 
 
 def _matches(data: EnergyData, at: Mask) -> Matches:

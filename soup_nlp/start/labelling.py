@@ -176,7 +176,8 @@ def candidates(
 def _refitted(
     flow: FlowFit, motions: list[Motion], label: Int, seen: Mask, bad: Mask, scale: float
 ) -> list[Motion]:
-    """Motions with candidates for the superpixels of each, and for pieces that none explains."""
+    """Motions with candidates for the superpixels of each, for those of the main one and another
+    together, and for pieces that none explains."""
     first = int(np.argmax(np.bincount(label[seen], minlength=len(motions))))
     main = motions[first]
     piece = connected_pieces(bad, flow.seg)

@@ -123,7 +123,7 @@ def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least,
 def test_a_rigid_room_does_not_bend_with_its_banner(seed, least):
     banner = problem("banner", f"input.seed={seed}")
     start = prepare(banner, pair=banner.load_pair()).start
-    assert least < start.bends.mean() < 0.41
+    assert least < start.bends.mean() < 0.4
 
 
 def test_a_bending_region_whose_flow_jumps_is_torn():

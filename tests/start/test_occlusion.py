@@ -102,7 +102,7 @@ def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     assert moves.sum() == 12
     # relative to the plane on which all of the image is drawn
     step = np.median(z[~moves]) - np.median(z[moves])
-    assert step == pytest.approx(IN_FRONT if covers else -IN_FRONT, abs=0.15)
+    assert step == pytest.approx(IN_FRONT if covers else -IN_FRONT, rel=1e-6)
     # the flow is explained as before, and the mover is a component
     np.testing.assert_allclose(start.error, before.error)
     flows = [reconstruct(soup, seg.labels, K, K).flow for soup in (start.soup, before.soup)]

@@ -18,7 +18,7 @@ from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
 
 SCALE_PX = 0.25
 """Smallest residual that a fit may treat as an outlier, pixels."""
-ROUNDS = 4
+ROUNDS = 3
 """Re-weighted fits of an affine flow."""
 SWEEPS = 12
 """Number of sweeps, in each of which a border moves at most one pixel, after each of two fits."""
@@ -125,7 +125,7 @@ def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Flo
     """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
 
     s is the larger of `SCALE_PX` and 1.48 times the weighted mean absolute residual of the
-    superpixel. The first weights are those of the distance to its median flow, since plain least
+    superpixel. The first weights follow from the distance to its median flow, since plain least
     squares would fit a slope across two motions without outliers.
 
     Args:
@@ -145,17 +145,21 @@ def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Flo
     fit = AffineFlow(np.zeros((n, 3, 2)), centre, np.sqrt(np.maximum(pixels, 1)), pixels >= 6)
     X = fit.basis(which, u, v)
     Y = flow.uv[v, u].astype(np.float64)
-    C, weight = fit.coefficients, np.ones(len(which))
+    C = fit.coefficients
     if not len(which):
-        return fit, weight
-    C[:, 0] = np.stack([median(y, which, np.arange(n)) for y in flow.uv[v, u].T], axis=1)
-    for k in range(ROUNDS):
-        C = _weighted(which, X, Y, base * weight, n) if k else C
+        return fit, base
+
+    def medians(values: Float) -> Float:
+        return np.asarray(median(values, which, np.arange(n)))
+
+    r = np.linalg.norm(Y - np.stack([medians(y) for y in Y.T], axis=1)[which], axis=1)
+    weight = 1.0 / (1.0 + (r / np.maximum(1.48 * medians(r), SCALE_PX)[which]) ** 2)
+    for _ in range(ROUNDS):
+        C = _weighted(which, X, Y, base * weight, n)
         r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, C[which]), axis=1)
         mass = np.maximum(np.bincount(which, base * weight, n), 1e-30)
         spread = 1.48 * np.bincount(which, base * weight * r, n) / mass
-        s = np.maximum(spread, SCALE_PX)
-        weight = 1.0 / (1.0 + (r / s[which]) ** 2)
+        weight = 1.0 / (1.0 + (r / np.maximum(spread, SCALE_PX)[which]) ** 2)
     return AffineFlow(C, fit.centre, fit.size, fit.fitted), weight
 
 
