@@ -211,8 +211,7 @@ def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
         out.append("frames farther apart in time")
     if camera is not None:
         said = f"undistorted images and exact intrinsics: the flow suggests an error of {camera}"
-        error = run.confidence.evidence.errors.get(camera)
-        fits = None if error is None else better_camera(run.pair.K_ref, camera, error.mean)
+        fits = better_camera(run.pair.K_ref, camera, run.confidence.evidence.errors[camera].mean)
         out.append(said if fits is None else f"{said}, and --intrinsics {written(fits)} would fit")
     if run.pair.focal_sigma > UNSURE_FOCAL and shares["weak"] >= SHARE:
         out.append("the focal length of the camera (--fov or --intrinsics)")

@@ -11,6 +11,7 @@ from soup_nlp.report import findings
 from soup_nlp.report.check import _constraints
 from soup_nlp.report.summary import certainty
 from soup_nlp.report.verdict import exit_code, facts
+from soup_nlp.start.camera_error import CameraError
 
 
 def titles(text):
@@ -39,9 +40,15 @@ def test_what_moves_is_told_with_its_size_length_and_direction(small_run):
     ]
 
 
+def blamed(evidence, camera):
+    """Evidence of a flow that shows an error of the camera, or of none."""
+    errors = {camera: CameraError(0.1, 0.01, 0.1, 9.0)} if camera else {}
+    return replace(evidence, errors=errors)
+
+
 def test_a_wrong_camera_may_look_like_motion(small_run):
     sure = small_run.confidence
-    wrong = replace(sure, evidence=replace(sure.evidence, camera="lens distortion"))
+    wrong = replace(sure, evidence=blamed(sure.evidence, "lens distortion"))
     told = findings.found_words(replace(small_run, confidence=wrong))
     words = "the flow suggests an error of lens distortion, which may look like such motion"
     assert [line for line in told if line not in findings.found_words(small_run)] == [words]
@@ -67,7 +74,7 @@ def seen(run, confidence=None, focal=0.0, camera=None):
     """A run with another confidence of the flow, an unsure focal length, an error of the camera."""
     flow, sure = run.pair.flow, run.confidence
     flow = flow if confidence is None else replace(flow, confidence=confidence)
-    evidence = replace(sure.evidence, camera=camera)
+    evidence = blamed(sure.evidence, camera)
     pair = replace(run.pair, flow=flow, focal_sigma=focal)
     return replace(run, pair=pair, confidence=replace(sure, evidence=evidence))
 
