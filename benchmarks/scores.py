@@ -10,15 +10,21 @@ from benchmarks.table import Cell
 from soup_nlp import Pair, Run, Soup, Truth, run
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.confidence import MOST_SIGMA
-from soup_nlp.evaluate.metrics import (
+from soup_nlp.evaluation.confidence import MOST_SIGMA
+from soup_nlp.evaluation.metrics import (
     MEDIAN,
     UNSCALED,
     DepthMetrics,
     depth_metrics,
     skill,
 )
-from soup_nlp.evaluate.scoring import at_truth, coverage, fill_nearest, score_depths, sparsification
+from soup_nlp.evaluation.scoring import (
+    at_truth,
+    coverage,
+    fill_nearest,
+    score_depths,
+    sparsification,
+)
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.storage.each import Row
 

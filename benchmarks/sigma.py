@@ -9,8 +9,8 @@ from scipy.optimize import minimize
 from benchmarks.scores import solved
 from benchmarks.table import Cell, markdown
 from soup_nlp.arrays import Float
-from soup_nlp.evaluate.confidence import DRAWN, PRIOR, SHARES, with_prior
-from soup_nlp.evaluate.scoring import at_truth
+from soup_nlp.evaluation.confidence import DRAWN, PRIOR, SHARES, with_prior
+from soup_nlp.evaluation.scoring import at_truth
 from soup_nlp.storage.each import Row
 
 PIXELS = 500
@@ -48,7 +48,7 @@ def measure_terms(cell: Cell) -> Row:
 
 
 def sigma_of(terms: Mapping[str, Float], factor: Mapping[str, float]) -> Float:
-    """Sigma by terms and factors, as `soup_nlp.evaluate.confidence` adds them up."""
+    """Sigma by terms and factors, as `soup_nlp.evaluation.confidence` adds them up."""
     squares = np.sum([(factor[name] * terms[name]) ** 2 for name in SHARES], axis=0)
     known = with_prior(np.sqrt(squares), factor["prior"])
     return np.where(terms["drawn"] > 0, factor["drawn"], known)

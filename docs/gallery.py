@@ -16,7 +16,7 @@ from PIL import Image
 import benchmarks.everyday  # noqa: F401, makes its scenes known
 import soup_nlp
 from soup_nlp.arrays import Float
-from soup_nlp.evaluate.metrics import depth_metrics
+from soup_nlp.evaluation.metrics import depth_metrics
 from soup_nlp.geometry.camera import project
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.colour import colourise_depth, depth_range

@@ -22,7 +22,7 @@ from scipy.interpolate import griddata
 import soup_nlp
 from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
-from soup_nlp.evaluate.metrics import depth_metrics
+from soup_nlp.evaluation.metrics import depth_metrics
 from soup_nlp.pipeline.case import prepare
 
 FOLDER, INDOOR = {"kind": "folder"}, {"kind": "folder", "depth_scale": 5000.0}

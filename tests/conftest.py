@@ -16,7 +16,7 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
 from soup_nlp.data.flow import sources
 from soup_nlp.data.scenes import catalogue
-from soup_nlp.evaluate import confidence, evidence
+from soup_nlp.evaluation import confidence, evidence
 from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run

@@ -44,7 +44,7 @@ LIBRARIES = {
 }
 """Which rooms may import a library; `importlib.metadata` names versions without importing."""
 
-BENCHMARKS = {"config", "data", "evaluate", "export", "geometry", "sequence", "storage"}
+BENCHMARKS = {"config", "data", "evaluation", "export", "geometry", "sequence", "storage"}
 """Rooms that `benchmarks` enters; the SOUP set builds its NLPs, and enters those below too."""
 FAMILY = {"model", "pipeline", "start"}
 

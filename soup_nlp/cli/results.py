@@ -14,8 +14,8 @@ from soup_nlp.cli import options
 from soup_nlp.cli.options import option, out_option
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.errors import ConfigError, DataError, ExportError
-from soup_nlp.evaluate.metrics import Scale
-from soup_nlp.evaluate.scoring import evaluate as evaluate_folder
+from soup_nlp.evaluation.metrics import Scale
+from soup_nlp.evaluation.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
 from soup_nlp.geometry.constraints import table
 from soup_nlp.report.chain import Lazy

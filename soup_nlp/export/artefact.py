@@ -12,7 +12,7 @@ from typing_extensions import TypedDict
 
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import ConfigError, ExportError
-from soup_nlp.evaluate.information import Information, information
+from soup_nlp.evaluation.information import Information, information
 from soup_nlp.export.nl import NLFile, suffixes_of, write_nl
 from soup_nlp.export.verify import examine
 from soup_nlp.model import oracle

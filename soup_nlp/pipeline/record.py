@@ -10,9 +10,9 @@ from soup_nlp.arrays import Float, FloatMap
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.working_size import full_depth
-from soup_nlp.evaluate.confidence import Confidence
-from soup_nlp.evaluate.metrics import DepthMetrics
-from soup_nlp.evaluate.scoring import score_depths
+from soup_nlp.evaluation.confidence import Confidence
+from soup_nlp.evaluation.metrics import DepthMetrics
+from soup_nlp.evaluation.scoring import score_depths
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.constraints import Constraints, constraints
 from soup_nlp.geometry.graph import Segmentation

@@ -25,8 +25,8 @@ from soup_nlp.data.formats.cameras import check_cameras
 from soup_nlp.data.inputs import PriorOptions, pair_hash, pair_with_prior
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, StoppedError, expect
-from soup_nlp.evaluate.confidence import confidence
-from soup_nlp.evaluate.scoring import rigid_depth, score_depths
+from soup_nlp.evaluation.confidence import confidence
+from soup_nlp.evaluation.scoring import rigid_depth, score_depths
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.plane import tilt_to_camera
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import FrameError
-from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.motion import RigidMotion

@@ -13,8 +13,8 @@ import numpy as np
 
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate import recompute
-from soup_nlp.evaluate.scoring import DEPTHS, SURE
+from soup_nlp.evaluation import recompute
+from soup_nlp.evaluation.scoring import DEPTHS, SURE
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.report.layout import require_layout
 from soup_nlp.report.summary import Summary

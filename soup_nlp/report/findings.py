@@ -7,7 +7,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.data.formats.cameras import written
 from soup_nlp.data.formats.images import interlaced
-from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
 from soup_nlp.start.camera_error import better_camera
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.scoring import DEPTHS
+from soup_nlp.evaluation.scoring import DEPTHS
 from soup_nlp.pipeline.record import Run
 from soup_nlp.storage.store import ReadTree, Row, parse_table, row_of
 

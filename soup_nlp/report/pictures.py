@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.arrays import AnyFloat, Image, Mask
-from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.report.chain import Chain, depth_legend
 from soup_nlp.report.colour import (
     colourise_depth,

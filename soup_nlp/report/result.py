@@ -13,9 +13,9 @@ from PIL.Image import fromarray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.confidence import MIN_CONFIDENCE, NO_CONFIDENCE
-from soup_nlp.evaluate.metrics import DepthMetrics
-from soup_nlp.evaluate.scoring import DEPTHS
+from soup_nlp.evaluation.confidence import MIN_CONFIDENCE, NO_CONFIDENCE
+from soup_nlp.evaluation.metrics import DepthMetrics
+from soup_nlp.evaluation.scoring import DEPTHS
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.constraints import Constraints, constraints
 from soup_nlp.geometry.graph import Segmentation

@@ -7,8 +7,8 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from soup_nlp.arrays import Mask
-from soup_nlp.evaluate.confidence import MOST_SIGMA
-from soup_nlp.evaluate.metrics import DepthMetrics, component_overlaps, skill
+from soup_nlp.evaluation.confidence import MOST_SIGMA
+from soup_nlp.evaluation.metrics import DepthMetrics, component_overlaps, skill
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.pipeline.record import Run

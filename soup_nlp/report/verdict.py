@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from soup_nlp.evaluate.metrics import DepthMetrics, skill
-from soup_nlp.evaluate.scoring import SURE
+from soup_nlp.evaluation.metrics import DepthMetrics, skill
+from soup_nlp.evaluation.scoring import SURE
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.findings import (
     certainty_lines,

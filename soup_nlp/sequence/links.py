@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError, expect
-from soup_nlp.evaluate.metrics import overlap_shares
+from soup_nlp.evaluation.metrics import overlap_shares
 from soup_nlp.geometry.superpixels import Labels
 from soup_nlp.report.chain import STILL, Brief, Chain, Lazy, Link
 from soup_nlp.report.result import Result, load

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import MEDIAN, UNSCALED, Convention, depth_metrics
+from soup_nlp.evaluation.metrics import MEDIAN, UNSCALED, Convention, depth_metrics
 from soup_nlp.geometry.rotation import log
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import certainty_lines, guess_line

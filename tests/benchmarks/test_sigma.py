@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.sigma import FACTORS, HEAVY, fitted, loss, sigma_of
-from soup_nlp.evaluate.confidence import SHARES
+from soup_nlp.evaluation.confidence import SHARES
 
 
 def test_sigma_by_terms_is_that_of_a_run(small_run):

@@ -231,9 +231,6 @@ def test_completion_knows_commands_problems_and_formats(line, word, monkeypatch)
 def test_public_names_are_there_after_any_import():
     assert all(hasattr(soup_nlp, name) for name in soup_nlp.__all__)
     assert soup_nlp.__all__ == dir(soup_nlp)
-    # the room of the same name does not take the function's place
-    import_module("soup_nlp.evaluate.scoring")
-    assert callable(soup_nlp.evaluate)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         soup_nlp.nothing  # noqa: B018
 

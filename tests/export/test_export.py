@@ -17,7 +17,7 @@ from scipy import sparse
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ConfigError, ExportError
-from soup_nlp.evaluate.information import information
+from soup_nlp.evaluation.information import information
 from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol, sol_table
 from soup_nlp.export.program import file_orders

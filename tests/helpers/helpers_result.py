@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from soup_nlp.evaluate.metrics import depth_metrics
+from soup_nlp.evaluation.metrics import depth_metrics
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.geometry.components import find_components
 from soup_nlp.geometry.graph import build_segmentation

@@ -15,7 +15,7 @@ from soup_nlp.arrays import Mask
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem, load_problem, make_problem
 from soup_nlp.data.pair import Pair
-from soup_nlp.evaluate.metrics import UNSCALED, depth_metrics
+from soup_nlp.evaluation.metrics import UNSCALED, depth_metrics
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct

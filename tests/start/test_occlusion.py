@@ -8,7 +8,7 @@ from helpers_start import fitted, rendered, squares
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.evaluate.confidence import MOST_SIGMA
+from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct

@@ -1,6 +1,6 @@
 """Independent computation of energy, depth and scores from stored arrays.
 
-Nothing of `soup_nlp.model`, `soup_nlp.solve` or `soup_nlp.evaluate.metrics` is used, so that an
+Nothing of `soup_nlp.model`, `soup_nlp.solve` or `soup_nlp.evaluation.metrics` is used, so that an
 error there cannot confirm itself.
 """
 

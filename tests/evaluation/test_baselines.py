@@ -6,8 +6,8 @@ import pytest
 from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.evaluate.metrics import depth_metrics
-from soup_nlp.evaluate.scoring import FAR, fill_nearest, rigid_depth
+from soup_nlp.evaluation.metrics import depth_metrics
+from soup_nlp.evaluation.scoring import FAR, fill_nearest, rigid_depth
 from soup_nlp.geometry import rotation
 
 K = np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]])

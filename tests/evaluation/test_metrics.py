@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate import recompute
-from soup_nlp.evaluate.metrics import (
+from soup_nlp.evaluation import recompute
+from soup_nlp.evaluation.metrics import (
     UNSCALED,
     Convention,
     component_overlaps,
@@ -19,7 +19,7 @@ from soup_nlp.evaluate.metrics import (
     scene_flow_epe,
     skill,
 )
-from soup_nlp.evaluate.scoring import LAST, STEPS, coverage, sparsification
+from soup_nlp.evaluation.scoring import LAST, STEPS, coverage, sparsification
 
 depths = arrays(np.float64, 12, elements=st.floats(0.1, 100.0))
 factors = st.floats(1e-3, 1e3)

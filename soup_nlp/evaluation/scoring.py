@@ -15,7 +15,7 @@ from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.evaluate.metrics import (
+from soup_nlp.evaluation.metrics import (
     MEDIAN,
     Convention,
     DepthMetrics,
@@ -103,7 +103,24 @@ def evaluate(
     depth_scale: float | None = None,
     moving: str | Path | Mask | None = None,
 ) -> dict[str, DepthMetrics]:
-    """Score a depth against the truth; its text is that of `soup_nlp.evaluate`."""
+    """Score a depth against the truth.
+
+    Args:
+        result: Result folder, `Run`, stored result, or depth of the reference frame (H, W).
+        depth: True depth of the reference frame (H, W), or a file: .dpt, .npy, .pfm, 16-bit .png.
+        scale: "median", "mre", "lsq", "affine" (scale and shift) or "none".
+        cap: Truth beyond this depth is dropped, positive.
+        depth_scale: Values per unit of length of a .png; None for 1000, with a warning.
+        moving: (H, W) True where something moves by itself, or a picture that is not black there:
+            "static" and "moving" are then scored by themselves, at the scale of all pixels.
+
+    Returns:
+        Metrics by "solution", "start", "nlp" and "rigid" (if known) and "constant".
+
+    Raises:
+        DataError: the cap is not positive, a file is missing, sizes differ, or the truth has no
+            pixel.
+    """
     convention = Convention(scale=scale, cap=cap)
     depths = _depths(result)
     where = depth if isinstance(depth, str | Path) else "truth"

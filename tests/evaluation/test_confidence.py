@@ -10,8 +10,8 @@ from scipy import sparse
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow
-from soup_nlp.evaluate import information as information_module
-from soup_nlp.evaluate.confidence import (
+from soup_nlp.evaluation import information as information_module
+from soup_nlp.evaluation.confidence import (
     DRAWN,
     MISFIT,
     MOST_SIGMA,
@@ -22,7 +22,7 @@ from soup_nlp.evaluate.confidence import (
     flow_misfit,
     with_prior,
 )
-from soup_nlp.evaluate.information import information, marginals, spread_in_image
+from soup_nlp.evaluation.information import information, marginals, spread_in_image
 from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation

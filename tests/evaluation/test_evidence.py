@@ -7,7 +7,7 @@ import pytest
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair
-from soup_nlp.evaluate.evidence import LEAST_GAP_PX, Evidence, evidence
+from soup_nlp.evaluation.evidence import LEAST_GAP_PX, Evidence, evidence
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup

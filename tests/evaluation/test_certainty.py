@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soup_nlp.evaluate.confidence import MOST_SIGMA, PRIOR
+from soup_nlp.evaluation.confidence import MOST_SIGMA, PRIOR
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.report.findings import (
     DETERMINED,

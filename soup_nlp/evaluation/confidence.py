@@ -14,8 +14,8 @@ from scipy import ndimage
 from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import ModelError
-from soup_nlp.evaluate.evidence import Evidence, evidence
-from soup_nlp.evaluate.information import Marginals, information, marginals, spread_in_image
+from soup_nlp.evaluation.evidence import Evidence, evidence
+from soup_nlp.evaluation.information import Marginals, information, marginals, spread_in_image
 from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
