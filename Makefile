@@ -60,8 +60,6 @@ results: $(VENV)/.optional
 	-$(BIN)/soup-nlp solve problems/motorcycle.yaml -o out/motorcycle --overwrite
 	-cp out/motorcycle/overview.png results/motorcycle.png
 	$(BENCH) accuracy -o results/accuracy $(PAIRS)
-	$(BENCH) accuracy -o results/accuracy --name banner --suite rendered --only banner \
-		--seeds 0,1,2,3,4,5 --flow truth --flow dis
 	$(BENCH) chain -o results/accuracy $(if $(DATA),--data $(DATA))
 	$(BENCH) paper -o results/paper $(if $(DATA),--data $(DATA)) --limit 1 --superpixels 1000 \
 		--analysis 100

@@ -6,6 +6,7 @@ from contextlib import suppress
 from itertools import product
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -234,12 +235,13 @@ def write_paper(page: Path, frame: pd.DataFrame, plan: pd.DataFrame, note: str) 
         blocks += _comparison(sections["comparison"])
     blocks += ["Published ablation, MRE:", markdown(ABLATION.rename_axis("sequence"))]
     for name, (title, _) in STUDIES.items():
-        blocks.append(f"## {title}")
+        blocks += [f"## {title}", "Median MRE of the pairs:"]
+        medians: dict[tuple[Any, int], pd.Series] = {}
         for method, group in sections[name].groupby("method", sort=False):
-            table = _pivot(group, "name", "change")
-            whole = table.dropna()
-            table.loc[f"mean of {len(whole)}"] = whole.mean()
-            blocks += [f"{method}, MRE:", markdown(table.rename_axis("pair"))]
+            table = _pivot(group, "name", "change").dropna()
+            medians[method, len(table)] = table.median()
+        table = pd.DataFrame(medians).T.rename_axis(["method", "pairs"])
+        blocks.append(markdown(table))
     page.write_text(page_text([*blocks, *_departures(sections["departures"])], frame), "utf-8")
 
 
@@ -271,14 +273,19 @@ def _comparison(rows: pd.DataFrame) -> list[str]:
 
 def _departures(rows: pd.DataFrame) -> list[str]:
     """Table of the departures, each undone alone."""
-    table = _pivot(rows, "change", "name").dropna(axis=1, how="all")
-    ratios = table / table.loc[BASE]
-    table.insert(0, "mean", ratios.apply(geometric, axis=1))
+    mre = _pivot(rows, "change", "name").dropna(axis=1, how="all")
+    ratios = (mre / mre.loc[BASE]).drop(BASE)
     counts = zip((ratios > 1.01).sum(axis=1), (ratios < 0.99).sum(axis=1), strict=True)
-    table.insert(1, "worse / better", [f"{a} / {b}" for a, b in counts])
-    text = (
-        "The defaults with one departure undone, MRE. *Mean*: geometric mean of the ratios to the"
-        " first line, above 1 if the departure pays; *worse / better*: pairs that change by more"
-        " than 1 %."
+    table = pd.DataFrame(
+        {
+            "mean": ratios.apply(geometric, axis=1),
+            "median": ratios.median(axis=1),
+            "worse / better": [f"{a} / {b}" for a, b in counts],
+        }
     )
-    return ["## Departures, one at a time", text, markdown(table.rename_axis("departure"))]
+    text = (
+        f"The defaults with one departure undone, on {', '.join(mre)}. Ratio of the MRE to that of"
+        " the defaults, above 1 if the departure pays; *mean* is geometric; *worse / better*: pairs"
+        " that change by more than 1 %."
+    )
+    return ["## Departures, one at a time", text, markdown(table.rename_axis("departure"), ".2f")]
