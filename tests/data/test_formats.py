@@ -11,6 +11,7 @@ import pytest
 from helpers_files import put, raises, write_cam, write_dpt, write_kitti_flow
 from PIL import Image
 
+from soup_nlp.data.datasets import benchmarks
 from soup_nlp.data.formats import camera_files
 from soup_nlp.data.formats import map_files as fmt
 from soup_nlp.data.formats.images import DataWarning, read_image, read_mask
@@ -57,8 +58,8 @@ READERS = {
     "depth": partial(fmt.read_depth, scale=1000.0),
     "cam": camera_files.read_cam,
     "camera": camera_files.read_intrinsics,
-    "kitti": partial(camera_files.read_rows, names=["P0:"], count=12),
-    "vkitti": partial(camera_files.read_rows, names=["0 0"], count=4),
+    "kitti": partial(benchmarks.read_rows, names=["P0:"], count=12),
+    "vkitti": partial(benchmarks.read_rows, names=["0 0"], count=4),
     "image": read_image,
 }
 MALFORMED = [
@@ -183,7 +184,7 @@ def test_real_files(shared_data: Path, tmp_path: Path) -> None:
     write_kitti_flow(tmp_path / "a.png", flow)
     np.testing.assert_array_equal(fmt.read_flow(tmp_path / "a.png"), flow)
     calibration = folder / "calib" / "000027.txt"
-    assert camera_files.read_rows(calibration, ["P1:"], 12)[0, 3] == -386.1448
+    assert benchmarks.read_rows(calibration, ["P1:"], 12)[0, 3] == -386.1448
 
 
 @pytest.mark.parametrize("mark", [np.nan, np.inf, -np.inf, 1.1e9, -2e9])
@@ -284,15 +285,15 @@ def test_rows_of_numbers(tmp_path: Path) -> None:
         "K_00: 1 2 3 4 5 6 7 8 9\n\nP_rect_00: 1 2 3 4 5 6 7 8 9 10 11 12\nT_00: 1 2 3\n"
     )
     path = put(tmp_path / "calib.txt", kitti.encode())
-    rows = camera_files.read_rows(path, ["P_rect_00:"], 12)
+    rows = benchmarks.read_rows(path, ["P_rect_00:"], 12)
     np.testing.assert_array_equal(rows, [np.arange(1, 13)])
     vkitti = f"{COLUMNS}\n0 0 725 726 620.5 187\n0 1 7 7 6 1\n1 0 730 730 6 1\n\n2 0 725\n"
     put(path, vkitti.encode())
-    rows = camera_files.read_rows(path, ["1 0", "0 0"], 4)
+    rows = benchmarks.read_rows(path, ["1 0", "0 0"], 4)
     np.testing.assert_array_equal(rows, [[730, 730, 6, 1], [725, 726, 620.5, 187]])
     for missing in ("2 0", "3 0"):
         with raises(rf"lacks the numbers of {missing}"):
-            camera_files.read_rows(path, ["0 0", missing], 4)
+            benchmarks.read_rows(path, ["0 0", missing], 4)
 
 
 # --- images -------------------------------------------------------------------------------------

@@ -1,13 +1,15 @@
 """KITTI stereo/flow 2012 and scene flow 2015, Virtual KITTI 1 and 2, MPI Sintel, in metres."""
 
 import re
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BeforeValidator
 
+from soup_nlp.arrays import Float
 from soup_nlp.data.datasets.layout import Folder, PairInput, Resolve, make_pair
-from soup_nlp.data.formats.camera_files import check_intrinsics, read_cam, read_rows
+from soup_nlp.data.formats.camera_files import check_intrinsics, number, read_cam
 from soup_nlp.data.formats.images import assumed, decode, read_mask
 from soup_nlp.data.formats.map_files import (
     KITTI_DISPARITY,
@@ -21,6 +23,7 @@ from soup_nlp.data.pair import Pair, Truth, check_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Index, Whole
+from soup_nlp.storage.files import PathLike, read_text
 
 _KITTI = {
     "kitti2012": ("image_0", "calib", ("P0:", "P1:"), "disp_occ"),
@@ -66,11 +69,30 @@ def _pair_number(index: object) -> str:
     return f"{int(str(index)):06d}"
 
 
+def read_rows(path: PathLike, names: Sequence[str], count: int) -> Float:
+    """The rows of a calibration file with these names, such as "P0:", as (len(names), count)."""
+    lines = [line.split() for line in read_text(path, "calibration file").splitlines()]
+    out = []
+    for name in names:
+        head = name.split()
+        rows = [line[len(head) :] for line in lines if line[: len(head)] == head]
+        row = [number(word, name, path) for word in (rows[0] if rows else [])]
+        if len(row) != count or not np.isfinite(row).all():
+            others = [line[0] for line in lines if line]
+            raise DataError(
+                f"calibration file lacks the numbers of {name}",
+                where=path,
+                found=" ".join(rows[0]) if rows else f"lines {', '.join(others[:20])}",
+                expected=f"a line '{name} ...' with {count} finite numbers",
+            )
+        out.append(row)
+    return np.array(out)
+
+
 class KittiInput(PairInput):
     """KITTI 2012 (grey camera 0) or 2015 (colour camera 2): frames 10 and 11 of a sequence.
 
-    Depth is f B / disparity. The moving objects of the obj_map of 2015 are components; 0 is the
-    static scene.
+    Depth is f B / disparity. The objects of the obj_map of 2015 are components; 0 is static.
     """
 
     kind: Literal["kitti2012", "kitti2015"]
