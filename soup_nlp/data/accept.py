@@ -1,4 +1,7 @@
-"""Conversion of images, cameras and flows, as callers may give them, to checked arrays."""
+"""Conversion of images, cameras and flows, as callers may give them, to checked arrays.
+
+What cannot be converted is a DataError.
+"""
 
 import os
 from pathlib import Path
@@ -33,11 +36,7 @@ def is_path(value: object) -> bool:
 
 
 def image_of(source: ImageLike, where: str) -> Image:
-    """(H, W, 3) uint8 RGB of an array, a file or a PIL image; grey is repeated, alpha dropped.
-
-    Raises:
-        DataError: it is not such an image.
-    """
+    """(H, W, 3) uint8 RGB of an array, a file or a PIL image; grey is repeated, alpha dropped."""
     if is_path(source):
         return read_image(Path(source))
     if hasattr(source, "convert") and getattr(source, "mode", None) in _PICTURES:
@@ -65,11 +64,7 @@ def image_of(source: ImageLike, where: str) -> Image:
 
 
 def camera_of(source: CameraLike, where: str) -> Float:
-    """(3, 3) intrinsics from a matrix, from (fx, fy, cx, cy), or from a file.
-
-    Raises:
-        DataError: it is not a camera.
-    """
+    """(3, 3) intrinsics from a matrix, from (fx, fy, cx, cy), or from a file."""
     if is_path(source):
         return read_intrinsics(Path(source))
     numbers = array_of(source, "intrinsics", where, "(3, 3), or fx, fy, cx, cy")
@@ -77,11 +72,7 @@ def camera_of(source: CameraLike, where: str) -> Float:
 
 
 def prior_of(source: object) -> Float:
-    """(H, W) values of a depth prior, NaN where they are not positive and finite.
-
-    Raises:
-        DataError: it is neither a map nor the path of a map file.
-    """
+    """(H, W) values of a depth prior or its file, NaN where they are not positive and finite."""
     if is_path(source):
         return read_prior(Path(str(source)))
     values = array_of(source, "depth prior", "prior", "numbers (H, W), or a path")
@@ -97,7 +88,7 @@ def array_of(
     axes: str = "",
     hint: str | None = None,
 ) -> NDArray[Any]:
-    """An object as NumPy array.
+    """An object as NumPy array, or a DataError with its name, origin, expectation and hint.
 
     Args:
         value: The object.
@@ -107,9 +98,6 @@ def array_of(
         kinds: Accepted kinds of NumPy's data types, a letter each.
         axes: Its shape, such as "(H, W, 2)"; any shape if empty.
         hint: What to try, for the message.
-
-    Raises:
-        DataError: it is not an array of these numbers or of this shape.
     """
     try:
         array = np.asarray(value)

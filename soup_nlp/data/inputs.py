@@ -52,16 +52,7 @@ class PriorOptions(Section):
             )
 
     def load(self, pair: Pair, path: Resolve) -> Pair:
-        """The pair with the prior of the source, if there is one.
-
-        Args:
-            pair: Images.
-            path: Resolves the name of a file.
-
-        Raises:
-            ConfigError: see `require_prior`.
-            DataError: see `pair_with_prior`.
-        """
+        """The pair with the prior of the source, if there is one; `path` resolves its name."""
         self.require_prior(pair.depth_prior is not None)
         if self.source is None:
             return pair
@@ -71,11 +62,7 @@ class PriorOptions(Section):
 
 
 def pair_with_prior(pair: Pair, source: object, where: str) -> Pair:
-    """The pair with a depth prior, a map (h, w) or its file, resized to the reference image.
-
-    Raises:
-        DataError: it is no map, its aspect ratio is not that of the image, or nothing is known.
-    """
+    """The pair with a depth prior, a map (h, w) or its file, resized to the reference image."""
     prior, (height, width) = prior_of(source), pair.size
     if abs(np.log(prior.shape[1] * height / (prior.shape[0] * width))) > SAME_SHAPE:
         raise DataError(

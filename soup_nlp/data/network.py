@@ -26,10 +26,6 @@ class Network:
     Args:
         source: Path of an .onnx file.
         count: Number of images, 1 or 2.
-
-    Raises:
-        ConfigError: onnxruntime is not installed.
-        DataError: the file is missing or no such network.
     """
 
     def __init__(self, source: str, count: int) -> None:
@@ -65,11 +61,7 @@ class Network:
     def outputs(
         self, fits: Callable[[Any], bool], kind: str, *images: Image
     ) -> tuple[list[Any], tuple[int, int]]:
-        """Outputs that fit for images (H, W, 3) of equal size, and (rows, columns) of the inputs.
-
-        Raises:
-            DataError: the network fails, or has no output of the kind, such as "flow (1, 2, h, w)".
-        """
+        """Outputs for images (H, W, 3) that fit a kind, "map (1, 1, h, w)"; the size of inputs."""
         height, width = images[0].shape[:2]
         rows, cols = self.size or (-(-n // 8) * 8 for n in (height, width))
         black, white = self.levels
@@ -119,9 +111,6 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
             used, and the last one of equal size.
         image_ref: (H, W, 3) uint8 RGB reference image.
         image_next: (H, W, 3) uint8 RGB next image of the same size.
-
-    Raises:
-        DataError: the library or the file is missing, or the network gives no flow.
     """
     if image_ref.shape != image_next.shape:
         shapes = f"{image_ref.shape} and {image_next.shape}"
@@ -135,15 +124,9 @@ def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
 
 
 def learned_map(source: str, image: Image) -> FloatMap:
-    """(h, w) depth or inverse depth of an image by a network; NaN where it is not positive.
+    """(h, w) depth or inverse depth of an image (H, W, 3), NaN where it is not positive.
 
-    Args:
-        source: Path of an .onnx file with an output (1, h, w) or (1, 1, h, w), the last one of
-            several.
-        image: (H, W, 3) uint8 RGB image.
-
-    Raises:
-        DataError: the library or the file is missing, or the network gives no map.
+    It is the last output (1, h, w) or (1, 1, h, w) of the network in an .onnx file.
     """
     network = Network(source, 1)
     maps, (rows, cols) = network.outputs(

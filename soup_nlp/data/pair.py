@@ -1,6 +1,6 @@
 """Input of a solve: two images, two cameras, a flow and, if known, the truth."""
 
-from dataclasses import InitVar, dataclass, field, replace
+from dataclasses import InitVar, dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import NoneType
@@ -231,7 +231,7 @@ class Pair:
     K_ref: Float = None  # type: ignore[assignment]
     K_next: Float = None  # type: ignore[assignment]
     flow: Flow | None = None
-    truth: Truth | None = field(default=None)
+    truth: Truth | None = None
     name: str = "pair"
     fov: InitVar[float | None] = None
     depth_prior: Float | None = None

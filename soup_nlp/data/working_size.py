@@ -23,8 +23,7 @@ ALIKE = 1.1
 def working_size(pair: Pair, megapixels: float | None) -> Pair:
     """The pair reduced to a reference image of at most `megapixels`, None for no limit.
 
-    Images and flow are averaged, the flow with its confidence as weight. Depths and labels of the
-    truth are those of the nearest pixel.
+    Images and flow are averaged, depths and labels are those of the nearest pixel.
     """
     height, width = pair.size
     if megapixels is None or height * width <= megapixels * 1e6:
@@ -77,10 +76,8 @@ def resized_flow(flow: Flow, pair: Pair, other: Pair) -> Flow:
 
 
 def resized(image: NDArray[Any], size: Sequence[int]) -> NDArray[Any]:
-    """An image or a flow resized to (height, width): pixel means, or nearest pixels to enlarge.
-
-    Interpolation would mix the displacements of two objects.
-    """
+    """An image or a flow resized to (height, width): pixel means, or nearest pixels to enlarge."""
+    # interpolation would mix the displacements of two objects
     how = cv2.INTER_AREA if size[0] <= image.shape[0] else cv2.INTER_NEAREST_EXACT
     return np.asarray(cv2.resize(image, (int(size[1]), int(size[0])), interpolation=how))
 
@@ -112,10 +109,9 @@ def _truth(truth: Truth, pair: Pair, small: Pair) -> Truth:
 
 
 def at_common_focal(pair: Pair) -> Pair:
-    """The pair with one image reduced to the focal lengths of the other image.
+    """The pair with the finer image reduced to the focal lengths of the other one, if they differ.
 
-    The finer image is reduced, since a blurred image shifts against a sharp one. The pair is
-    returned unchanged if the focal lengths differ by less than a tenth.
+    A blurred image would shift against a sharp one.
     """
     ratio = np.diag(pair.K_next)[1::-1] / np.diag(pair.K_ref)[1::-1]
     if 1 / ALIKE <= np.sqrt(ratio.prod()) <= ALIKE:

@@ -1,4 +1,8 @@
-"""Files: checked reading, JSON and YAML with limits of size and nesting, and writing."""
+"""Files: checked reading, JSON and YAML with limits of size and nesting, and writing.
+
+What cannot be read is a SoupError of the type that the caller asks for, with the name `what` of the
+file; what cannot be written is a DataError.
+"""
 
 import json
 import os
@@ -33,11 +37,7 @@ DEEPEST = 64
 def as_path(
     name: object, what: str = "file", *, error: type[SoupError] = DataError, home: bool = False
 ) -> Path:
-    """A name as a path; `~` stands for the home folder if `home` is set.
-
-    Raises:
-        SoupError: it is no path, no name of a file, or names the home of an unknown user.
-    """
+    """A name as a path; `~` stands for the home folder if `home` is set."""
     if not isinstance(name, str | os.PathLike) or isinstance(os.fspath(name), bytes):
         raise error(
             f"{what} is not named by a path",
@@ -64,11 +64,7 @@ is_folder: Callable[[PathLike], bool] = os.path.isdir
 
 
 def require_file(path: PathLike, what: str, *, error: type[SoupError] = DataError) -> Path:
-    """The path, if it is a regular file.
-
-    Raises:
-        SoupError: it is not.
-    """
+    """The path, if it is a regular file."""
     path = as_path(path, what, error=error)
     try:
         mode = os.stat(path).st_mode
@@ -87,13 +83,7 @@ def require_file(path: PathLike, what: str, *, error: type[SoupError] = DataErro
 def read_bytes(
     path: PathLike, what: str, *, error: type[SoupError] = DataError, most: int = MOST_BYTES
 ) -> bytes:
-    """The content of a regular file.
-
-    Pipes and devices, which may never end, are not opened, and the size is checked first.
-
-    Raises:
-        SoupError: the file is missing, not a regular one, empty, too large, or not readable.
-    """
+    """The content of a regular file, of 1 to `most` bytes; pipes, which may never end, are none."""
     path = require_file(path, what, error=error)
     try:
         size = path.stat().st_size
@@ -165,17 +155,7 @@ def fits(value: object, kind: Any) -> bool:
 def read_json(
     path: PathLike, what: str, kind: type[Kind], *, error: type[SoupError] = DataError
 ) -> Kind:
-    """The value of a JSON file, see `parse_json`.
-
-    Args:
-        path: The file.
-        what: Its name in messages.
-        kind: Type that the value must have, such as a TypedDict; further entries stay.
-        error: Type of the exception.
-
-    Raises:
-        SoupError: the file cannot be read, is not such JSON, or an entry is of another type.
-    """
+    """The value of a JSON file, see `parse_json`, which must have a type, see `fits`."""
     try:
         value: Kind = parse_json(read_text(path, what, error=error))
         _adapter(kind).validate_python(value, strict=True)
@@ -210,12 +190,7 @@ def parse_yaml(
     kind: type[yaml.SafeLoader] = yaml.SafeLoader,
     see: Callable[[yaml.Node], None] = lambda node: None,
 ) -> Any:
-    """The value of a YAML text.
-
-    Args:
-        text: The text.
-        kind: Loader.
-        see: Called with the document before its values are constructed.
+    """The value of a YAML text, by a loader; `see` is called with the document before.
 
     Raises:
         ValueError: it is not YAML (its cause is the YAML error), too long, nested too deeply, or
@@ -258,11 +233,7 @@ def parse_yaml(
 
 
 def write_bytes(path: PathLike, data: bytes) -> None:
-    """Write a file; commands do so in a folder of `folders.staged`.
-
-    Raises:
-        DataError: the folder is missing or cannot be written, or the disk is full.
-    """
+    """Write a file; commands do so in a folder of `folders.staged`."""
     target = Path(path)
     try:
         target.write_bytes(data)
@@ -280,10 +251,7 @@ def write_text(path: PathLike, text: str) -> None:
 def plain(obj: object) -> Any:
     """An object as JSON types: NumPy becomes Python, NaN and infinities None, paths text.
 
-    Dataclasses become mappings; tuples and arrays become lists.
-
-    Raises:
-        DataError: a type that JSON does not have.
+    Dataclasses become mappings; tuples and arrays become lists; other types are a DataError.
     """
     return to_jsonable_python(obj, inf_nan_mode="null", fallback=_builtin)
 
@@ -302,10 +270,6 @@ def _builtin(obj: object) -> Any:
 
 
 def write_json(path: PathLike, obj: object) -> None:
-    """Write an object as JSON (see `plain`); two-space indent, UTF-8.
-
-    Raises:
-        DataError: the object holds a type that JSON does not have, or the file cannot be written.
-    """
+    """Write an object as JSON, see `plain`; two-space indent, UTF-8."""
     text = json.dumps(plain(obj), indent=2, ensure_ascii=False, allow_nan=False)
     write_text(path, text + "\n")

@@ -102,9 +102,7 @@ def claim(
     subject: str = "",
     journal: str = "",
 ) -> Path:
-    """Check that these files may be written into an output folder, and return it.
-
-    A missing folder is not made yet.
+    """Check that these files may be written into an output folder, which is not made yet.
 
     Args:
         folder: The output folder.
@@ -112,10 +110,6 @@ def claim(
         overwrite: Allow files of the user with these names, and the result of another subject.
         subject: Subject of the new result, see `Sums`.
         journal: File that the command appends to: one that is there must be of this program.
-
-    Raises:
-        DataError: the folder cannot be written, holds a file of the user or a folder with one of
-            the names, or is the result of another subject.
     """
     hint = "choose another --out, or --overwrite"
     with _named_errors(folder):
@@ -167,9 +161,6 @@ def staged(
         whole: The new files are a complete result: files of an earlier result are removed.
         overwrite: Overwrite files that the program did not make.
         subject: Subject of the new result; empty for that of the earlier result.
-
-    Raises:
-        DataError: a file cannot be written, or a file of the user has the name of a new one.
     """
     target = Path(os.path.realpath(as_path(folder, "output folder")))
     fresh = [p for p in target.parents if not os.path.lexists(p)]

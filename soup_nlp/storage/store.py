@@ -75,18 +75,13 @@ def write_h5(
 ) -> None:
     """Write a result file.
 
-    Each array becomes a dataset with the attributes `units`, `description` and `shape_letters`;
-    each mapping a group. The root gets `attrs`, without None, plus `schema`, `versions` and
-    `machine`; what has no type of HDF5 is JSON text.
-
     Args:
         path: File to write; its folder must exist.
-        tree: The arrays.
-        attrs: Root attributes.
+        tree: The arrays. Each becomes a dataset with the attributes `units`, `description` and
+            `shape_letters`, each mapping a group.
+        attrs: Root attributes, without None, beside `schema`, `versions` and `machine`; what has no
+            type of HDF5 is JSON text.
         rows: Descriptions of the arrays, see `parse_table`.
-
-    Raises:
-        DataError: an array cannot be stored, or the file cannot be written.
     """
     about = {"schema": SCHEMA, "versions": json.dumps(versions()), "machine": platform.platform()}
     try:
@@ -134,20 +129,15 @@ def _write_array(group: h5py.Group, name: str, data: NDArray[Any]) -> h5py.Datas
             options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
         return group.create_dataset(name, data=data, **options)
     # scalars and empty arrays are stored in the header, which has a checksum
-    kind = h5py.h5t.py_create(data.dtype, logical=True)
     layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     layout.set_layout(h5py.h5d.COMPACT)
-    space = h5py.h5s.create_simple(data.shape) if data.ndim else h5py.h5s.create(h5py.h5s.SCALAR)
-    made = h5py.h5d.create(group.id, name.encode(), kind, space, layout)
-    made.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(data))
-    return h5py.Dataset(made)
+    return group.create_dataset(name, data=data, dcpl=layout)
 
 
 # --- reading --------------------------------------------------------------------------------------
 
 ReadTree: TypeAlias = dict[str, Any]
 """Nested dict of numpy arrays, as `read_h5` returns it."""
-
 DEEPEST = 16
 """Largest number of nested groups."""
 LARGE = 16 << 20
@@ -161,9 +151,8 @@ BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError
 def read_h5(path: PathLike) -> ReadTree:
     """All arrays of a result file, as nested dicts of numpy arrays (text as str or object arrays).
 
-    Raises:
-        DataError: the file is missing, damaged or not HDF5, holds a link or a type that no result
-            has, or does not fit into memory.
+    A file that is damaged, holds a link or a type that no result has, or does not fit into memory
+    is a DataError.
     """
     require_file(path, "result file")
     try:
@@ -227,11 +216,7 @@ def _odd(item: Any, seen: set[object]) -> str:
 
 
 def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:
-    """The array at "a/b" of a tree that was read.
-
-    Raises:
-        DataError: there is no such array; the message lists the existing ones.
-    """
+    """The array at "a/b" of a tree that was read; the error lists the existing ones."""
     here: Any = tree
     for key in name.split("/"):
         if not isinstance(here, Mapping) or key not in here:

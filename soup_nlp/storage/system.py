@@ -27,19 +27,11 @@ REFUSALS = (
 
 
 def require_memory(size: float, what: str, where: object = None, hint: str | None = None) -> None:
-    """Raise DataError if fewer than `size` bytes of memory are usable.
-
-    Args:
-        size: Bytes that will be allocated.
-        what: What needs them, for the message.
-        where: File or option concerned.
-        hint: What to try.
-    """
+    """Raise DataError if fewer bytes of memory than `what` needs are usable without swapping."""
     free = [int(psutil.virtual_memory().available)]
     for name in _LIMITS:
         with suppress(OSError, ValueError):
             free.append(int(Path(name).read_text()) - int(psutil.Process().memory_info().rss))
-    # bytes that this process can allocate without swapping
     usable = max(0, min(free))
     if size > usable:
         raise DataError(

@@ -27,11 +27,7 @@ class PairInput(Section, ABC):
 
     @abstractmethod
     def load(self, path: Resolve) -> Pair:
-        """The pair, without its flow; `path` resolves the names of files.
-
-        Raises:
-            DataError: a required file is missing, or a file is malformed or has a wrong size.
-        """
+        """The pair, without its flow; `path` resolves the names of files."""
 
     def files(self) -> list[str]:
         """Names of the files and folders that are read."""
@@ -53,16 +49,7 @@ class FramesInput(PairInput):
 
 
 class Folder:
-    """The folder of a dataset.
-
-    Args:
-        path: Its path.
-        layout: The files that are expected in it, for messages.
-        below: Name of a folder in it that takes its place if there is one.
-
-    Raises:
-        DataError: the path is no folder.
-    """
+    """The folder of a dataset, or the folder `below` in it; `layout` names the expected files."""
 
     def __init__(self, path: PathLike, layout: str, below: str = "") -> None:
         self.path, self.layout = as_path(path, "dataset folder"), layout
@@ -80,11 +67,7 @@ class Folder:
         return next((self.path / name for name in names if is_file(self.path / name)), None)
 
     def need(self, *names: str) -> Path:
-        """The first of these files that exists.
-
-        Raises:
-            DataError: there is none; the message names the first missing folder.
-        """
+        """The first of these files that exists; the error names the first missing folder."""
         file = self.find(*names)
         if file is not None:
             return file
@@ -129,9 +112,6 @@ def make_pair(
         focal_sigma: Standard deviation of the log focal length of `fov`.
         cropped: The images are parts of larger ones, see `check_cameras`.
         distortion: Coefficients (n,) of both lenses, removed from the images, see `undistorted`.
-
-    Raises:
-        DataError: an image is damaged, a camera is impossible, or the truth has another size.
     """
     # a given camera may belong to the stored or to the rotated image
     pictures = read_images(images, white, turn=all(K is None for K in cameras))
@@ -142,6 +122,6 @@ def make_pair(
     check_cameras(matrices, pictures, images, cropped)
     for k, coefficients in enumerate(distortion):
         pictures[k], matrices[k] = undistorted(pictures[k], matrices[k], coefficients)
-    images_and_cameras = pictures[0], pictures[1], matrices[0], matrices[1]
+    (ref, following), (K_ref, K_next) = pictures, matrices
     known = truth if truth.known() else None
-    return Pair(*images_and_cameras, truth=known, focal_sigma=focal_sigma)
+    return Pair(ref, following, K_ref, K_next, truth=known, focal_sigma=focal_sigma)

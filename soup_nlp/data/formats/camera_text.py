@@ -38,12 +38,7 @@ class _Pairs(list[tuple[str, Any]]):
 
 
 def leaves(path: PathLike) -> list[Leaf]:
-    """The names and words of a camera file.
-
-    Raises:
-        DataError: the file cannot be read.
-        ValueError: the content is of none of these formats.
-    """
+    """The names and words of a camera file; ValueError for a content of none of these formats."""
     content = read_bytes(path, "camera file", most=MOST_TEXT)
     if content.startswith((b"\x93NUMPY", b"PK")):
         return list(_flat(_arrays(path, content)))
@@ -147,11 +142,7 @@ def _split(text: str) -> Iterator[str]:
 
 
 def _lines(text: str) -> Iterator[Leaf]:
-    """Leaves of lines such as `fx: 500`, `fx 500 fy 500`, a name above its numbers, numbers only.
-
-    Names may also stand in one row above as many numbers. A row of COLMAP's cameras.txt is one
-    camera.
-    """
+    """Leaves of lines such as `fx: 500`, `fx 500 fy 500`, names above their numbers, numbers."""
     found: list[tuple[str, list[str], list[str]]] = [("", [], [])]
     section = ""
     for line in text.splitlines():

@@ -30,20 +30,12 @@ _LONGEST_OF_SMALL = 14.0  # focal length that a lens of a small sensor rarely ex
 def estimated_cameras(
     paths: Sequence[PathLike | None], images: Sequence[Image], fov: float | None = None
 ) -> tuple[list[Float], float]:
-    """Intrinsics of pictures, with square pixels and the principal point in the middle.
+    """Intrinsics (3, 3) of pictures, and the standard deviation of the log focal length.
 
-    Args:
-        paths: The files, for their EXIF; None for a picture without a file. A picture without EXIF
-            gets the focal length of another one, relative to the longer side.
-        images: The pictures, (H, W, 3), rotated by their EXIF orientation.
-        fov: Horizontal field of view of the first picture, degrees; None for EXIF or `GUESS`.
-
-    Returns:
-        (3, 3) intrinsics of each picture, pixels, and the standard deviation of the log focal
-        length: 0 where `fov` or EXIF gives it.
-
-    Raises:
-        ConfigError: the field of view is not between 0 and 180 degrees.
+    Pixels are square, and the principal point is in the middle. The focal length is that of the
+    horizontal field of view `fov` (degrees) of the first picture, or else of EXIF, or else `GUESS`.
+    The deviation is 0 where `fov` or EXIF gives it. A picture without EXIF, or without a file
+    (None), gets the focal length of another one, relative to the longer side.
 
     Warns:
         DataWarning: the origin of a focal length without `fov`; one that is implausible.
@@ -92,10 +84,7 @@ def _degrees(focal: float) -> float:
 
 
 def exif_focal(path: PathLike | None, image: Image) -> float | None:
-    """Focal length of EXIF relative to the longer side of a picture; None if not determined.
-
-    An implausible one is ignored with a warning.
-    """
+    """Plausible focal length of EXIF relative to the longer side of a picture; None without."""
     tags = {} if path is None else exif_tags(path)
     candidates = [_number(tags, Base.FocalLengthIn35mmFilm) / _LONGER_35, _by_sensor(tags, image)]
     focals = [focal for focal in candidates if focal > 0]
@@ -147,21 +136,16 @@ UNEVEN = 1.2
 RESIZED, ALIKE = 1.25, 1.1
 """Ratio of sizes that shows another resolution; ratio of two numbers that are taken as equal."""
 
-Size = tuple[int, int]
-
 
 def check_cameras(
     cameras: Sequence[Float], images: Sequence[Image], names: Sequence[object], cropped: bool
 ) -> None:
-    """Check the intrinsics (3, 3) of both frames, once where they are the same.
+    """Warn of implausible intrinsics (3, 3) of the frames, and of their likely cause.
 
     Principal points of `cropped` images, which are parts of larger ones, may be anywhere.
 
     Raises:
         DataError: a principal point is outside of the image.
-
-    Warns:
-        DataWarning: intrinsics are implausible; the warning names the likely cause.
     """
     alike = images[0].shape == images[1].shape and np.array_equal(cameras[0], cameras[1])
     for K, image, where in list(zip(cameras, images, names))[: 1 if alike else 2]:
@@ -194,12 +178,12 @@ def _ratio(a: float, b: float) -> float:
     return max(a / b, b / a) if a > 0 and b > 0 else float("inf")
 
 
-def _off_middle(x: float, y: float, size: Size) -> float:
+def _off_middle(x: float, y: float, size: Sequence[int]) -> float:
     """Larger distance of a point from the middle of an image, relative to the side."""
     return max(abs((x + 0.5) / size[1] - 0.5), abs((y + 0.5) / size[0] - 0.5))
 
 
-def _problems(K: Float, size: Size, cropped: bool) -> list[str]:
+def _problems(K: Float, size: Sequence[int], cropped: bool) -> list[str]:
     """Descriptions of implausible intrinsics; empty for plausible ones."""
     (fx, fy), (cx, cy) = K[[0, 1], [0, 1]], K[:2, 2]
     off, exchanged = _off_middle(cx, cy, size), _off_middle(cy, cx, size)
@@ -215,7 +199,7 @@ def _problems(K: Float, size: Size, cropped: bool) -> list[str]:
     return out
 
 
-def _explanation(K: Float, size: Size) -> tuple[str, Float]:
+def _explanation(K: Float, size: Sequence[int]) -> tuple[str, Float]:
     """The likely cause of implausible intrinsics, and intrinsics without it."""
     (fx, fy), (cx, cy), (height, width) = K[[0, 1], [0, 1]], K[:2, 2], size
     middle = (width - 1) / 2, (height - 1) / 2

@@ -64,11 +64,7 @@ def check_body(count: int, expected: int, path: PathLike, what: str) -> None:
 
 
 def decode(path: PathLike, what: str) -> NDArray[Any]:
-    """Decode an image file as stored, with all its bits, to grey, BGR or BGRA.
-
-    OpenCV decodes the file, or else Pillow, to 8 bits. The size in the header is checked first,
-    since a small file can have many pixels of one colour.
-    """
+    """Decode an image file as stored to grey, BGR or BGRA: OpenCV, or else Pillow, to 8 bits."""
     content = read_bytes(path, what)
     _refuse_raw(content, path, what)
     size, pages = (1, 1), 1
@@ -86,6 +82,7 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
         ) from None
     except Exception:  # OpenCV may read formats that Pillow does not
         pages = 1
+    # a small file can have many pixels of one colour
     check_image_size(*size, what, path)
     if pages > 1:
         text = f"{path}: holds {pages} pages or frames; the first one is used"
@@ -124,10 +121,7 @@ def _refuse_raw(content: bytes, path: PathLike, what: str) -> None:
 
 
 def _decode_by_opencv(content: bytes) -> tuple[NDArray[Any] | None, str]:
-    """Image as stored, None if OpenCV cannot decode it, and what is damaged.
-
-    Decoders of JPEG and TIFF print that to the standard error of the process only.
-    """
+    """Image as stored, None if OpenCV cannot decode it, and damage, which it prints to stderr."""
     image, said = None, b""
     file: Any = io.BytesIO()
     with _STDERR, contextlib.ExitStack() as stack:
@@ -181,11 +175,7 @@ def decode_png16(path: PathLike, channels: int, what: str) -> NDArray[np.uint16]
 
 
 def exif_tags(path: PathLike) -> dict[int, Any]:
-    """EXIF tags of an image file, about the picture and about the camera; empty without EXIF.
-
-    Warns:
-        DataWarning: EXIF is malformed and is ignored.
-    """
+    """EXIF tags of an image file, about picture and camera; empty, or a warning, without."""
     content = read_bytes(path, "image")
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(content)) as image:
@@ -209,28 +199,15 @@ def read_image(
 def read_images(
     paths: Sequence[PathLike], white: int | None = None, *, turn: bool = False
 ) -> list[NDArray[np.uint8]]:
-    """Read the pictures of one scene as 8-bit RGB.
-
-    8 and 16 bit, grey, RGB and RGBA are accepted. Grey is repeated in the three channels, and alpha
-    is dropped. 16-bit values v become 255 v / white; without `white`, the range of the values of
-    all pictures between the percentiles `OUTER` becomes 0 to 255, 8-bit ones beside them (times
-    257) included. An image with an EXIF rotation is rejected unless `turn` is set, since its camera
-    may be that of either orientation.
+    """Read the pictures of one scene as (H, W, 3) 8-bit RGB; grey is repeated, alpha dropped.
 
     Args:
-        paths: Image files (PNG, JPEG, TIFF, PPM ...).
-        white: Value of a 16-bit image that becomes 255, such as 4095 for 12-bit images.
-        turn: Rotate the images by their EXIF orientation, as viewers do.
-
-    Returns:
-        (H, W, 3) uint8 RGB images, indexed [v, u].
-
-    Raises:
-        DataError: a file is damaged, of another kind, or has an EXIF rotation without `turn`.
-
-    Warns:
-        DataWarning: 16-bit images without `white` (the warning names the values), or an image that
-            is interlaced.
+        paths: Image files of 8 or 16 bits, grey, RGB or RGBA.
+        white: Value of a 16-bit image that becomes 255, such as 4095 for 12-bit images. Without it
+            the values of all pictures between the percentiles `OUTER`, 8-bit ones beside them times
+            257, become 0 to 255, with a warning.
+        turn: Rotate the images by their EXIF orientation, as viewers do. A rotation is refused
+            otherwise, since the camera may be that of either orientation.
     """
     images = [_colours(path, turn) for path in paths]
     depths = {image.dtype for image in images}
@@ -253,16 +230,14 @@ def read_images(
             stacklevel=3,
         )
     scale = 255.0 / max(high - low, 1.0)
-    out = [
-        image
-        if image.dtype == np.uint8
-        else np.clip(np.rint((image - low) * scale), 0, 255).astype(np.uint8)
-        for image in images
-    ]
-    for path in (path for path, image in zip(paths, out) if interlaced(image)):
-        text = f"{path}: looks interlaced; separate its fields, for example by ffmpeg's yadif"
-        warnings.warn(text, DataWarning, stacklevel=3)
-    return out
+    for k, image in enumerate(images):
+        if image.dtype != np.uint8:
+            image = np.clip(np.rint((image - low) * scale), 0, 255).astype(np.uint8)
+        if interlaced(image):
+            text = "looks interlaced; separate its fields, for example by ffmpeg's yadif"
+            warnings.warn(f"{paths[k]}: {text}", DataWarning, stacklevel=3)
+        images[k] = image
+    return images
 
 
 def _colours(path: PathLike, turn: bool) -> NDArray[Any]:
@@ -300,9 +275,8 @@ def _colours(path: PathLike, turn: bool) -> NDArray[Any]:
 def interlaced(image: NDArray[Any]) -> bool:
     """Whether the rows of an image (H, W, 3) alternate between two moments.
 
-    A row that differs from both its neighbours in the same direction is a comb. Among 95 pictures
-    at hand, combs of neighbouring rows are at most 1.05 times as many as those of every second row;
-    of interlaced frames of moving scenes, 2.5 times or more.
+    Rows that differ from both neighbours in one direction, combs, are then 2.5 times or more as
+    many as those of every second row; in 95 other pictures at most 1.05 times.
     """
     if len(image) < 5:
         return False

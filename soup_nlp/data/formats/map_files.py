@@ -1,8 +1,8 @@
 """Flow and depth files: Middlebury .flo, Sintel .dpt, .pfm, 16-bit PNG, NumPy arrays.
 
-All readers return a flow as (H, W, 2) float64 of float32 precision, displacement (u right, v down)
-in pixels, NaN in both components where unknown, and a depth as (H, W) float64, z along the optical
-axis, NaN where unknown. Zero, negative and infinite depths count as unknown.
+A flow is (H, W, 2) float64 of float32 precision, displacement (u right, v down) in pixels, NaN in
+both components where unknown; a depth is (H, W) float64, z along the optical axis, NaN where
+unknown, as for zero, negative and infinite values.
 
 Every reader raises `DataError` for a file that is missing, empty, of another format, of an
 impossible size, or longer or shorter than its header says.
@@ -56,11 +56,7 @@ def after_magic(path: PathLike, what: str) -> bytes:
 
 
 def _floats(body: bytes, size: tuple[int, ...], order: str, path: PathLike, what: str) -> FloatMap:
-    """The float32 numbers of byte order `order` behind the header of a file, as an array.
-
-    Raises:
-        DataError: the size (H, W, ...) is impossible, or the body is shorter or longer.
-    """
+    """The float32 numbers (H, W, ...), of byte order `order`, behind the header of a file."""
     check_image_size(size[1], size[0], what, path)
     check_body(len(body), 4 * int(np.prod(size)), path, what)
     return np.frombuffer(body, f"{order}f4").reshape(size).astype(np.float32)
@@ -127,11 +123,7 @@ def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> NDAr
 
 
 def flow_layout(flow: NDArray[Any], where: PathLike) -> NDArray[Any]:
-    """A flow (H, W, 2), or (2, H, W) whose last axis has another length than 2, as (H, W, 2).
-
-    Raises:
-        DataError: it has another shape.
-    """
+    """A flow (H, W, 2), or (2, H, W) whose last axis has another length than 2, as (H, W, 2)."""
     if flow.ndim == 3 and flow.shape[0] == 2 and flow.shape[2] != 2:
         flow = np.moveaxis(flow, 0, 2)
     if flow.ndim != 3 or flow.shape[2] != 2:
@@ -174,11 +166,7 @@ def _read_flow_png(path: PathLike, what: str) -> Float:
 
 
 def read_vkitti_flow(path: PathLike) -> Float:
-    """Read a Virtual KITTI 1 or 2 flow PNG.
-
-    16-bit RGB: u = (2 R / 65535 - 1) (W - 1), v = (2 G / 65535 - 1) (H - 1), B = 0 invalid such as
-    the sky.
-    """
+    """Read a Virtual KITTI flow PNG, u = (2 R / 65535 - 1) (W - 1), v likewise, B = 0 unknown."""
     unit = 2.0 / 65535.0 * _read_flow_png(path, "Virtual KITTI flow") - 1.0
     height, width = unit.shape[:2]
     return _known_flow(unit * [width - 1, height - 1], path)
@@ -210,11 +198,7 @@ def read_confidence(path: PathLike) -> NDArray[Any]:
 
 
 def known_depth(depth: NDArray[Any], path: PathLike) -> Float:
-    """The depth as float64 with NaN where it is not positive and finite.
-
-    Raises:
-        DataError: it has another shape, or is negative everywhere.
-    """
+    """A map (H, W) as float64 with NaN where it is not positive and finite."""
     if depth.ndim != 2 or depth.size == 0:
         one = np.squeeze(depth).ndim == 2
         raise DataError(
@@ -266,10 +250,8 @@ def read_pfm(path: PathLike) -> Float:
 def read_depth_png16(path: PathLike, scale: float) -> Float:
     """Read a 16-bit grey PNG of depth = value / scale, 0 where unknown.
 
-    Args:
-        path: The file.
-        scale: Positive values per unit of length: 1000 for millimetres, 5000 for TUM RGB-D, 256 for
-            KITTI depth, 100 for Virtual KITTI; `KITTI_DISPARITY` gives disparities in pixels.
+    The scale is 1000 for millimetres, 5000 for TUM RGB-D, 256 for KITTI depth, 100 for Virtual
+    KITTI; `KITTI_DISPARITY` gives disparities in pixels.
     """
     if not (isinstance(scale, Real) and 0 < scale < 1e300):
         raise DataError(
@@ -291,15 +273,8 @@ def read_vkitti_depth(path: PathLike) -> Float:
 def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIMETRES) -> Float:
     """Read a depth by the suffix of its file: .dpt (Sintel), .npy, .npz, .pfm or 16-bit .png.
 
-    A .npz holds one array (H, W), or one of the name depth.
-
-    Args:
-        path: The file.
-        scale: Values per unit of length of a .png, see `read_depth_png16`; None for `usual`.
-        usual: Values per unit of length that are assumed.
-
-    Warns:
-        DataWarning: the usual scale is assumed.
+    `scale` are the values per unit of length of a .png; without it `usual` is assumed, with a
+    warning.
     """
 
     def by_scale(path: PathLike) -> Float:
@@ -333,11 +308,7 @@ def _one_map(path: PathLike) -> NDArray[Any]:
 
 
 def read_prior(path: PathLike) -> Float:
-    """The values of a depth prior: a depth file of any scale, or an 8-bit grey picture.
-
-    Warns:
-        DataWarning: the values are those of an 8-bit picture.
-    """
+    """The values of a depth prior: a depth file of any scale, or an 8-bit grey picture."""
     image = decode(path, "depth prior") if Path(path).suffix.lower() == ".png" else np.empty(0)
     # a grey picture may be stored in colour
     grey = image[:, :, 0] if image.ndim == 3 else image
