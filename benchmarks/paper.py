@@ -1,5 +1,6 @@
 """The paper's tables: its datasets, ablation and studies, by its method and by the defaults."""
 
+import json
 import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -24,7 +25,7 @@ from benchmarks.table import (
     provenance,
 )
 from soup_nlp import SoupError, make_problem
-from soup_nlp.config.presets import as_override, overrides_of
+from soup_nlp.config.trees import PRESETS
 
 SOURCE = "Superpixel Soup (Kumar, Dai, Li, TPAMI), table of the performance comparison"
 METHODS: Mapping[str, Overrides] = {"preset: paper": ("preset=paper",), "defaults": ()}
@@ -130,6 +131,16 @@ NO_EFFECT = {"max_size", "energy.weights.depth"}
 """Options without a departure here: for images of other sizes, for a depth prior."""
 
 
+def printed() -> dict[str, str]:
+    """Options of the preset, by dotted key, as `--set` takes their values."""
+    (options,) = pd.json_normalize(PRESETS["paper"]).to_dict("records")
+    return {str(key): _text(value) for key, value in options.items()}
+
+
+def _text(value: object) -> str:
+    return ".inf" if value == float("inf") else json.dumps(value)
+
+
 def departures() -> dict[str, Overrides]:
     """Overrides of the defaults that undo each departure from the paper, by its first option.
 
@@ -137,12 +148,10 @@ def departures() -> dict[str, Overrides]:
     """
     defaults = make_problem({"input": {"kind": "motorcycle"}})
     out: dict[str, Overrides] = {}
-    for override in overrides_of("paper"):
-        key, _, value = override.partition("=")
-        own = attrgetter(key)(defaults)
-        if as_override(key, own).partition("=")[2] != value and key not in NO_EFFECT:
+    for key, value in printed().items():
+        if _text(attrgetter(key)(defaults)) != value and key not in NO_EFFECT:
             group = next((keys[0] for keys in JOINT if key in keys), key)
-            out[group] = (*out.get(group, ()), override)
+            out[group] = (*out.get(group, ()), f"{key}={value}")
     return out
 
 
@@ -202,8 +211,8 @@ def make_plan(
 
 def _scaled(method: str, n: int) -> Overrides:
     """The preset's weights of `LENGTHS`, which are given for 1,000 superpixels, for n."""
-    pairs = [o.partition("=") for o in overrides_of("paper") if method != "defaults"]
-    return tuple(f"{k}={float(v) * n / 1000:g}" for k, _, v in pairs if k in LENGTHS)
+    options = printed() if method != "defaults" else {}
+    return tuple(f"{k}={float(v) * n / 1000:g}" for k, v in options.items() if k in LENGTHS)
 
 
 def _with_truth(data: Path | None) -> list[Item]:

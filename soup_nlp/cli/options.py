@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
-from soup_nlp.config.presets import PRESETS
 from soup_nlp.config.problem import Problem as ProblemFile
 from soup_nlp.config.problem import shipped_problems
+from soup_nlp.config.trees import PRESETS
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, StoppedError, printable
 from soup_nlp.storage.files import as_path

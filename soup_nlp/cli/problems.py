@@ -7,8 +7,8 @@ import typer
 
 from soup_nlp.cli import options
 from soup_nlp.cli.options import option
-from soup_nlp.config.presets import PRESETS, dump_preset
 from soup_nlp.config.problem import description, dump_problem, load_problem, shipped_problems
+from soup_nlp.config.trees import PRESET_FILES
 from soup_nlp.errors import ConfigError, printable
 from soup_nlp.storage.files import is_folder
 
@@ -24,14 +24,14 @@ def show(
 ) -> None:
     """Print the merged problem and its hash; without a problem, the options of a preset."""
     if problem is None:
-        if preset is None or preset not in PRESETS or overrides:
+        if preset is None or preset not in PRESET_FILES or overrides:
             raise ConfigError(
                 "nothing to show",
                 where="--preset" if preset else None,
                 found=preset,
-                expected=f"a problem, or --preset {' or '.join(PRESETS)} alone",
+                expected=f"a problem, or --preset {' or '.join(PRESET_FILES)} alone",
             )
-        print(dump_preset(preset), end="")
+        print(PRESET_FILES[preset].read_text("utf-8"), end="")
         return
     chosen = load_problem(problem, options.changed(preset, overrides))
     footer = "" if all_options else "# all other options have their defaults: soup-nlp show --all\n"

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.pair import Pair
-from soup_nlp.errors import DataError
+from soup_nlp.storage.folders import digest_of
 
 NOT_OPTIONS = {"name", "base", "preset", "expected"}
 """Keys of a problem that change no result."""
@@ -26,14 +25,8 @@ def identity(problem: Problem, pair: Pair | None = None) -> str:
     """Hash of the contents of images, cameras, truth, flow and prior of a problem, and its options.
 
     Names and places of files do not count: a data set that was moved is the same, a file that was
-    replaced under its name is another one. Of folders and data sets the pair that they hold counts.
-
-    Args:
-        problem: The problem.
-        pair: Its pair, where it is in memory only.
-
-    Raises:
-        SoupError: the pair cannot be loaded, or a file cannot be read.
+    replaced under its name is another one. Of folders and data sets the pair that they hold counts;
+    `pair` is that of a problem whose pair is in memory only.
     """
     tree = problem.model_dump(mode="json", exclude=NOT_OPTIONS)
     if pair is None and problem.input.kind not in ("files", "scene"):
@@ -44,7 +37,7 @@ def identity(problem: Problem, pair: Pair | None = None) -> str:
         for key in keys:
             name = tree[section].get(key)
             if isinstance(name, str) and (section == "input" or problem.path(name).is_file()):
-                tree[section][key] = _file_hash(problem.path(name))
+                tree[section][key] = digest_of(problem.path(name))
     return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -55,12 +48,3 @@ def _pair_contents(pair: Pair) -> dict[str, Any]:
     known = {k: np.ascontiguousarray(v) for k, v in arrays.items() if v is not None}
     hashes = {k: hashlib.sha256(v.tobytes()).hexdigest() for k, v in known.items()}
     return {"pair": pair_hash(pair), **hashes}
-
-
-def _file_hash(path: Path) -> str:
-    """SHA-256 of the bytes of a file."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise DataError("file cannot be read", where=path, found=error.strerror) from error

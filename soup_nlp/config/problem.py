@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field, ValidationError
 
-from soup_nlp.config.presets import with_preset
-from soup_nlp.config.yaml_text import Dumper, parse
+from soup_nlp.config.trees import PRESETS, Dumper, merged, override, parse
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import Input, PriorOptions
 from soup_nlp.data.pair import Pair
@@ -152,18 +151,13 @@ class Problem(Section):
         """The frame pair, without its flow.
 
         Raises:
-            ConfigError: the pair was in memory only, or a depth prior has a kind but no source.
-            DataError: a file is missing, damaged, or does not fit.
+            SoupError: a file is missing, damaged, or does not fit, or the pair was in memory only.
         """
         self.depth_prior.require_prior()
         return replace(self.input.load(self.path), name=self.name)
 
     def input_paths(self) -> list[Path]:
-        """Files and folders that are read; the name of a flow method is included as a path.
-
-        Raises:
-            ConfigError: the pair was in memory only.
-        """
+        """Files and folders that are read; the name of a flow method is included as a path."""
         prior = [self.depth_prior.source] if self.depth_prior.source else []
         return [self.path(name) for name in (*self.input.files(), *self.flow.files(), *prior)]
 
@@ -221,11 +215,7 @@ def description(path: Path) -> str:
 
 
 def _find(path: Path) -> tuple[Path, Path]:
-    """A problem file, and the folder that its relative paths start from.
-
-    Raises:
-        ConfigError: it is a folder, or a bare name that no problem of the package has.
-    """
+    """A problem file, and the folder that its relative paths start from."""
     bare = len(path.parts) == 1 and not path.suffix and not is_file(path)
     shipped = shipped_problems() if bare else {}
     if is_folder(path) and path.name not in shipped:
@@ -271,9 +261,11 @@ def make_problem(
         expect(item, str, "override", "text such as 'solver.max_iter=200'")
     expect(where, str, "where", "a name for messages")
     tree = copy.deepcopy(dict(raw))
-    overridden = {_override(tree, item): item for item in overrides}
+    overridden = {override(tree, item): item for item in overrides}
     lines = {**(lines or {}), **{keys: f"--set {item}" for keys, item in overridden.items()}}
-    tree = with_preset(tree)
+    preset = tree.get("preset")
+    # the validation refuses an unknown one
+    tree = merged(PRESETS.get(preset, {}) if isinstance(preset, str) else {}, tree)
     try:
         return Problem.model_validate(tree)
     except ValidationError as error:
@@ -325,24 +317,3 @@ def _write(model: Section, pad: str, prefix: str, all_keys: bool) -> Iterator[st
             flow = None if isinstance(value, list | tuple | dict) else False
             text = yaml.dump({key: value}, Dumper=Dumper, default_flow_style=flow, width=10**6)
             yield f"{pad}{text.rstrip()}{comment}"
-
-
-def _override(tree: dict[str, Any], item: str) -> Keys:
-    key, eq, value = item.partition("=")
-    path = tuple(key.strip().split("."))
-    if not eq or not all(path):
-        raise ConfigError(
-            "override is not key=value", where="--set", found=item, expected="solver.max_iter=200"
-        )
-    node: Any = tree
-    for part in path[:-1]:
-        node = node.setdefault(part, {})
-        if not isinstance(node, dict):
-            raise ConfigError(
-                "override goes below a value",
-                where="--set",
-                found=item,
-                expected=f"{part} is a section",
-            )
-    node[path[-1]] = parse(value, f"--set {item}")[0]
-    return path

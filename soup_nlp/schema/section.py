@@ -185,20 +185,12 @@ class Section(BaseModel, metaclass=_Checked):
     )
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some values changed, checked again.
-
-        Raises:
-            ConfigError: a name is unknown, or a value is of the wrong type or out of range.
-        """
+        """A copy with some values changed, checked again."""
         return self.make({**dict(self), **changes})
 
     @classmethod
     def make(cls, values: Mapping[str, Any]) -> Self:
-        """A record with these values and defaults for the other fields.
-
-        Raises:
-            ConfigError: a name is unknown, or a value is of the wrong type or out of range.
-        """
+        """A record with these values and defaults for the other fields; else a ConfigError."""
         return cls(**values)
 
     @classmethod

@@ -70,8 +70,11 @@ def files_in(folder: Path) -> list[str]:
 
 def digest_of(path: Path) -> str:
     """SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError("file cannot be read", where=path, found=error.strerror) from error
 
 
 def _state(folder: Path, name: str, made: dict[str, str]) -> str:

@@ -1,6 +1,12 @@
-"""YAML of problem files: numbers as in version 1.2, the line of every key."""
+"""Trees of options: read from YAML with the line of every key, merged over presets, overridden.
 
+Numbers and booleans are those of YAML 1.2: 1e-3 and 010 are numbers, `no` is a word.
+"""
+
+import copy
 import re
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -9,9 +15,11 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.schema.section import Keys
 from soup_nlp.storage.files import parse_yaml
 
+Tree = dict[str, Any]
+
 
 class _Loader(yaml.SafeLoader):
-    """YAML with the numbers and booleans of version 1.2: 1e-3 is a number, `no` is a word."""
+    """Reads numbers and booleans of version 1.2."""
 
 
 class Dumper(yaml.SafeDumper):
@@ -65,3 +73,41 @@ def _locate(node: yaml.Node, path: Keys, lines: dict[Keys, str], source: str) ->
             raise ConfigError("key is given twice", where=f"{source}, {line}", found=".".join(here))
         lines[here] = line
         _locate(value, here, lines, source)
+
+
+PRESET_FILES: Mapping[str, Path] = {"paper": Path(__file__).with_name("paper.yaml")}
+PRESETS: Mapping[str, Tree] = {
+    name: parse(path.read_text("utf-8"), str(path))[0] for name, path in PRESET_FILES.items()
+}
+"""Options below the keys of a problem, by name: `preset: paper` is the method as printed."""
+
+
+def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> Tree:
+    """Both trees merged section by section; where a key is in both, `above` has the value."""
+    out: Tree = copy.deepcopy(dict(below))
+    for key, value in above.items():
+        both = isinstance(value, Mapping) and isinstance(out.get(key), Mapping)
+        out[key] = merged(out[key], value) if both else value
+    return out
+
+
+def override(tree: Tree, item: str) -> Keys:
+    """Put the value of `a.b=value` into a tree, and return its keys."""
+    key, eq, value = item.partition("=")
+    path = tuple(key.strip().split("."))
+    if not eq or not all(path):
+        raise ConfigError(
+            "override is not key=value", where="--set", found=item, expected="solver.max_iter=200"
+        )
+    node: Any = tree
+    for part in path[:-1]:
+        node = node.setdefault(part, {})
+        if not isinstance(node, dict):
+            raise ConfigError(
+                "override goes below a value",
+                where="--set",
+                found=item,
+                expected=f"{part} is a section",
+            )
+    node[path[-1]] = parse(value, f"--set {item}")[0]
+    return path
