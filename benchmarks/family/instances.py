@@ -24,8 +24,8 @@ from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.formulation import Coordinates, Formulation
 from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.programs import build_tangent_nlp, exact_chart
 from soup_nlp.model.reweighting import in_pixels
-from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 from soup_nlp.pipeline.case import solver_options
 from soup_nlp.pipeline.record import Case
 from soup_nlp.start.labelling import limited_noise

@@ -17,7 +17,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation, FormulationOptions
 from soup_nlp.model.layout import TangentLayout
-from soup_nlp.model.tangent_nlp import build_tangent_nlp, majorant
+from soup_nlp.model.programs import build_tangent_nlp, majorant
 from soup_nlp.solve.selected_inverse import BlockCholesky
 
 SMOOTHING = 0.03

@@ -133,7 +133,7 @@ class Reconstruction:
         source_next: (H', W') reference pixel that the next frame shows there, in row order; -1
             where nothing lands.
         sigma_ref: (H, W) standard deviation of log z of the reference frame, scale left out
-            (`evaluate.confidence`); None where it was not computed.
+            (`evaluation.confidence`); None where it was not computed.
     """
 
     depth_ref: Float

@@ -20,8 +20,6 @@ from soup_nlp.model.superpixel import View
 
 THETA = ("eps", "eps_pixel", "theta", "ridge")
 """Names of the numbers that an NLP lets change without a new build."""
-
-
 _SYMBOLS = ca.SX.sym("theta", len(THETA))
 """One for all kernels, so that they serve every NLP."""
 
@@ -81,12 +79,7 @@ class Builder:
     rows: list[Block] = field(default_factory=list)
 
     def add_norms(self, name: str, element: Element) -> None:
-        """Add an energy term: kernel of its norms in solver form, and its table.
-
-        Args:
-            name: Of the kernel.
-            element: Superpixels, data columns and the norms.
-        """
+        """Add an energy term: kernel of its norms in solver form, and its table."""
         size, arity = element.superpixels.shape
         if not size:
             return
@@ -123,8 +116,7 @@ class Builder:
             x: (k,) symbols of the variables.
             body: (r,) constraints.
             index: (N, k) variables of every superpixel.
-            lower: Bound of every row.
-            upper: Bound of every row.
+            lower, upper: Bounds of every row.
             row: (m,) symbols of the data, if there are any.
             data: (N, m) data of every superpixel.
             total: Whether the superpixels add up to one row (r = 1).
@@ -159,9 +151,7 @@ class Builder:
 
         Args:
             name: Of the NLP.
-            x0: Start of the layout's variables.
-            lbx: Their lower bounds.
-            ubx: Their upper bounds.
+            x0, lbx, ubx: Start and bounds of the layout's variables.
         """
         lower, upper = _bounds(self.slacks)
         lbx, ubx = np.concatenate([lbx, lower]), np.concatenate([ubx, upper])

@@ -6,11 +6,10 @@ which variables it reads, which rows of g it adds to, and its data. Nothing here
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ModelError
@@ -122,21 +121,6 @@ def nonzeros(function: ca.Function | None) -> tuple[Int, Int]:
     return np.asarray(row, np.int64), np.asarray(column, np.int64)
 
 
-Blocks = tuple[NDArray[np.integer], Float, NDArray[np.integer]]
-"""(B, nx, width) variables, (B, np, width) data and (B, nc, width) constraint rows."""
-
-
-def in_blocks(
-    table: NDArray[Any], width: int, dtype: type, fill: int | None = None
-) -> NDArray[Any]:
-    """(E, k) table as (B, k, width); the last row, or `fill`, in what is left over."""
-    extra = -len(table) % width
-    last = table[-1:] if fill is None else np.full_like(table[-1:], fill)
-    full: NDArray[Any] = np.concatenate([table, np.repeat(last, extra, axis=0)]).astype(dtype)
-    blocks = full.reshape(len(full) // width, width, table.shape[1])
-    return np.ascontiguousarray(blocks.transpose(0, 2, 1))
-
-
 @dataclass(frozen=True)
 class Group:
     """A kernel with its table: the elements of one kind.
@@ -173,8 +157,3 @@ class Group:
 
     def __len__(self) -> int:
         return len(self.index)
-
-    def blocks(self, width: int, dtype: type = np.int64) -> Blocks:
-        """Index, data and rows in blocks of elements, the indices of a type; see `in_blocks`."""
-        index, rows = (in_blocks(part, width, dtype) for part in (self.index, self.rows))
-        return index, in_blocks(self.data, width, np.float64), rows

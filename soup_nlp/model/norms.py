@@ -5,7 +5,7 @@ exact sum is the energy that is reported; a solver gets a smooth or an epigraph 
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import casadi as ca
 
@@ -36,16 +36,9 @@ class Norm:
     leak: ca.SX | float = 0.0
 
 
-@dataclass(frozen=True)
-class Form:
-    """A norm in solver form.
-
-    Attributes:
-        objective: Its contribution to the objective.
-        curvature: Positive semidefinite majorant of the objective, of the same
-            size as the kernel's variables.
-        constraint: Epigraph constraint `>= 0` (scalar), or None.
-    """
+class Form(NamedTuple):
+    """A norm in solver form: objective, its positive semidefinite majorant over the kernel's
+    variables, and the epigraph's constraint `>= 0`, if any."""
 
     objective: ca.SX
     curvature: ca.SX

@@ -53,25 +53,20 @@ OPERATIONS: Mapping[int, Operation] = {
     ca.OP_POW: Operation(np.power, "o5 {0} {1}", 2),
     ca.OP_CONSTPOW: Operation(np.power, "o5 {0} {1}", 2),
     ca.OP_ATAN2: Operation(np.arctan2, "o48 {0} {1}", 2),
-    **{
-        getattr(ca, f"OP_{name.upper()}"): Operation(function, f"o{code} {{0}}")
-        for name, function, code in (
-            ("exp", np.exp, 44),
-            ("log", np.log, 43),
-            ("sin", np.sin, 41),
-            ("cos", np.cos, 46),
-            ("tan", np.tan, 38),
-            ("asin", np.arcsin, 51),
-            ("acos", np.arccos, 53),
-            ("atan", np.arctan, 49),
-            ("sinh", np.sinh, 40),
-            ("cosh", np.cosh, 45),
-            ("tanh", np.tanh, 37),
-            ("asinh", np.arcsinh, 50),
-            ("acosh", np.arccosh, 52),
-            ("atanh", np.arctanh, 47),
-        )
-    },
+    ca.OP_EXP: Operation(np.exp, "o44 {0}"),
+    ca.OP_LOG: Operation(np.log, "o43 {0}"),
+    ca.OP_SIN: Operation(np.sin, "o41 {0}"),
+    ca.OP_COS: Operation(np.cos, "o46 {0}"),
+    ca.OP_TAN: Operation(np.tan, "o38 {0}"),
+    ca.OP_ASIN: Operation(np.arcsin, "o51 {0}"),
+    ca.OP_ACOS: Operation(np.arccos, "o53 {0}"),
+    ca.OP_ATAN: Operation(np.arctan, "o49 {0}"),
+    ca.OP_SINH: Operation(np.sinh, "o40 {0}"),
+    ca.OP_COSH: Operation(np.cosh, "o45 {0}"),
+    ca.OP_TANH: Operation(np.tanh, "o37 {0}"),
+    ca.OP_ASINH: Operation(np.arcsinh, "o50 {0}"),
+    ca.OP_ACOSH: Operation(np.arccosh, "o52 {0}"),
+    ca.OP_ATANH: Operation(np.arctanh, "o47 {0}"),
 }
 """Operations by CasADi's number; `operation` finds them."""
 NAMES: Mapping[int, str] = {
@@ -102,25 +97,15 @@ def instructions(function: ca.Function) -> tuple[Instruction, ...]:
     return (_of_small if function.n_instructions() < LARGE else _of_large)(function)
 
 
-def input_sizes(function: ca.Function) -> list[int]:
-    """Sizes of x, row, theta, lam_f and lam_c in a function of a kernel; 0 for missing ones."""
-    return [function.nnz_in(i) if i < function.n_in() else 0 for i in range(5)]
-
-
 LARGE = 20_000
 """Instructions from which a function's list takes megabytes: only those of one solve are kept."""
 
 
 def _instructions(f: ca.Function) -> tuple[Instruction, ...]:
-    return tuple(
-        (
-            operation := f.instruction_id(k),
-            f.instruction_output(k),
-            f.instruction_input(k),
-            f.instruction_constant(k) if operation == ca.OP_CONST else 0.0,
-        )
-        for k in range(f.n_instructions())
-    )
+    numbers = [f.instruction_id(k) for k in range(f.n_instructions())]
+    values = [f.instruction_constant(k) if n == ca.OP_CONST else 0.0 for k, n in enumerate(numbers)]
+    places = [(f.instruction_output(k), f.instruction_input(k)) for k in range(len(numbers))]
+    return tuple((n, *place, value) for n, place, value in zip(numbers, places, values))
 
 
 _of_small = lru_cache(maxsize=200)(_instructions)

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
-from soup_nlp.model.kernel import Group, in_blocks
-from soup_nlp.model.operations import input_sizes, instructions, operation
+from soup_nlp.model.kernel import Group
+from soup_nlp.model.operations import instructions, operation
 
 BLOCK = 2048
 """Elements of a block: more cost fewer calls, fewer fit into the cache."""
@@ -36,12 +36,15 @@ class Vectors:
             sums: Size of the vector; what pads the last block is added behind it.
         """
         size = max(1, min(BLOCK, len(group)))
-        count = input_sizes(function)
+        # what a function does not take has no rows
+        count = [function.nnz_in(i) if i < function.n_in() else 0 for i in range(5)]
         self._x, self._data = np.empty((count[0], size)), np.empty((count[1], size))
         self._theta, self._lam_f = np.empty(count[2]), np.empty(1)
         self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
         self._function = function
-        self._blocks = list(zip(*group.blocks(size), in_blocks(target, size, np.int64, fill=sums)))
+        tables = (_in_blocks(t, size, t[-1:]) for t in (group.index, group.data, group.rows))
+        behind = np.full((1, target.shape[1]), sums)
+        self._blocks = list(zip(*tables, _in_blocks(target, size, behind)))
 
     @cached_property
     def _calls(self) -> list[tuple[Callable[..., Any], Any]]:
@@ -89,3 +92,11 @@ class Vectors:
                 for call, given in self._calls:
                     call(*given)
                 out += np.bincount(target.ravel(), self._out.ravel(), len(out))
+
+
+def _in_blocks(table: NDArray[Any], width: int, last: NDArray[Any]) -> NDArray[Any]:
+    """(E, k) table as (B, k, width), filled up with a last row (1, k)."""
+    full = np.concatenate([table, np.repeat(last, -len(table) % width, axis=0)])
+    full = full.astype(np.float64 if full.dtype.kind == "f" else np.int64)
+    blocks = full.reshape(len(full) // width, width, table.shape[1])
+    return np.ascontiguousarray(blocks.transpose(0, 2, 1))

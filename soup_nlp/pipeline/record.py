@@ -23,9 +23,8 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Layout, MatrixLayout, TangentLayout
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
+from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp, exact_chart
 from soup_nlp.refine.records import Refined
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution

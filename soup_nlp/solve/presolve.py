@@ -25,9 +25,8 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Chart, Layout, MatrixLayout
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart, majorant
+from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp, exact_chart, majorant
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.storage.progress import Watch

@@ -15,8 +15,8 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import UNMET, WARM, residuals, warm_start
 from soup_nlp.solve.presolve import EXACT, LEAST_SECONDS, STOPPED, Presolve

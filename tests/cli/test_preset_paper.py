@@ -17,8 +17,8 @@ from soup_nlp.model import oracle
 from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.layout import TangentLayout
+from soup_nlp.model.programs import build_tangent_nlp
 from soup_nlp.model.reweighting import in_translations
-from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 from soup_nlp.refine.mppbp import refine_soup

@@ -18,8 +18,8 @@ from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.export.sol import read_sol
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 

@@ -23,8 +23,8 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import GAUGES as GAUGES
 from soup_nlp.model.layout import Layout, MatrixLayout
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.reweighting import OF_EDGES, in_pixels
 from soup_nlp.model.superpixel import matrix_view, tangent_view
 

@@ -40,9 +40,8 @@ from soup_nlp.config.problem import load_problem
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.tangent_nlp import build_tangent_nlp
+from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.stages import solve_soup

@@ -35,7 +35,7 @@ from soup_nlp.model.energy_data import (
     sample_pixels,
 )
 from soup_nlp.model.energy_options import BENDING, GAP, EnergyOptions, Weights
-from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.reweighting import HELD, Known, in_pixels, weighted
 from soup_nlp.pipeline.case import build_energy
 from soup_nlp.start.labelling import limited_noise

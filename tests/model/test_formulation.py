@@ -25,8 +25,8 @@ from soup_nlp.model import oracle
 from soup_nlp.model.elements import TERMS
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.pattern import Pattern
+from soup_nlp.model.programs import build_tangent_nlp, exact_chart
 from soup_nlp.model.symbolic import Graph
-from soup_nlp.model.tangent_nlp import build_tangent_nlp, exact_chart
 
 # --- layouts -------------------------------------------------------------------------------------
 

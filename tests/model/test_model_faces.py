@@ -22,7 +22,7 @@ from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.tangent_nlp import build_tangent_nlp
+from soup_nlp.model.programs import build_tangent_nlp
 
 pytestmark = pytest.mark.slow
 

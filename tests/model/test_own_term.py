@@ -10,8 +10,8 @@ from soup_nlp.model import oracle
 from soup_nlp.model.elements import TERMS, Element, Norms, Term, _rays
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.norms import Norm
+from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.refine.costs import PairCosts
 from soup_nlp.refine.particles import Particles
 from soup_nlp.schema.section import NonNegative

@@ -11,10 +11,9 @@ from soup_nlp.errors import ModelError
 from soup_nlp.model import vectors
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel
-from soup_nlp.model.matrix import build_matrix_nlp
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp
 from soup_nlp.model.symbolic import Graph
-from soup_nlp.model.tangent_nlp import build_tangent_nlp
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
 

@@ -28,7 +28,7 @@ from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
-from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import optimality

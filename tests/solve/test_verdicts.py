@@ -11,7 +11,7 @@ from scipy import sparse
 
 from soup_nlp.export.verify import Residuals
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.matrix import build_matrix_nlp
+from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.report.check import Stored, _constraints
 from soup_nlp.solve import stages
 from soup_nlp.solve.ipopt import Ipopt

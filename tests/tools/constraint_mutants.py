@@ -25,7 +25,7 @@ class Mutant(NamedTuple):
     new: str
 
 
-MATRIX, TANGENT, TERMS = "model/matrix.py", "model/tangent_nlp.py", "model/terms.py"
+PROGRAMS, TERMS = "model/programs.py", "model/terms.py"
 BUILDER, IPOPT, NORMS = "model/builder.py", "solve/ipopt.py", "model/norms.py"
 FREE = "lower=-1e9, upper=1e9"
 ROWS = "for c in range(3) for r in range(c + 1)"
@@ -35,42 +35,42 @@ MUTANTS = [
         for c in range(3)
         for r in range(c + 1)
     ],
-    Mutant("so3 not held", MATRIX, "terms.so3(v), every, lower=0.0, upper=0.0",
+    Mutant("so3 not held", PROGRAMS, "terms.so3(v), every, lower=0.0, upper=0.0",
            f"terms.so3(v), every, {FREE}"),
-    Mutant("normal not held", MATRIX, "terms.unit_normal(v), every, lower=0.0, upper=0.0",
+    Mutant("normal not held", PROGRAMS, "terms.unit_normal(v), every, lower=0.0, upper=0.0",
            f"terms.unit_normal(v), every, {FREE}"),
-    Mutant("normal at most 1", MATRIX, "terms.unit_normal(v), every, lower=0.0",
+    Mutant("normal at most 1", PROGRAMS, "terms.unit_normal(v), every, lower=0.0",
            "terms.unit_normal(v), every, lower=-1e9"),
     Mutant("visible without the anchor", TERMS, "for j in range(count)])",
            "for j in range(1, count)])"),
     Mutant("visible without the last rim ray", TERMS, "for j in range(count)])",
            "for j in range(count - 1)])"),
-    Mutant("visible down to 0", MATRIX, "lower=form.min_facing", "lower=0.0"),
-    Mutant("visible without depth_ratio", MATRIX, "data.visibility_ray(form.depth_ratio)",
+    Mutant("visible down to 0", PROGRAMS, "lower=form.min_facing", "lower=0.0"),
+    Mutant("visible without depth_ratio", PROGRAMS, "data.visibility_ray(form.depth_ratio)",
            "data.visibility_ray(1e9)"),
-    Mutant("simplex not held", MATRIX, '"simplex", x, body, every, lower=1.0, upper=1.0',
+    Mutant("simplex not held", PROGRAMS, '"simplex", x, body, every, lower=1.0, upper=1.0',
            f'"simplex", x, body, every, {FREE}'),
-    Mutant("simplex at most 1", MATRIX, '"simplex", x, body, every, lower=1.0',
+    Mutant("simplex at most 1", PROGRAMS, '"simplex", x, body, every, lower=1.0',
            '"simplex", x, body, every, lower=0'),
-    Mutant("unit not held", MATRIX, '"unit", x, body, every, lower=1.0, upper=1.0',
+    Mutant("unit not held", PROGRAMS, '"unit", x, body, every, lower=1.0, upper=1.0',
            f'"unit", x, body, every, {FREE}'),
-    Mutant("translation not held", MATRIX, "body, index, lower=0.0, upper=0.0",
+    Mutant("translation not held", PROGRAMS, "body, index, lower=0.0, upper=0.0",
            f"body, index, {FREE}"),
-    Mutant("lam > 0", MATRIX, "lbx[np.arange(n) * stride] = MIN_SCALE", "pass"),
-    Mutant("d > 0", MATRIX, "lbx[np.arange(n) * stride + 4] = MIN_SCALE", "pass"),
-    Mutant("tau > 0", MATRIX, "lbx[layout.tau] = 1e-8", "pass"),
+    Mutant("lam > 0", PROGRAMS, "lbx[np.arange(n) * stride] = MIN_SCALE", "pass"),
+    Mutant("d > 0", PROGRAMS, "lbx[np.arange(n) * stride + 4] = MIN_SCALE", "pass"),
+    Mutant("tau > 0", PROGRAMS, "lbx[layout.tau] = 1e-8", "pass"),
     Mutant("epigraph rows not held", BUILDER, 'f"epigraph_{norm}", 0.0,',
            'f"epigraph_{norm}", -1e9,'),
     Mutant("epigraph without eps", NORMS, "slack**2 - square - norm.eps**2", "slack**2 - square"),
     Mutant("slack >= 0", BUILDER, 'Block(f"s_{norm}", 0.0,', 'Block(f"s_{norm}", -np.inf,'),
-    Mutant("presolve: simplex", TANGENT, "value, index, lower=1.0, upper=1.0",
+    Mutant("presolve: simplex", PROGRAMS, "value, index, lower=1.0, upper=1.0",
            f"value, index, {FREE}"),
-    Mutant("presolve: visible", TANGENT, "        lower=0.0,\n        upper=np.inf",
+    Mutant("presolve: visible", PROGRAMS, "        lower=0.0,\n        upper=np.inf",
            "        lower=-1e9,\n        upper=np.inf"),
-    Mutant("presolve: a rim ray", TANGENT, "for j in range(count)])",
+    Mutant("presolve: a rim ray", PROGRAMS, "for j in range(count)])",
            "for j in range(count - 1)])"),
-    Mutant("presolve: lam > 0", TANGENT, "lower[:, 0] = 1e-3", "pass"),
-    Mutant("presolve: box of slopes", TANGENT, "lower[:, 1:3], upper[:, 1:3] =", "_ ="),
+    Mutant("presolve: lam > 0", PROGRAMS, "lower[:, 0] = 1e-3", "pass"),
+    Mutant("presolve: box of slopes", PROGRAMS, "lower[:, 1:3], upper[:, 1:3] =", "_ ="),
     *[
         Mutant(f"Ipopt without {name}", IPOPT, '("lbx", "ubx", "lbg", "ubg")',
                str(tuple(b for b in ("lbx", "ubx", "lbg", "ubg") if b != name)))
