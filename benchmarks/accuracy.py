@@ -1,7 +1,9 @@
 """The page of a suite: tables by pair, family and half; a picture of sigma; two pages compared."""
 
 import re
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -138,23 +140,22 @@ def _by_family(frame: pd.DataFrame, titles: dict[str, str]) -> str:
     groups = table.dropna(axis=1, how="all").groupby([frame["family"], frame["flow"]], sort=False)
     means = groups.mean()
     means.insert(0, "pairs", groups.size())
-    return markdown(means, {str(c): "" if c == "pairs" else ".4f" for c in means})
+    return markdown(means)
 
 
 def _halves(frame: pd.DataFrame) -> str:
     """Table of geometric means over families by half and flow, and of means of sigma's columns."""
-    shown = {"MRE": "metrics.solution.mre", "constant": "metrics.constant.mre"}
-    table = pd.DataFrame({title: numbers(frame, column) for title, column in shown.items()})
-    for column, title in SIGMA_COLUMNS.items():
-        table[title] = numbers(frame, column)
+    shown = {"metrics.solution.mre": "MRE", "metrics.constant.mre": "constant"}
+    columns = shown | SIGMA_COLUMNS
+    table = pd.DataFrame({title: numbers(frame, column) for column, title in columns.items()})
     families = table.groupby([frame["family"], frame["flow"]]).mean().reset_index()
     half = families["family"].isin(HALF_B).map({True: "B", False: "A"}).rename("half")
     groups = families.groupby([half, "flow"])
     means = groups[list(table)].mean()
-    for title in shown:
+    for title in shown.values():
         means[title] = groups[title].agg(geometric)
     means.insert(0, "families", groups.size())
-    return markdown(means, {str(c): "" if c == "families" else ".4f" for c in means})
+    return markdown(means)
 
 
 def plot_sigma(path: Path, frame: pd.DataFrame) -> bool:
@@ -203,20 +204,14 @@ def read_pages(path: Path) -> pd.DataFrame:
         DataError: there is no table by pair.
     """
     pages = sorted(path.glob("*.md")) if path.is_dir() else [path]
-    merged: dict[str, dict[str, str]] = {}
-    for text in (page.read_text(encoding="utf-8") for page in pages if page.is_file()):
-        for table in re.findall(r"(?:^\| pair, flow \|.*\n)(?:^\|.*\n)*", text, re.MULTILINE):
-            head, _, *lines = (_cells(line) for line in table.splitlines())
-            if "baseline" not in head:
-                for cells in lines:
-                    merged.setdefault(cells[0], {}).update(zip(head[1:], cells[1:], strict=True))
-    if not any("solution" in row for row in merged.values()):
+    texts = [page.read_text(encoding="utf-8") for page in pages if page.is_file()]
+    by_pair = re.compile(r"^\| pair, flow \|.*\n(?:^\|.*\n)*", re.MULTILINE)
+    form: Any = {"sep": r"\s*\|\s*", "engine": "python", "skiprows": [1], "na_values": "-"}
+    tables = [pd.read_csv(StringIO(t), **form) for text in texts for t in by_pair.findall(text)]
+    own = [t.iloc[:, 1:-1].set_index("pair, flow") for t in tables if "baseline" not in t]
+    if not any("solution" in table for table in own):
         raise DataError("no table by pair is there", where=path, expected="pages of `accuracy`")
-    return pd.DataFrame.from_dict(merged, orient="index")
-
-
-def _cells(line: str) -> list[str]:
-    return [cell.strip() for cell in line.strip().strip("|").split("|")]
+    return pd.concat(own).groupby(level=0, sort=False).first()
 
 
 def comparison(before: pd.DataFrame, after: pd.DataFrame) -> str:
@@ -233,9 +228,9 @@ def comparison(before: pd.DataFrame, after: pd.DataFrame) -> str:
     old, new = before.loc[both], after.loc[both]
     family = new["family"] if "family" in new else old["family"]
     flow = pd.Series([title.rpartition(", ")[2] for title in both], both, name="flow")
-    table = pd.DataFrame({"before": _floats(old, "solution"), "after": _floats(new, "solution")})
+    table = pd.DataFrame({"before": old["solution"], "after": new["solution"]})
     table["ratio"] = table["after"] / table["before"]
-    table["NLL before"], table["NLL after"] = _floats(old, "NLL"), _floats(new, "NLL")
+    table["NLL before"], table["NLL after"] = old.get("NLL"), new.get("NLL")
     groups = table.groupby([family, flow], sort=False)
     families = groups.mean()
     families["ratio"] = groups["ratio"].agg(geometric)
@@ -244,17 +239,10 @@ def comparison(before: pd.DataFrame, after: pd.DataFrame) -> str:
     lines = []
     for name, part in (("A", ~half), ("B", half), ("A and B", half | True)):
         for which, ratios in families[part].groupby(level="flow")["ratio"]:
-            text = (
-                f"worse by 10 %: {int((ratios > 1.1).sum())}, better: {int((ratios < 0.9).sum())}"
-            )
+            worse, better = int((ratios > 1.1).sum()), int((ratios < 0.9).sum())
+            mean = f"{geometric(ratios):.4f} over {len(ratios)}"
             lines.append(
-                f"- half {name}, {which}: {geometric(ratios):.4f} over {len(ratios)}; {text}"
+                f"- half {name}, {which}: {mean}; worse by 10 %: {worse}, better: {better}"
             )
-    shown = families.dropna(axis=1, how="all")
-    forms = {str(c): "" if c == "pairs" else ".4f" for c in shown}
-    return "\n".join([markdown(shown, forms), "", "Geometric mean of the ratios:", *lines])
-
-
-def _floats(frame: pd.DataFrame, column: str) -> pd.Series:
-    """A column of texts as numbers; NaN where there is none."""
-    return pd.to_numeric(frame.get(column, pd.Series("-", frame.index)), errors="coerce")
+    shown = markdown(families.dropna(axis=1, how="all"))
+    return "\n".join([shown, "", "Geometric mean of the ratios:", *lines])

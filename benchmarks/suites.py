@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from benchmarks.everyday import LAYOUTS
 from benchmarks.table import Item
@@ -58,7 +58,7 @@ Items = Iterator[Item]
 def _item(
     family: str, name: str, raw: Mapping[str, Any], needs: Sequence[Path] = (), **fields: Any
 ) -> Item:
-    """A pair whose suite and flow are added by its suite."""
+    """A pair whose suite and flow `every_pair` adds."""
     return Item("", family, name, "", raw, **fields, needs=tuple(needs))
 
 
@@ -161,84 +161,87 @@ def _kinect(root: Path, o: Options) -> Items:
 # --- suites ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Suite:
+class Suite(NamedTuple):
     """A list of pairs.
 
     Attributes:
-        name: Name on the command line.
         text: Description.
         pairs: Makes the pairs of a root folder.
         layout: Contents that the root must have; empty if no data is needed.
         source: Where to get the data.
+        flows: Default flow sources.
     """
 
-    name: str
     text: str
     pairs: Callable[[Path, Options], Iterable[Item]]
     layout: str = ""
     source: str = ""
-
-    @property
-    def flows(self) -> tuple[str, ...]:
-        """Default flow sources."""
-        return ("truth", "dis") if self.name in ("rendered", "shared") else ("dis",)
-
-    def items(self, root: Path, o: Options) -> Items:
-        """Every wanted pair with every flow, whether its files exist or not."""
-        for pair in self.pairs(root, o):
-            member = replace(pair, suite=self.name, family=pair.family or self.name)
-            if o.only and not any(word in pair.name for word in o.only):
-                continue
-            for flow in o.flows or self.flows:
-                if pair.true_flow or not flow.startswith("truth"):
-                    yield replace(member, flow=flow)
+    flows: tuple[str, ...] = ("dis",)
 
 
-_SINTEL = (
-    "training/clean/SCENE/frame_NNNN.png, training/depth/SCENE/frame_NNNN.dpt,"
-    " training/camdata_left/SCENE/frame_NNNN.cam"
-)
-_VKITTI = (
-    "vkitti_1.3.1_rgb/WORLD/morning and _depthgt, _flowgt (version 1), or"
-    " SceneNN/morning/frames/rgb, depth, forwardFlow (version 2)"
-)
 _KINECT = (
     "pair_NNN/ with frame_0.png, frame_1.png, K.txt and points.npz (uv_0 in pixels, xyz_mm_0) or"
     " depth.png (16 bit, millimetres)"
 )
-_KITTI = "https://www.cvlibs.net/datasets/kitti/eval_{}.php".format
 _EPFL = "https://www.epfl.ch/labs/cvlab/data/data-dsr/"
-_SHARED = (
-    "kitti2012/, driving_synthetic/, kinect_paper/, sintel/, tum_fr1/, kitti2015/,"
-    f" kitti_tracking/, rgbd/, deepdeform/, {', '.join(SINGLE)}"
-)
-_OWN = "a folder with these pairs; the motorcycle pair comes with scikit-image"
-_2012 = "training/image_0, training/calib, training/disp_occ, training/flow_occ"
-_2015 = "training/image_2, training/calib_cam_to_cam, training/disp_occ_0"
-_MPI = "http://sintel.is.tue.mpg.de/downloads and its depth training data /depth"
-_NAVER = "https://europe.naverlabs.com/proxy-virtual-worlds/"
-_kitti12, _kitti15 = (
-    partial(_kitti, "kitti2012", "image_0", 194),
-    partial(_kitti, "kitti2015", "image_2", 200),
-)
-_rendered, _everyday = (
-    partial(_scenes, RENDERED, 1, 436 / 1024),
-    partial(_scenes, tuple(LAYOUTS), 5 / 8, 15 / 32),
-)
-_ALL = (
-    Suite("rendered", "rendered dynamic scenes", _rendered),
-    Suite("everyday", "rendered scenes of everyday kinds, most without parallax", _everyday),
-    Suite("shared", "the real pairs that development was done with", _shared, _SHARED, _OWN),
-    Suite("sintel", "MPI Sintel, the paper's five sequences", _sintel, _SINTEL, _MPI),
-    Suite("kitti2012", "KITTI stereo and flow 2012", _kitti12, _2012, _KITTI("stereo_flow")),
-    Suite("kitti2015", "KITTI scene flow 2015", _kitti15, _2015, _KITTI("scene_flow")),
-    Suite("vkitti", "Virtual KITTI 1 or 2, the paper's four worlds", _vkitti, _VKITTI, _NAVER),
-    Suite("kinect_paper", "bending paper of EPFL", _kinect, _KINECT, _EPFL),
-    Suite("kinect_tshirt", "bending T-shirt of EPFL", _kinect, _KINECT, _EPFL),
-)
-SUITES: Mapping[str, Suite] = {s.name: s for s in _ALL}
+SUITES: Mapping[str, Suite] = {
+    "rendered": Suite(
+        "rendered dynamic scenes",
+        partial(_scenes, RENDERED, 1, 436 / 1024),
+        flows=("truth", "dis"),
+    ),
+    "everyday": Suite(
+        "rendered scenes of everyday kinds, most without parallax",
+        partial(_scenes, tuple(LAYOUTS), 5 / 8, 15 / 32),
+    ),
+    "shared": Suite(
+        "the real pairs that development was done with",
+        _shared,
+        "kitti2012/, driving_synthetic/, kinect_paper/, sintel/, tum_fr1/, kitti2015/,"
+        f" kitti_tracking/, rgbd/, deepdeform/, {', '.join(SINGLE)}",
+        "a folder with these pairs; the motorcycle pair comes with scikit-image",
+        flows=("truth", "dis"),
+    ),
+    "sintel": Suite(
+        "MPI Sintel, the paper's five sequences",
+        _sintel,
+        "training/clean/SCENE/frame_NNNN.png, training/depth/SCENE/frame_NNNN.dpt,"
+        " training/camdata_left/SCENE/frame_NNNN.cam",
+        "http://sintel.is.tue.mpg.de/downloads and its depth training data /depth",
+    ),
+    "kitti2012": Suite(
+        "KITTI stereo and flow 2012",
+        partial(_kitti, "kitti2012", "image_0", 194),
+        "training/image_0, training/calib, training/disp_occ, training/flow_occ",
+        "https://www.cvlibs.net/datasets/kitti/eval_stereo_flow.php",
+    ),
+    "kitti2015": Suite(
+        "KITTI scene flow 2015",
+        partial(_kitti, "kitti2015", "image_2", 200),
+        "training/image_2, training/calib_cam_to_cam, training/disp_occ_0",
+        "https://www.cvlibs.net/datasets/kitti/eval_scene_flow.php",
+    ),
+    "vkitti": Suite(
+        "Virtual KITTI 1 or 2, the paper's four worlds",
+        _vkitti,
+        "vkitti_1.3.1_rgb/WORLD/morning and _depthgt, _flowgt (version 1), or"
+        " SceneNN/morning/frames/rgb, depth, forwardFlow (version 2)",
+        "https://europe.naverlabs.com/proxy-virtual-worlds/",
+    ),
+    "kinect_paper": Suite("bending paper of EPFL", _kinect, _KINECT, _EPFL),
+    "kinect_tshirt": Suite("bending T-shirt of EPFL", _kinect, _KINECT, _EPFL),
+}
 """Suites by name."""
+
+
+def every_pair(name: str, root: Path, o: Options) -> Items:
+    """Every wanted pair of a suite with every flow, whether its files exist or not."""
+    suite = SUITES[name]
+    for pair in suite.pairs(root, o):
+        if not o.only or any(word in pair.name for word in o.only):
+            for flow in o.flows or suite.flows:
+                if pair.true_flow or not flow.startswith("truth"):
+                    yield replace(pair, suite=name, family=pair.family or name, flow=flow)
 
 
 def list_suite(
@@ -262,7 +265,7 @@ def list_suite(
     root = Path(os.path.realpath(as_path(data or Path(), "data folder", home=True)))
     listed: list[Item] = []
     for folder in (".", name):
-        listed = list(suite.items(Path(os.path.realpath(root / folder)), o))
+        listed = list(every_pair(name, Path(os.path.realpath(root / folder)), o))
         here = [i for i in listed if all(is_file(f) for f in i.needs)]
         if any(i.needs for i in here) or (here and not suite.layout):
             found, total = (len({i.name for i in items}) for items in (here, listed))

@@ -144,11 +144,10 @@ def geometric(values: pd.Series) -> float:
 
 
 def show(value: Any, form: str = ".4f") -> str:
-    """A value as text: numbers in a format, a dash for an unknown value."""
+    """A value as text: numbers but whole ones in a format, a dash for an unknown value."""
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return "-"
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return format(value, form) if number else str(value)
+    return format(value, form) if isinstance(value, float) else str(value)
 
 
 def markdown(frame: pd.DataFrame, forms: str | Mapping[str, str] = ".4f") -> str:

@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.suites import HALF_B, SINGLE, SUITES, Options, list_suite, spread
+from benchmarks.suites import HALF_B, SINGLE, SUITES, Options, every_pair, list_suite, spread
 
 
 def test_suites_list_the_papers_pairs(tmp_path):
@@ -17,7 +17,7 @@ def test_suites_list_the_papers_pairs(tmp_path):
         problem = items[0].problem(["segmentation.superpixels=60"])
         assert (problem.input.width, problem.input.height) == size
     for name, count in (("sintel", 120), ("vkitti", 120), ("kitti2012", 194), ("kitti2015", 200)):
-        items = list(SUITES[name].items(tmp_path, Options()))
+        items = list(every_pair(name, tmp_path, Options()))
         assert len({i.key for i in items}) == count
         for i in items[:: count // 5]:
             i.problem()  # is a problem that the program accepts
@@ -28,8 +28,7 @@ def test_suites_list_the_papers_pairs(tmp_path):
 def test_a_suite_lists_the_pairs_whose_files_exist(tmp_path):
     base = tmp_path / "data" / "sintel" / "training" / "clean" / "alley_1"
     base.mkdir(parents=True)
-    suite = SUITES["sintel"]
-    frames = [i.input["frame"] for i in suite.items(tmp_path, Options())][:2]
+    frames = [i.input["frame"] for i in every_pair("sintel", tmp_path, Options())][:2]
     for frame in frames:
         (base / f"frame_{frame:04d}.png").touch()
     (base / f"frame_{frames[0] + 1:04d}.png").touch()
@@ -51,8 +50,7 @@ def test_a_pair_is_listed_with_every_flow_that_it_has(tmp_path):
 
 
 def test_sintel_needs_cameras_except_for_the_known_scene(tmp_path):
-    suite = SUITES["sintel"]
-    for i in suite.items(tmp_path, Options()):
+    for i in every_pair("sintel", tmp_path, Options()):
         if i.family in ("alley_1", "temple_2"):
             for path in i.needs:
                 if path.suffix == ".png":
@@ -75,7 +73,7 @@ def test_a_missing_dataset_says_where_to_get_it(name, tmp_path, capsys):
 
 
 def test_the_shared_pairs_are_split_in_two_halves_by_family(tmp_path):
-    items = list(SUITES["shared"].items(tmp_path, Options(flows=("dis",))))
+    items = list(every_pair("shared", tmp_path, Options(flows=("dis",))))
     families = {i.family for i in items}
     assert len({i.key for i in items}) == len(items)
     assert {*SINGLE, *HALF_B} <= families
