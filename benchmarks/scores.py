@@ -1,7 +1,6 @@
 """The row of a pair: errors of the solution and of baselines, of what is seen, moves, of sigma."""
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -11,13 +10,7 @@ from soup_nlp import Pair, Run, Soup, Truth, run
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
 from soup_nlp.evaluation.confidence import MOST_SIGMA
-from soup_nlp.evaluation.metrics import (
-    MEDIAN,
-    UNSCALED,
-    DepthMetrics,
-    depth_metrics,
-    skill,
-)
+from soup_nlp.evaluation.metrics import MEDIAN, UNSCALED, depth_metrics, skill
 from soup_nlp.evaluation.scoring import (
     at_truth,
     coverage,
@@ -90,8 +83,12 @@ def scores(result: Run) -> Row:
     }
     if truth is None or not has_depth(truth):
         return {**row, "metrics": {}}
-    metrics = _rows(score_depths(truth, maps))
-    scale = metrics["solution"]["scale"]
+    scored = score_depths(truth, maps)
+    scale, constant = scored["solution"].scale, scored["constant"].mre
+    metrics = {
+        method: {**{k: getattr(m, k) for k in KEPT_METRICS}, "skill": skill(m.mre, constant)}
+        for method, m in scored.items()
+    }
     z, gt = at_truth(truth, result.reconstruction.depth_ref)
     sigma = result.reconstruction.sigma_ref
     counts = MEDIAN.mask(gt) & np.isfinite(z) & (z > 0)
@@ -113,14 +110,6 @@ def has_depth(truth: Truth | None) -> bool:
     if truth.depth_ref is not None:
         return MEDIAN.counts(truth.depth_ref)
     return truth.points is not None and MEDIAN.counts(truth.points[:, 2])
-
-
-def _rows(scored: Mapping[str, DepthMetrics]) -> dict[str, dict[str, float]]:
-    constant = scored["constant"].mre
-    return {
-        method: {**{k: getattr(m, k) for k in KEPT_METRICS}, "skill": skill(m.mre, constant)}
-        for method, m in scored.items()
-    }
 
 
 def sigma_scores(error: Float, sigma: Float) -> Row:
