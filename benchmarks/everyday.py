@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from soup_nlp.arrays import Float
-from soup_nlp.data.scenes.catalogue import Layouts, add_scenes
+from soup_nlp.data.scenes import catalogue
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse
 from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Plane
 from soup_nlp.data.scenes.texture import Colour, Panels
@@ -206,8 +206,7 @@ def _swing(b: SceneBuilder) -> Scene:
 
 def _jam(b: SceneBuilder) -> Scene:
     """camera that creeps in a traffic jam; vehicles over half of the image move differently"""
-    lanes = Panels((3.4, 5.0), (0.035, 0.5), (0.78, 0.78, 0.74), (-1.75, b.uniform(0, 5)))
-    static = [floor(b.plain(ASPHALT, 2.0, lanes, contrast=0.3)), sky(b, 76)]
+    static = [b.road(3.4, -1.75, 2.0, contrast=0.3), sky(b, 76)]
     panes = windows((2.6, 2.9), (0.4, 0.5))
     for side in (-1, 1):
         z = 2.0
@@ -300,7 +299,7 @@ def _standing(b: SceneBuilder) -> Scene:
     return Scene(bodies, pose, pose)
 
 
-LAYOUTS: Layouts = {
+LAYOUTS: catalogue.Layouts = {
     "pan": (_pan, 0.85, 0.6),
     "handheld": (_handheld, 0.75, 0.6),
     "swing": (_swing, 0.8, 0.6),
@@ -310,4 +309,4 @@ LAYOUTS: Layouts = {
     "standing": (_standing, 0.8, 0.6),
 }
 
-add_scenes(LAYOUTS)
+catalogue.LAYOUTS.update(LAYOUTS)

@@ -58,6 +58,7 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
     "head row": ("fx,fy,cx,cy\n256,257,159.5,119.5\n", []),
     "INI": ("[camera]\nfx = 256\nfy = 257\ncx = 159.5\ncy = 119.5\nk1 = -0.3\n", [-0.3]),
     "twice the same": (FOUR + "fx: 256.0", []),
+    "holes": (FOUR + "p1: 0.01", [0, 0, 0.01]),
     "signs": (FOUR + "k1: +0.1\np1: -.5e-3\nk3: 0", [0.1, 0, -5e-4]),
     "not octal": ("fx: 0256\nfy: 0257\ncx: 159.5\ncy: 119.5", []),
     "ROS 1": (

@@ -1,7 +1,6 @@
 """Rendered scenes: exact truth, images that agree with it, and what each kind moves."""
 
 from functools import cache
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -27,7 +26,8 @@ FIRST = [name for name in SCENES if name not in LAYOUTS]
 RIGID = {"sheet": (0.01, 0.5), "banner": (0.5, 0.9), "handheld": (0.8, 1), "standing": (0.7, 1)}
 """Bounds of the share of rigid pixels in scenes with bending bodies."""
 PARALLAX = {"swing": (1, 7), "jam": (0.05, 2), "facade": (1.5, 7), "corridor": (4, 14)}
-"""Bounds of the background's median parallax, px at 640 columns."""
+PARALLAX |= {"handheld": (1, 14)}
+"""Bounds of the background's median parallax, px at 640 columns; none for the others."""
 MOVES = {"handheld": (0.03, 0.2), "swing": (0.1, 0.32), "jam": (0.3, 0.65), "standing": (0.05, 0.3)}
 """Bounds of the moving share of the image; of the other kinds, only `pan` at odd seeds has one."""
 WIDTH, HEIGHT = 240, 102
@@ -148,36 +148,18 @@ def test_still_background_does_not_move():
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_each_kind_has_its_parallax_and_moving_bodies(name, seed):
     p = pair(name, seed)
+    T, uv = p.truth, camera.pixel_grid(*p.size)
     # flow of the static background beyond the camera's rotation, px at 640 columns
-    uv, R = camera.pixel_grid(*p.size), p.truth.motions[0, :3, :3]
-    turned = camera.project(p.K_next, camera.rays(p.K_ref, uv) @ R.T) - uv
-    left = np.linalg.norm(p.truth.flow - turned, axis=-1)
-    far = left[p.truth.components == 0] * 640 / SMALL[0]
-    if name in ("pan", "standing"):
-        assert far.max() < 1e-6
-    elif name == "handheld":
-        size = np.linalg.norm(p.truth.motions[0, :3, 3]) / np.median(p.truth.depth_ref)
-        assert 0.008 < size < 0.035
-    else:
-        least, most = PARALLAX[name]
-        assert least < np.median(far) < most
-    moves = (p.truth.components > 0).mean()
+    turned = camera.project(p.K_next, camera.rays(p.K_ref, uv) @ T.motions[0, :3, :3].T) - uv
+    far = np.linalg.norm(T.flow - turned, axis=-1)[T.components == 0] * 640 / SMALL[0]
+    least, most = PARALLAX.get(name, (0, 1e-6))
+    assert least <= np.median(far) < most
     least, most = (0.01, 0.15) if name == "pan" and seed % 2 else MOVES.get(name, (0, 0))
-    assert least <= moves <= most
-    assert np.bincount(p.truth.components.ravel()).min() > 0.002 * p.truth.components.size
-    if name == "standing":
-        np.testing.assert_allclose(p.truth.motions[0], np.eye(4), rtol=0, atol=1e-12)
-    if name == "pan":
-        turn = np.degrees(np.arccos((np.trace(p.truth.motions[0, :3, :3]) - 1) / 2))
-        assert 1.9 < turn < 6.5
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_seeds_differ_in_depth_and_camera_motion(name):
-    for a, b in combinations([pair(name, seed).truth for seed in range(2)], 2):
-        assert abs(np.log(a.depth_ref / b.depth_ref)).mean() > 0.02
-        assert name == "standing" or abs(a.motions[0] - b.motions[0]).max() > 1e-3
+    assert least <= (T.components > 0).mean() <= most
+    assert np.bincount(T.components.ravel()).min() > 0.002 * T.components.size
+    turn = np.degrees(np.arccos(min(1, (np.trace(T.motions[0, :3, :3]) - 1) / 2)))
+    assert name != "pan" or 1.9 < turn < 6.5
+    assert name != "standing" or turn < 1e-4
 
 
 def test_limbs_of_a_person_move_differently():
@@ -331,23 +313,13 @@ def test_same_seed_same_bytes_other_seed_other_scene(name):
     assert a.truth.flow.tobytes() != c.truth.flow.tobytes()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [(65, 131), WIDE])
-@pytest.mark.parametrize("name", FIRST)
-def test_any_size(name, size):
-    p = pair(name, 0, size)
-    assert p.size == size[::-1]
-    assert np.isfinite(p.truth.flow).all()
-    assert np.isfinite(p.truth.depth_ref).all()
-    assert p.truth.depth_ref.min() > 0.3
-    assert p.truth.depth_ref.max() < 80
-
-
-def test_the_camera_scales_with_the_width():
-    for width, height in (WIDE, (WIDTH, HEIGHT)):
-        K = pair("room", 0, (width, height)).K_ref
-        np.testing.assert_allclose(K[0, 0], 0.8 * width)
-        np.testing.assert_allclose(K[:2, 2], [(width - 1) / 2, (height - 1) / 2])
+def test_the_camera_scales_with_the_width_or_height():
+    for width, height, focal in ((*WIDE, 160), (WIDTH, HEIGHT, 240), (65, 131, 131 * 4 / 3)):
+        p = pair("room", 0, (width, height))
+        np.testing.assert_allclose(p.K_ref[0, 0], 0.8 * focal)
+        np.testing.assert_allclose(p.K_ref[:2, 2], [(width - 1) / 2, (height - 1) / 2])
+        assert p.size == p.truth.depth_ref.shape == (height, width)
+        assert np.isfinite(p.truth.flow).all()
 
 
 @pytest.mark.parametrize(

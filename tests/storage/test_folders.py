@@ -62,7 +62,7 @@ NAMES = st.sets(st.sampled_from(["a", "b", "c/x", "c/d/y"]), min_size=1)
 ENDS = st.sampled_from([None, None, None, RuntimeError, KeyboardInterrupt, OSError, DataError])
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.lists(st.tuples(NAMES, st.sampled_from(["whole", "part", "user"]), ENDS), max_size=6))
 def test_results_and_files_of_the_user_share_a_folder(steps):
     """Results that are written, or fail, and files of the user, against two dicts of files."""
@@ -346,7 +346,7 @@ def test_a_kill_leaves_the_old_or_the_new_result(moves, tmp_path):
 WRITER = """
 import sys
 from soup_nlp.storage.folders import staged
-for k in range(20):
+for k in range(8):
     with staged(sys.argv[1]) as new:
         (new / f"{sys.argv[2]}{k}").write_text("1")
         (new / sys.argv[2]).write_text(str(k))
@@ -359,7 +359,7 @@ def test_processes_that_write_into_one_folder_lose_no_files(tmp_path):
         subprocess.Popen([sys.executable, "-c", WRITER, str(target), name]) for name in "abc"
     ]
     assert [writer.wait() for writer in writers] == [0, 0, 0]
-    expected = {f"{name}{k}": "1" for name in "abc" for k in range(20)} | dict.fromkeys("abc", "19")
+    expected = {f"{name}{k}": "1" for name in "abc" for k in range(8)} | dict.fromkeys("abc", "7")
     assert content(target) == expected
     assert read_sums(target).files == {name: digest_of(target / name) for name in expected}
 

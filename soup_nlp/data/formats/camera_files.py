@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.camera_text import Leaf, leaves
+from soup_nlp.data.formats.cameras import written
 from soup_nlp.data.formats.images import check_body
 from soup_nlp.data.formats.map_files import MAGIC, after_magic
 from soup_nlp.errors import DataError
@@ -128,26 +129,22 @@ def read_camera(path: PathLike) -> tuple[Float, Float]:
         return _plain([number(word, "", path) for word in named[0][1]], path)
     check_model(named, path)
     cameras = cameras_of(named, path)
-    different: dict[tuple[float, ...], str] = {}
+    different: dict[tuple[float, ...], tuple[str, str]] = {}
     for name, K in cameras:
-        different.setdefault(tuple(K.ravel()), f"{name or 'unnamed'}: {_four(K)}")
+        different.setdefault(tuple(K.ravel()), (name or "unnamed", written(K, 9)))
     if len(different) > 1:
         several = list(different.values())
+        name, four = several[0]
         raise refused(
             f"camera file holds {len(several)} cameras",
             path,
-            "; ".join(several[:8]),
-            f"choose one by its numbers: --intrinsics {_four(cameras[0][1])} for {cameras[0][0]}",
+            "; ".join(": ".join(camera) for camera in several[:8]),
+            f"choose one by its numbers: --intrinsics {four} for {name}",
         )
     if not cameras:
         shown = ", ".join(".".join(names) for names, _ in named[:12]) or "nothing"
         raise refused("camera file holds no camera", path, shown, _field_of_view(named) or TRY)
     return check_intrinsics(cameras[0][1], path), distortion_of(named, path)
-
-
-def _four(K: Float) -> str:
-    """fx,fy,cx,cy as `--intrinsics` takes them."""
-    return ",".join(f"{x:.9g}" for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
 
 def _plain(values: list[float], where: PathLike) -> tuple[Float, Float]:

@@ -1,7 +1,6 @@
 """Intrinsics of pictures: estimated where no file gives them, and checked for plausibility."""
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 from PIL.ExifTags import Base
 
 from soup_nlp.arrays import Float, Image
-from soup_nlp.data.formats.images import DataWarning, PathLike, exif_tags
+from soup_nlp.data.formats.images import PathLike, exif_tags, warn
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.camera import intrinsics
 
@@ -52,12 +51,8 @@ def estimated_cameras(
         # the ratio of the two focal lengths is that in EXIF
         first = sizes[0][0] / (2 * math.tan(math.radians(fov) / 2)) / max(sizes[0])
         if not NARROWEST <= _degrees(first) <= WIDEST:
-            warnings.warn(
-                f"a field of view of {fov:g} degrees is outside of the usual {NARROWEST:g} to"
-                f" {WIDEST:g}; it is in degrees, not in radians",
-                DataWarning,
-                stacklevel=2,
-            )
+            usual = f"{NARROWEST:g} to {WIDEST:g}; it is in degrees, not in radians"
+            warn("fov", f"a field of view of {fov:g} degrees is outside of the usual {usual}")
         relative = [first * focal / relative[0] for focal in relative]
     sides = [focal * max(size) for focal, size in zip(relative, sizes)]
     out = [intrinsics(f, f, (w - 1) / 2, (h - 1) / 2) for f, (w, h) in zip(sides, sizes)]
@@ -68,12 +63,11 @@ def estimated_cameras(
         " depth: give --intrinsics or --fov"
     )
     for k, focal in enumerate(sides[: 0 if fov is not None else 1 if alike else None]):
-        warnings.warn(
-            f"{paths[k] or 'image'}: no intrinsics; focal length {focal:.0f} px from"
-            f" {'EXIF' if exif_focals[k] else other} ({_degrees(focal / sizes[k][0]):.0f} degrees"
-            f" of view horizontally), principal point in the middle{'' if first_exif else doubt}",
-            DataWarning,
-            stacklevel=2,
+        warn(
+            paths[k] or "image",
+            f"no intrinsics; focal length {focal:.0f} px from {'EXIF' if exif_focals[k] else other}"
+            f" ({_degrees(focal / sizes[k][0]):.0f} degrees of view horizontally), principal point"
+            f" in the middle{'' if first_exif else doubt}",
         )
     return out, 0.0 if first_exif or fov is not None else GUESS_SIGMA
 
@@ -92,12 +86,8 @@ def exif_focal(path: PathLike | None, image: Image) -> float | None:
         if NARROWEST <= _degrees(focal) <= WIDEST:
             return focal
     if focals:
-        warnings.warn(
-            f"{path}: the focal length of EXIF is ignored, since {focals[0]:.3g} times the longer"
-            f" side ({_degrees(focals[0]):.1f} degrees of view) is implausible",
-            DataWarning,
-            stacklevel=2,
-        )
+        side = f"{focals[0]:.3g} times the longer side ({_degrees(focals[0]):.1f} degrees of view)"
+        warn(path, f"the focal length of EXIF is ignored, since {side} is implausible")
     return None
 
 
@@ -164,13 +154,13 @@ def check_cameras(
                 hint=f"{hint}. If the images were cropped, --set input.cropped=true accepts it, in"
                 " Python solve_pair(pair, cropped=True)",
             )
-        text = f"{where}, {width} x {height}: {' and '.join(problems)}. Likely cause: {hint}"
-        warnings.warn(text, DataWarning, stacklevel=2)
+        text = f"{' and '.join(problems)}. Likely cause: {hint}"
+        warn(f"{where}, {width} x {height}", text)
 
 
-def written(K: Float) -> str:
+def written(K: Float, digits: int = 6) -> str:
     """fx,fy,cx,cy as `--intrinsics` takes them."""
-    return ",".join(f"{x:g}" for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    return ",".join(f"{x:.{digits}g}" for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
 
 
 def _ratio(a: float, b: float) -> float:

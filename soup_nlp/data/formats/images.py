@@ -45,9 +45,14 @@ class DataWarning(UserWarning):
     """An input can be used, but it may not be what the user expects."""
 
 
+def warn(where: object, text: str) -> None:
+    """Warn of an input, from the place that called the caller."""
+    warnings.warn(f"{where}: {text}", DataWarning, stacklevel=3)
+
+
 def assumed(where: object, missing: str, taken: str) -> None:
     """Warn that a value is missing in the input, and name the value that is assumed."""
-    warnings.warn(f"{where}: {missing}; assumed: {taken}", DataWarning, stacklevel=3)
+    warn(where, f"{missing}; assumed: {taken}")
 
 
 def check_body(count: int, expected: int, path: PathLike, what: str) -> None:
@@ -85,12 +90,10 @@ def decode(path: PathLike, what: str) -> NDArray[Any]:
     # a small file can have many pixels of one colour
     check_image_size(*size, what, path)
     if pages > 1:
-        text = f"{path}: holds {pages} pages or frames; the first one is used"
-        warnings.warn(text, DataWarning, stacklevel=3)
+        warn(path, f"holds {pages} pages or frames; the first one is used")
     image, said = _decode_by_opencv(content)
     if said:
-        text = f"{path}: is damaged, so that parts of it may be wrong ({said}); copy it again"
-        warnings.warn(text, DataWarning, stacklevel=3)
+        warn(path, f"is damaged, so that parts of it may be wrong ({said}); copy it again")
     return _decode_by_pillow(content, path, what) if image is None else image
 
 
@@ -184,8 +187,7 @@ def exif_tags(path: PathLike) -> dict[int, Any]:
     except UnidentifiedImageError:  # OpenCV may read formats that Pillow does not
         return {}
     except Exception as error:  # readers of metadata raise many types
-        text = f"{path}: its EXIF is malformed and is ignored ({type(error).__name__}: {error})"
-        warnings.warn(text, DataWarning, stacklevel=2)
+        warn(path, f"its EXIF is malformed and is ignored ({type(error).__name__}: {error})")
         return {}
 
 
@@ -221,21 +223,18 @@ def read_images(
         values = np.concatenate([x.ravel()[:: x.size // 10**6 + 1] for x in deep])
         low, high = np.percentile(values, OUTER)
         least, most = min(x.min() for x in deep), max(x.max() for x in deep)
-        names = ", ".join(str(path) for path in paths)
         beside = " beside 8 bit, which are taken times 257" if len(depths) > 1 else ""
-        warnings.warn(
-            f"{names}: 16 bit{beside}, values {least} to {most}; {low:.0f} to {high:.0f}"
-            " become black to white; the key white of the input (4095 for 12 bits) sets 0 to white",
-            DataWarning,
-            stacklevel=3,
+        warn(
+            ", ".join(map(str, paths)),
+            f"16 bit{beside}, values {least} to {most}; {low:.0f} to {high:.0f} become black to"
+            " white; the key white of the input (4095 for 12 bits) sets 0 to white",
         )
     scale = 255.0 / max(high - low, 1.0)
     for k, image in enumerate(images):
         if image.dtype != np.uint8:
             image = np.clip(np.rint((image - low) * scale), 0, 255).astype(np.uint8)
         if interlaced(image):
-            text = "looks interlaced; separate its fields, for example by ffmpeg's yadif"
-            warnings.warn(f"{paths[k]}: {text}", DataWarning, stacklevel=3)
+            warn(paths[k], "looks interlaced; separate its fields, for example by ffmpeg's yadif")
         images[k] = image
     return images
 

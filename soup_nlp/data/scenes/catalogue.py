@@ -14,7 +14,6 @@ from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
 from soup_nlp.data.scenes.shapes import Sheet
 from soup_nlp.data.scenes.texture import Panels
 from soup_nlp.data.scenes.things import (
-    ASPHALT,
     BACK,
     FRONT,
     SKY,
@@ -22,7 +21,6 @@ from soup_nlp.data.scenes.things import (
     about,
     backdrop,
     block,
-    floor,
     foot,
     placed,
     views,
@@ -38,13 +36,8 @@ def render_scene(
     """Render a scene of `LAYOUTS`, with full truth in metres and no flow.
 
     Component 0 is the static background. Motions include that of the camera; NaN for what bends.
-
-    Args:
-        name: The scene.
-        seed: Changes layout, textures and motions within sensible ranges; same seed, same bytes.
-        width: Columns of both images, at least 64; the focal length grows with it.
-        height: Rows of both images, at least 48.
-        frame: First frame of the pair; camera and bodies repeat their motion from frame 0 to 1.
+    The seed changes layout, textures and motions; the focal length grows with the width. `frame` is
+    the first one of the pair: camera and bodies repeat their motion from frame 0 to 1.
     """
     check_image_size(width, height, "scene", name)
     layout, focal, contrast = LAYOUTS[name]
@@ -58,9 +51,8 @@ def render_scene(
 
 def _street(b: SceneBuilder) -> Scene:
     """driving camera, two moving cars on a street between houses; depth to 80 m"""
-    lanes = Panels((3.6, 5.0), (0.035, 0.5), (0.78, 0.78, 0.74), (-0.06, b.uniform(0, 5)))
     static = [
-        floor(b.plain(ASPHALT, 2.5, lanes, contrast=0.5)),
+        b.road(3.6, -0.06, 2.5, contrast=0.5),
         backdrop(78, b.plain(SKY, 9.0, contrast=0.16), glow=1.0),
     ]
     for side in (-1.0, 1.0):
@@ -184,9 +176,4 @@ LAYOUTS: Layouts = {
     "still": (_still, 0.8, 1.0),
     "banner": (_banner, 0.8, 1.0),
 }
-"""The index of a scene in this table is part of its seed, so that new scenes are appended."""
-
-
-def add_scenes(layouts: Layouts) -> None:
-    """Make further scenes known to `render_scene` and to the input of kind scene."""
-    LAYOUTS.update(layouts)
+"""The index of a scene in this table is part of its seed: others may be added at the end."""

@@ -1,4 +1,4 @@
-"""Elements of rendered scenes: poses, colours, textures; rooms, vehicles, trees, people."""
+"""Elements of rendered scenes: poses, colours, textures; rooms, furniture, roads, cars."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -170,7 +170,12 @@ class SceneBuilder:
             out.append(Part(shape, placed(x, -up, z, yaw=yaw), self.paint(0.8 * size)))
         return out
 
-    # --- vehicles and people ----------------------------------------------------------------------
+    # --- roads and vehicles ----------------------------------------------------------------------
+
+    def road(self, lane: float, line: float, cell: float, contrast: float) -> Part:
+        """The ground as a road with a dashed line every `lane` metres, the first one at `line`."""
+        dashes = Panels((lane, 5.0), (0.035, 0.5), (0.78, 0.78, 0.74), (line, self.uniform(0, 5)))
+        return floor(self.plain(ASPHALT, cell, dashes, contrast=contrast))
 
     def car(self, x: float, z: float, yaw: float) -> list[Part]:
         """A car of three boxes that stands on the ground, nose along +z at yaw 0."""
