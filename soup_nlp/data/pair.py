@@ -1,10 +1,10 @@
 """Input of a solve: two images, two cameras, a flow and, if known, the truth."""
 
-from dataclasses import InitVar, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ def check_size(
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Flow:
     """A dense flow from the reference to the next image.
 
@@ -70,32 +70,26 @@ class Flow:
     """
 
     uv: FloatMap
-    confidence: FloatMap = None  # type: ignore[assignment]
-    source: str = "unknown"
+    confidence: FloatMap
+    source: str
 
-    if TYPE_CHECKING:
-
-        def __init__(
-            self, uv: FlowLike, confidence: object = None, source: str = "unknown"
-        ) -> None: ...
-
-    def __post_init__(self) -> None:
+    def __init__(self, uv: FlowLike, confidence: object = None, source: str = "unknown") -> None:
         put = partial(object.__setattr__, self)
-        named = is_path(self.uv) and self.source == "unknown"
-        put("source", printable(self.uv if named else self.source))
-        flow: FlowLike = self.uv
-        flow = read_flow(flow) if is_path(flow) else flow
-        expected = "numbers (H, W, 2) or (2, H, W) in pixels, or a path"
-        uv = flow_layout(array_of(flow, "flow", self.source, expected), self.source)
-        put("uv", uv if uv.dtype.kind == "f" and uv.dtype.itemsize >= 4 else uv.astype(np.float32))
-        if self.confidence is None:
-            valid = (np.abs(self.uv) < UNKNOWN_FLOW).all(axis=2)
-            put("uv", np.where(valid[..., None], self.uv, 0))
-            put("confidence", valid.astype(np.float32))
+        named = is_path(uv) and source == "unknown"
+        put("source", printable(uv if named else source))
+        what, expected = "flow", "numbers (H, W, 2) or (2, H, W) in pixels, or a path"
+        flow = array_of(read_flow(uv) if is_path(uv) else uv, what, self.source, expected)
+        flow = flow_layout(flow, self.source)
+        if flow.dtype.kind != "f" or flow.dtype.itemsize < 4:
+            flow = flow.astype(np.float32)
+        if confidence is None:
+            confidence = known = (np.abs(flow) < UNKNOWN_FLOW).all(axis=2)
+            flow = np.where(known[..., None], flow, 0)
         what, expected = "flow confidence", "numbers (H, W) from 0 to 1"
-        sure = array_of(self.confidence, what, self.source, expected, "fiub", "(H, W)")
+        sure = array_of(confidence, what, self.source, expected, "fiub", "(H, W)")
+        check_size("flow confidence and flow", sure.shape, flow.shape, self.source)
+        put("uv", flow)
         put("confidence", sure if sure.dtype.kind == "f" else sure.astype(np.float32))
-        check_size("flow confidence and flow", sure.shape, self.uv.shape, self.source)
         # False for NaN
         fits = (self.confidence >= 0) & (self.confidence <= 1)
         if not fits.all():
@@ -199,7 +193,7 @@ class Truth:
     __repr__ = __str__
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Pair:
     """Two consecutive frames with cameras, flow and truth.
 
@@ -228,69 +222,59 @@ class Pair:
 
     image_ref: Image
     image_next: Image
-    K_ref: Float = None  # type: ignore[assignment]
-    K_next: Float = None  # type: ignore[assignment]
-    flow: Flow | None = None
-    truth: Truth | None = None
-    name: str = "pair"
-    fov: InitVar[float | None] = None
-    depth_prior: Float | None = None
-    focal_sigma: float = 0.0
+    K_ref: Float
+    K_next: Float
+    flow: Flow | None
+    truth: Truth | None
+    name: str
+    depth_prior: Float | None
+    focal_sigma: float
 
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            image_ref: ImageLike,
-            image_next: ImageLike,
-            K_ref: CameraLike = None,
-            K_next: CameraLike = None,
-            flow: Flow | FlowLike | None = None,
-            truth: Truth | None = None,
-            name: str = "pair",
-            fov: float | None = None,
-            depth_prior: object = None,
-            focal_sigma: float = 0.0,
-        ) -> None: ...
-
-    def __post_init__(self, fov: float | None) -> None:
+    def __init__(
+        self,
+        image_ref: ImageLike,
+        image_next: ImageLike,
+        K_ref: CameraLike = None,
+        K_next: CameraLike = None,
+        flow: Flow | FlowLike | None = None,
+        truth: Truth | None = None,
+        name: str = "pair",
+        fov: float | None = None,
+        depth_prior: object = None,
+        focal_sigma: float = 0.0,
+    ) -> None:
         put = partial(object.__setattr__, self)
-        one_line(self.name, "name of the pair", "name")
+        put("name", one_line(name, "name of the pair", "name"))
         truths = "soup_nlp.Truth(depth_ref=..., ...) or None"
-        expect(self.truth, (Truth, NoneType), "truth of the pair", truths)
+        expect(truth, (Truth, NoneType), "truth of the pair", truths)
+        put("truth", truth)
+        given = {"image_ref": image_ref, "image_next": image_next}
         # files may have EXIF, and 16-bit files have one range of values
-        given: tuple[ImageLike, ...] = self.image_ref, self.image_next
-        files = [Path(image) if is_path(image) else None for image in given]
+        files = [Path(image) if is_path(image) else None for image in given.values()]
         known = [path for path in files if path is not None]
-        read = iter(read_images(known, turn=self.K_ref is None))
-        for what, path in zip(("image_ref", "image_next"), files, strict=True):
-            put(what, image_of(getattr(self, what) if path is None else next(read), what))
-        if self.K_ref is None:
-            cameras, sigma = estimated_cameras(files, (self.image_ref, self.image_next), fov)
-            put("focal_sigma", sigma)
-            put("K_ref", cameras[0])
-            if self.K_next is None:
-                put("K_next", cameras[1])
+        read = iter(read_images(known, turn=K_ref is None))
+        for path, (what, image) in zip(files, given.items(), strict=True):
+            put(what, image_of(image if path is None else next(read), what))
+        images = self.image_ref, self.image_next
+        if K_ref is None:
+            (K_ref, estimated), focal_sigma = estimated_cameras(files, images, fov)
+            K_next = estimated if K_next is None else K_next
         elif fov is not None:
             raise DataError("two cameras are given", found="K_ref and fov", expected="one of them")
-        sigma = self.focal_sigma
-        if not (isinstance(sigma, int | float) and 0 <= sigma < np.inf):
+        if not (isinstance(focal_sigma, int | float) and 0 <= focal_sigma < np.inf):
             raise DataError(
                 "standard deviation of the log focal length is out of range",
                 where="focal_sigma",
-                found=repr_of(sigma),
+                found=repr_of(focal_sigma),
                 expected="a finite number, at least 0; 0 for a known focal length",
             )
-        if self.K_next is None:
-            put("K_next", self.K_ref)
-        for what in ("K_ref", "K_next"):
-            K = camera_of(getattr(self, what), what)
-            put(what, K)
-            _check_focal(K, getattr(self, what.replace("K", "image")), what)
-        if self.depth_prior is not None:
-            put("depth_prior", prior_of(self.depth_prior))
-        if not isinstance(self.flow, Flow | None):
-            put("flow", Flow(self.flow))
+        put("focal_sigma", focal_sigma)
+        cameras = {"K_ref": K_ref, "K_next": K_ref if K_next is None else K_next}
+        for image, (what, camera) in zip(images, cameras.items(), strict=True):
+            put(what, camera_of(camera, what))
+            _check_focal(getattr(self, what), image, what)
+        put("depth_prior", None if depth_prior is None else prior_of(depth_prior))
+        put("flow", flow if isinstance(flow, Flow | None) else Flow(flow))
         self._check_sizes()
 
     def _check_sizes(self) -> None:
