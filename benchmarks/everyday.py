@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 from soup_nlp.arrays import Float
 from soup_nlp.data.scenes import catalogue
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse
-from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Plane
-from soup_nlp.data.scenes.texture import Colour, Panels
+from soup_nlp.data.scenes.surfaces import Box, Colour, Ellipsoid, Panels, Plane
 from soup_nlp.data.scenes.things import (
     ASPHALT,
     BACK,

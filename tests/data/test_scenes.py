@@ -14,8 +14,16 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes import catalogue
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, render
-from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Plane, Sheet
-from soup_nlp.data.scenes.texture import Texture, fractal_noise, pulse_coverage, value_noise
+from soup_nlp.data.scenes.surfaces import (
+    Box,
+    Ellipsoid,
+    Plane,
+    Sheet,
+    Texture,
+    fractal_noise,
+    pulse_coverage,
+    value_noise,
+)
 from soup_nlp.data.scenes.things import SceneBuilder, placed
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.raycast import Body, Frame, Part, Scene, render
-from soup_nlp.data.scenes.shapes import Box, Plane
-from soup_nlp.data.scenes.texture import Texture
+from soup_nlp.data.scenes.surfaces import Box, Plane, Texture
 from soup_nlp.data.scenes.things import about, placed
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation

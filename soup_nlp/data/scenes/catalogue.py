@@ -11,8 +11,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse, render
-from soup_nlp.data.scenes.shapes import Sheet
-from soup_nlp.data.scenes.texture import Panels
+from soup_nlp.data.scenes.surfaces import Panels, Sheet
 from soup_nlp.data.scenes.things import (
     BACK,
     FRONT,

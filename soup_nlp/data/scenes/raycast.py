@@ -14,8 +14,7 @@ import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap, Image, Int
 from soup_nlp.data.pair import Pair, Truth
-from soup_nlp.data.scenes.shapes import NEAR, Shape
-from soup_nlp.data.scenes.texture import Texture
+from soup_nlp.data.scenes.surfaces import NEAR, Shape, Texture
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera
 
@@ -99,12 +98,9 @@ class Scene:
         return out
 
     def advanced(self, steps: int) -> "Scene":
-        """The scene `steps` frames later; camera and bodies repeat their motion of one frame.
-
-        Raises:
-            DataError: a body bends; bending is defined for the first two frames only.
-        """
+        """The scene `steps` frames later; camera and bodies repeat their motion of one frame."""
         if steps and any(body.bends for body in self.bodies):
+            # bending is defined between two shapes
             what = "a scene that bends has two frames"
             raise DataError(what, found=f"frame {steps}", expected="0")
         go_on = self.next_from_scene @ inverse(self.ref_from_scene)
@@ -118,10 +114,9 @@ class Scene:
 
 
 class Frame:
-    """A scene in the camera of a frame, 0 for the reference and 1 for the next.
+    """Parts of a scene, body by body, in the camera of a frame: 0 the reference, 1 the next.
 
-    Parts are listed body by body, with shapes and poses (P, 4, 4) camera_from_part in the frame and
-    the component label `body` (P,).
+    `poses` (P, 4, 4) are camera_from_part, `body` (P,) the component labels.
     """
 
     def __init__(self, scene: Scene, K: Float, frame: int) -> None:

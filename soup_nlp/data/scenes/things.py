@@ -7,8 +7,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from soup_nlp.data.scenes.raycast import Part, inverse
-from soup_nlp.data.scenes.shapes import Box, Ellipsoid, Float, Plane, Shape
-from soup_nlp.data.scenes.texture import Colour, Panels, Texture
+from soup_nlp.data.scenes.surfaces import (
+    Box,
+    Colour,
+    Ellipsoid,
+    Float,
+    Panels,
+    Plane,
+    Shape,
+    Texture,
+)
 from soup_nlp.geometry import rotation
 
 ZERO = (0.0, 0.0, 0.0)
