@@ -16,7 +16,6 @@ from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import connected_labels, connected_pieces
 from soup_nlp.start.epipolar import Motion, essential_motion, refine_near
@@ -151,33 +150,9 @@ def moving_pieces(flow: FlowFit) -> Int:
     return np.where(still, 0, 1 + connected_labels(continuous, flow.seg))
 
 
-ABOVE_NOISE, LEAST_JUMP = 10.0, 0.25
-"""Least jump of a flow discontinuity: multiple of the median jump between neighbours (which noise
-and bending cause), and share of `discontinuity_px`."""
 LEAST_SHARE = 0.06
 """Least share of the superpixels that makes a surface: a smaller one joins a neighbour, because a
 few superpixels with a wrong flow look like a bending one."""
-
-
-def surfaces(flow: FlowFit) -> Int:
-    """(N,) index of the surface of every superpixel; flow discontinuities separate them.
-
-    The size of the jumps varies along an outline, and one small jump would join both sides.
-    Surfaces are therefore first separated along smaller jumps. Two of them are joined again if the
-    flow is continuous along most of their common outline, longest outline first.
-    """
-    jump, most, seg = flow.jump, flow.options.discontinuity_px, flow.seg
-    usual = float(np.median(jump)) if len(jump) else 0.0
-    least = np.clip(ABOVE_NOISE * usual, LEAST_JUMP * most, most)
-    surface = connected_labels(jump < least, seg)
-    length = seg.boundary_length.astype(float)
-    while True:
-        ends, total, whole = _along_outlines(surface, seg, length, length * (jump < most))
-        length_of = np.where(whole > 0.5 * total, total, 0.0)
-        if not length_of.any():
-            return surface
-        a, b = ends[np.argmax(length_of)]
-        surface = np.where(surface == b, a, surface)
 
 
 def joined(flow: FlowFit, surface: Int) -> Int:
@@ -185,25 +160,20 @@ def joined(flow: FlowFit, surface: Int) -> Int:
 
     The smallest joins the neighbour with the longest common outline, until each has `LEAST_SHARE`.
     """
-    length = flow.seg.boundary_length.astype(float)
+    seg, count = flow.seg, len(surface)
     while True:
-        ends, total = _along_outlines(surface, flow.seg, length)
-        count = np.bincount(surface, flow.views.usable)
-        small = np.unique(ends[count[ends] < LEAST_SHARE * len(surface)])
+        ends = np.sort(surface[seg.pairs], axis=1)
+        across = ends[:, 0] != ends[:, 1]
+        key, outline = np.unique(ends[across] @ [count, 1], return_inverse=True)
+        length = np.bincount(outline, seg.boundary_length[across].astype(float), len(key))
+        ends = np.stack(np.divmod(key, count), axis=1)
+        size = np.bincount(surface, flow.views.usable)
+        small = np.unique(ends[size[ends] < LEAST_SHARE * count])
         if not len(small):
             return surface
-        c = small[np.argmin(count[small])]
-        a, b = ends[np.argmax(np.where((ends == c).any(axis=1), total, 0.0))]
+        c = small[np.argmin(size[small])]
+        a, b = ends[np.argmax(np.where((ends == c).any(axis=1), length, 0.0))]
         surface = np.where(surface == c, a + b - c, surface)
-
-
-def _along_outlines(label: Int, seg: Segmentation, *values: Float) -> tuple[Int | Float, ...]:
-    """(Q, 2) labels that touch, in order, and (Q,) the sums of values (P,) along their outlines."""
-    ends = np.sort(label[seg.pairs], axis=1)
-    across = ends[:, 0] != ends[:, 1]
-    key, which = np.unique(ends[across] @ [len(seg), 1], return_inverse=True)
-    sums = (np.bincount(which, v[across], len(key)) for v in values)
-    return np.stack(np.divmod(key, len(seg)), axis=1), *sums
 
 
 def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float]:

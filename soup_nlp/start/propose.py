@@ -12,7 +12,6 @@ from soup_nlp.start.bending import (
     constant_depth,
     moving_pieces,
     surface_motions,
-    surfaces,
     torn,
     turn_alone,
 )
@@ -143,7 +142,7 @@ def propose(flow: FlowFit) -> Start:
         return Start.whole(views, soup, error, borrowed, limited_noise(error))
     fixed, shift = fixed_to_camera(flow)
     flow = flow.without(fixed)
-    surface = surfaces(flow)
+    surface = connected_labels(flow.jump < o.discontinuity_px, seg)
     motions, bends = surface_motions(flow, surface)
     bends &= o.bending
     jumping = torn(flow, surface, bends)
@@ -159,8 +158,6 @@ def propose(flow: FlowFit) -> Start:
         start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
         start = replace(start, surface=surface, bends=every, unexplained=jumping)
         return start if turn is None else replace(start, at_rest=True, part=parts_at_rest(flow))
-    if not bends.any():
-        surface = connected_labels(flow.jump < o.discontinuity_px, seg)
     choice = settle(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
     soup, weak = _with_depth(rigid, choice, wrong)

@@ -83,23 +83,7 @@ def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
     return x, tie
 
 
-def supported(flow: FlowFit, label: Int) -> Float:
-    """(C,) share of the lower end of every component (N,) where what it stands on is visible.
-
-    It is not where the lower image border cuts the component off, nor beside superpixels without
-    usable flow, which may belong to it.
-    """
-    around, count = outlines(label, flow.seg), int(label.max()) + 1
-    usable = flow.views.usable[around.neighbour]
-    seen, hidden = (
-        np.bincount(around.component[at], around.contact[at], count)
-        for at in (around.below & usable, around.below & ~usable)
-    )
-    cut_off = np.bincount(label[flow.seg.labels[-1]], minlength=count)
-    return np.asarray(seen / np.maximum(seen + hidden + cut_off, 1.0))
-
-
-def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask, support: Float) -> list[Rows]:
+def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> list[Rows]:
     """Rows of contact between components (N,); none stands on one that is fixed (N,)."""
     seg = flow.seg
     across = seg.across(label)
@@ -113,18 +97,17 @@ def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask, support: Float) 
         mine &= (around.component != SCENE) & ~fixed[around.neighbour]
         a, b, length = around.component[mine], around.other[mine], around.contact[mine]
         weight = length / np.bincount(a, length, count)[a]
-        weight = weight * (BELOW_WEIGHT * support[a] if below else 1.0)
+        weight = weight * (BELOW_WEIGHT if below else 1.0)
         share, tie = (STANDS, "contact below") if below else (HIDES, "outline")
         out.append(rows(a, b, ratio[mine], weight * (1 - share), weight * share, tie))
     return out
 
 
-def pace(flow: FlowFit, soup: Soup, label: Int, support: Float) -> Rows:
+def pace(flow: FlowFit, soup: Soup, label: Int) -> Rows:
     """Rows of the displacement of components (N,)."""
     far = log_pace(displacement(soup, flow.views.anchor, label), label)
     c = np.flatnonzero((np.abs(far) < UNKNOWN) & (np.arange(len(far)) != SCENE))
-    usual = FREE * support[c]
-    return rows(c, np.array(SCENE), usual - far[c], FASTER, SLOWER, "too fast")
+    return rows(c, np.array(SCENE), FREE - far[c], FASTER, SLOWER, "too fast")
 
 
 def above(flow: FlowFit, soup: Soup, label: Int, floor: Float) -> Rows:
@@ -142,9 +125,8 @@ def scaled(flow: FlowFit, soup: Soup, label: Int, fixed: Mask, floor: Float) -> 
     count = int(label.max()) + 1
     if count == 1 or not len(flow.seg.pairs):
         return np.ones(len(soup)), np.full(len(soup), TIES.index("reference"))
-    support = supported(flow, label)
-    parts = contact(flow, soup, label, fixed, support)
-    parts += [pace(flow, soup, label, support), above(flow, soup, label, floor)]
+    parts = contact(flow, soup, label, fixed)
+    parts += [pace(flow, soup, label), above(flow, soup, label, floor)]
     x, tie = minimum(count, parts, np.array([SCENE]))
     tie = np.where(fixed, FIXED, tie[label])
     return np.exp(x)[label], tie

@@ -17,7 +17,6 @@ from soup_nlp.config.problem import Problem, load_problem, make_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluation.metrics import UNSCALED, depth_metrics
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.energy_options import BENDING_ARAP
 from soup_nlp.pipeline.case import build_energy, prepare, solver_options
@@ -31,10 +30,10 @@ from soup_nlp.start.bending import (
     constant_depth,
     fit_turn,
     joined,
-    surfaces,
     torn,
     turn_alone,
 )
+from soup_nlp.start.components import connected_labels
 from soup_nlp.start.labelling import LEAST_NOISE, dominant, labelled
 from soup_nlp.start.views import FlowFit
 
@@ -114,16 +113,11 @@ def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least,
     assert least <= start.bends.mean() <= most
 
 
-@pytest.mark.parametrize(
-    ("seed", "least"),
-    # without cuts at smaller jumps the whole image would bend with 1; the outline of 3 has no
-    # discontinuity: a compromise motion has more inliers than that of the room
-    [(1, 0.3), (3, 0.25)],
-)
-def test_a_rigid_room_does_not_bend_with_its_banner(seed, least):
-    banner = problem("banner", f"input.seed={seed}")
+def test_a_rigid_room_does_not_bend_with_its_banner():
+    """The outline has no discontinuity: a compromise motion has more inliers than the room's."""
+    banner = problem("banner", "input.seed=3")
     start = prepare(banner, pair=banner.load_pair()).start
-    assert least < start.bends.mean() < 0.4
+    assert 0.25 < start.bends.mean() < 0.4
 
 
 def test_a_bending_region_whose_flow_jumps_is_torn():
@@ -236,7 +230,7 @@ def test_depth_that_explains_the_flow_is_no_turn():
     # without jumps, with a noise of 0.02 px
     residual = np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c)))
     flow = fit(c)._replace(jump=np.zeros(len(c.segmentation.pairs)), residual=residual)
-    choice = labelled(flow, dominant(flow), surfaces(flow))
+    choice = labelled(flow, dominant(flow), connected_labels(flow.jump < 1, flow.seg))
     assert flow.views.usable.all()
     assert turn_alone(flow, choice) is None
     # the same flow with the depths taken out of it
@@ -248,7 +242,7 @@ def test_depth_that_explains_the_flow_is_no_turn():
 def test_depth_within_three_noises_of_the_flow_is_not_seen():
     c = case("orbit")
     flow = fit(c)
-    choice = labelled(flow, dominant(flow), surfaces(flow))
+    choice = labelled(flow, dominant(flow), connected_labels(flow.jump < 1, flow.seg))
     choice = replace(choice, label=np.zeros(len(c), int), excess=0)
     error = float(np.quantile(fit_turn(flow.views, ANY_TURN)[1], AT_REST))
     assert error > 320 / 512  # 1 px at 512 columns
@@ -263,7 +257,7 @@ def test_a_stabilised_turn_is_a_turn():
     """The next image is moved back by stabilisation; the rotation is that of the plain turn."""
     c = case("orbit")
     flow = fit(c)._replace(residual=np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c))))
-    choice = labelled(flow, dominant(flow), surfaces(flow))
+    choice = labelled(flow, dominant(flow), connected_labels(flow.jump < 1, flow.seg))
     target = flow.views.ray @ rotation.exp(np.array([0.02, -0.2, 0.05])).T
     target = 1.03 * target / target[..., 2:] + np.array([0.2, 0.02, 0.0])
     target[..., 2] = 1.0
@@ -348,32 +342,3 @@ def test_bending_regions_are_reconstructed_and_every_claim_holds(
     for component, limit in most.items():
         true_depth = np.where(truth.components == component, truth.depth_ref, np.nan)
         assert 1e-4 < depth_metrics(z, true_depth, UNSCALED).mre < limit
-
-
-def jumps(seg: Segmentation, column: float, size: np.ndarray, noise: float) -> np.ndarray:
-    """(P,) jump of `size` (rows,) between columns before and after `column`, else noise."""
-    i, k = seg.pairs.T
-    x, row = seg.anchors[:, 0] > column, (seg.anchors[:, 1] > 8).astype(int)
-    return np.where(x[i] != x[k], size[row[i]], noise)
-
-
-def test_a_gap_in_a_discontinuity_does_not_join_two_surfaces():
-    seg = squares(2, 10)
-    left = seg.anchors[:, 0] < 40
-    surface = surfaces(flow_of(seg, jumps(seg, 40, np.array([2.0, 0.6]), 0.01)))
-    # one of two rows jumps by more than 1 px: half of the outline is a discontinuity
-    np.testing.assert_array_equal(surface == surface[0], left)
-    whole = surfaces(flow_of(seg, jumps(seg, 40, np.array([0.9, 0.6]), 0.01)))
-    assert (whole == whole[0]).all()
-
-
-def test_noise_does_not_cut_a_surface():
-    seg = squares(2, 10)
-    rng = np.random.default_rng(0)
-    jump = np.where(rng.random(len(seg.pairs)) < 0.3, 0.9, 0.4)
-    whole = surfaces(flow_of(seg, jump))
-    assert (whole == whole[0]).all()
-    # and it does not hide a discontinuity
-    jump = np.maximum(jump, jumps(seg, 40, np.array([3.0, 2.0]), 0.0))
-    surface = surfaces(flow_of(seg, jump))
-    np.testing.assert_array_equal(surface == surface[0], seg.anchors[:, 0] < 40)

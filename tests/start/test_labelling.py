@@ -11,7 +11,7 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start import labelling
-from soup_nlp.start.bending import surfaces
+from soup_nlp.start.components import connected_labels
 from soup_nlp.start.continuation import belonging, continued, harmonic, likeness
 from soup_nlp.start.epipolar import SIDEWAYS, Motion
 from soup_nlp.start.labelling import (
@@ -46,7 +46,7 @@ def test_every_region_gets_one_motion(world, given):
     _, flow, component, (room, wedge) = world
     several = [turned(wedge, 0.4, 0), turned(wedge, -0.4, 1), turned(wedge, 0.4, 2)]
     motions = {"none": [SIDEWAYS], "room": [room], "three of the wedge": [room, *several]}[given]
-    found = labelled(flow, motions, surfaces(flow))
+    found = labelled(flow, motions, connected_labels(flow.jump < 1, flow.seg))
     assert len(found.motions) == 2
     first = int(np.bincount(component[found.label == 0]).argmax())
     assert (found.label == (component != first)).mean() > 0.95
@@ -126,7 +126,7 @@ def test_what_is_not_seen_has_no_motion_of_its_own(world):
     uv = pair.flow.uv + np.where(np.isin(seg.labels, hidden)[..., None], 7.0, 0.0)
     confidence = np.where(np.isin(seg.labels, hidden), 0.0, 1.0)
     blind = fitted(pair.with_flow(Flow(uv.astype(np.float32), confidence, "test")), seg)
-    found = labelled(blind, [room, wedge], surfaces(blind))
+    found = labelled(blind, [room, wedge], connected_labels(blind.jump < 1, blind.seg))
     assert len(found.motions) == 2
     assert len(np.unique(found.label[inner])) == 1
     start = propose(blind)

@@ -4,7 +4,6 @@ A coarse-to-fine search loses large displacements with a change of scale, such a
 ground near a driving camera. The dominant homographies of a first flow explain most of such a
 motion. The flow is therefore computed again on images that a homography aligns: the remaining
 displacements are small. The new flow is used where its round trip closes better than the first one.
-What still has no flow may be small surfaces that move far (`soup_nlp.data.flow.tiles`).
 """
 
 from collections.abc import Callable
@@ -14,7 +13,6 @@ import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.flow.consistency import confidence_of, round_trip_error, sampled
-from soup_nlp.data.flow.tiles import with_tiles
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
@@ -142,8 +140,7 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
 
     The flow is computed in both directions, and again after each of the dominant homographies
     (`PLANES`) has aligned the images. The better one is used for each pixel (`guided_flow`), since
-    displacements near a driving camera are too large for a coarse-to-fine search alone. Small
-    surfaces that move far are searched for by their tiles (`with_tiles`).
+    displacements near a driving camera are too large for a coarse-to-fine search alone.
 
     The confidence follows from the round-trip error (`confidence_of`). A wrong but consistent flow,
     as on weak texture, keeps its confidence. An image without contrast (standard deviation below
@@ -190,6 +187,5 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
         return dis.calc(a, b, None)[:h1, :w1], dis.calc(b, a, None)[:h2, :w2]
 
     uv, gap = guided_flow(ref, nxt, match, *match(ref, nxt))
-    uv, gap = with_tiles(ref, nxt, match, uv, gap)
     confidence = confidence_of(gap) if consistency else np.isfinite(gap)
     return Flow(np.ascontiguousarray(uv), confidence.astype(np.float32), "dis")
