@@ -18,7 +18,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import connected_labels, connected_pieces
-from soup_nlp.start.epipolar import Motion, essential_motion, refine_near
+from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.labelling import Labelling, candidates, dominant
 from soup_nlp.start.views import FlowFit, Views
 
@@ -36,8 +36,7 @@ a share of the longer side of a small image."""
 STEP, NEAREST = 1e-5, 1e-3
 """Step by which matrices of motions are differentiated, and least depth of a moved point."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
-"""Pixels of a fit of a rotation or of the least median error, and the least scale of the latter's
-refinement, pixels."""
+"""Pixels of the fit of a turn, and the least scale of the refinement of a motion, pixels."""
 
 
 def reference_noise(residual: Float) -> float:
@@ -233,11 +232,10 @@ TELLS = 7.0
 NOISES, SYSTEMATIC, LEAST_PX, MOST_PX = 2.5, 4.0, 0.01, 0.08
 """Median excess of the error, in units of the noise, from which a surface may bend; below
 `SYSTEMATIC` noises, within these limits in pixels, it never does."""
-LEAST_LEFT = 15
-"""Least number of superpixels of a piece split from a rigid surface: large ones mix flows."""
-SURELY = 0.5
-"""Share of the limit of a bending surface's excess up to which a motion surely explains a surface,
-so that pieces it does not explain are no errors of the flow."""
+LEAST_LEFT, SURELY = 15, 0.5
+"""Least number of superpixels of a piece split from a rigid surface (large ones mix flows), and
+share of the limit of a bending surface's excess up to which a motion surely explains a surface, so
+that pieces it does not explain are no errors of the flow."""
 
 
 def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
@@ -246,10 +244,8 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     A surface bends if the best rigid motion leaves a median excess over the residual of affine
     flows that noise does not explain, or from which depth, which explains what a turn alone does
     not, stands out less than `TELLS` times: an error shared along the epipolar lines would then
-    cause much of the relief.
-    Pieces that the best motion does not explain are surfaces of their own if they have
-    `LEAST_SHARE`, and `LEAST_LEFT` superpixels: where the flow jumps little along its outline, a
-    bending surface is joined to its surroundings.
+    cause much of the relief. Large pieces that the best motion does not explain are surfaces of
+    their own: where the flow jumps little, a bending surface is joined to its surroundings.
 
     Returns:
         The motions that many pixels share and those of the surfaces, and (N,) True where the
@@ -262,36 +258,27 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     whole = ~seg.across(surface)
     surface = joined(flow, surface)
     bends = np.zeros(len(seg), bool)
-    left = [np.flatnonzero(surface == c) for c in np.unique(surface[usable])]
+    left = [surface == c for c in np.unique(surface[usable])]
     while left:
         members = left.pop()
-        at = members[usable[members]]
+        at = np.flatnonzero(members & usable)
         present = [motions[c] for c in np.unique(label[at])]
         tried = candidates(flow, at, motions[0], present, max(noise, LEAST_SCALE))
-        # RANSAC has an inlier distance, within which a compromise with the bending part has more
-        # inliers than the motion of the least median error
-        matches, median = views.subset(at).matches(FIT_PIXELS), []
-        if (motion := essential_motion(matches, None, flow.options.seed)) is not None:
-            median = [refine_near(motion, matches, max(noise, LEAST_SCALE))]
-        excess = views.subset(at).fit(tried + median).cost - flow.residual[at, None]
+        excess = views.subset(at).fit(tried).cost - flow.residual[at, None]
         middle = np.median(excess, axis=0)
         gain = np.median(fit_turn(views.subset(at), ANY_TURN)[1] - flow.residual[at])
         least = np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX)
         most = max(float(least), min(gain / TELLS, NOISES * noise))
-        # where many motions explain half of a surface badly, the one of least median is chance
-        chance = (np.arange(len(middle)) >= len(tried)) & (middle > SURELY * most)
-        best = int(np.argmin(np.where(chance, np.inf, middle)))
+        best = int(np.argmin(middle))
         if middle[best] > most:
-            bends[members] = True
+            bends |= members
             continue
-        motions.append((tried + median)[best])
-        if middle[best] > SURELY * most:
-            continue
-        # large pieces that the motion does not explain are surfaces of their own
-        unexplained = np.zeros(len(seg), bool)
-        unexplained[at[excess[:, best] > most]] = True
-        piece = connected_pieces(unexplained, seg, whole)
-        sizes = np.bincount(piece[unexplained], minlength=1)
-        large = np.flatnonzero(sizes >= max(LEAST_SHARE * len(seg), LEAST_LEFT))
-        left += [np.flatnonzero(piece == c) for c in large]
+        motions.append(tried[best])
+        if middle[best] <= SURELY * most:
+            unexplained = np.zeros(len(seg), bool)
+            unexplained[at[excess[:, best] > most]] = True
+            piece = connected_pieces(unexplained, seg, whole)
+            size = np.bincount(piece[unexplained], minlength=1)
+            large = np.flatnonzero(size >= max(LEAST_SHARE * len(seg), LEAST_LEFT))
+            left += [piece == c for c in large]
     return motions, bends
