@@ -134,11 +134,7 @@ RECORDS = Path(__file__).with_name("records")
 
 
 def load_frozen(scene: str, size: int) -> Frozen:
-    """The record of a scene and size.
-
-    Raises:
-        DataError: there is no such record.
-    """
+    """The record of a scene and size, see `read_frozen`."""
     return read_frozen(RECORDS / f"{scene}-{size}.npz")
 
 

@@ -5,7 +5,7 @@ results are records (`frozen`). The rest is rendering and arithmetic, whose last
 depend on the processor. Every number of the NLP is therefore rounded to 20 significant bits.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import product
@@ -116,19 +116,13 @@ def select(
     Raises:
         ConfigError: one of them is not part of the family.
     """
-    known = {
-        "--sizes": (sizes, SIZES),
-        "--scenes": (scenes, SCENES),
-        "--starts": (starts, STARTS),
-    }
-    for where, (asked, members) in known.items():
-        wrong = [str(a) for a in asked if a not in members]
+    known = {"sizes": (sizes, SIZES), "scenes": (scenes, SCENES), "starts": (starts, STARTS)}
+    for name, (asked, members) in known.items():
+        wrong = ", ".join(str(a) for a in asked if a not in members)
         if wrong or not len(asked):
+            found, expected = wrong or "nothing", ", ".join(map(str, members))
             raise ConfigError(
-                "not of the family",
-                where=where,
-                found=", ".join(wrong) or "nothing",
-                expected=", ".join(map(str, members)),
+                "not of the family", where=f"--{name}", found=found, expected=expected
             )
     labels = {}
     for form in forms:
@@ -144,12 +138,7 @@ def select(
 
 
 def case_of(record: Frozen, pair: Pair | None = None) -> Case:
-    """The case of a record, with rendered pair, graphs and weights.
-
-    Args:
-        record: Record of a scene and size.
-        pair: Pair of the scene, if it was rendered before.
-    """
+    """The case of a record, with graphs and weights; its pair may have been rendered before."""
     problem = record.problem
     pair = pair or problem.load_pair()
     pair = pair.with_flow(problem.flow.load(pair, problem.path))
@@ -200,11 +189,8 @@ def build_instance(
 ) -> tuple[NLP, Layout, Formulation]:
     """The NLP of a formulation at a start, its layout and its formulation.
 
-    Args:
-        case: Case of the record.
-        record: The record.
-        formulation: gauge/norm.
-        start: One of STARTS; "best" is the best known point without rounding.
+    The formulation is gauge/norm, the start one of STARTS, or "best": the best known point without
+    rounding.
     """
     form = case.formulation(**parse_formulation(formulation), hessian="exact")
     assert form_label(form) == formulation
@@ -253,15 +239,7 @@ def constant_depth(data: EnergyData) -> Soup:
     target = np.add.reduce(data.pixel_target, axis=1) / data.pixel_target.shape[1]
     source = np.add.reduce(data.pixel_ray, axis=1) / data.pixel_ray.shape[1]
     K = data.K_next
-    focal, centre = np.array([K[0, 0], K[1, 1]]), np.array([K[0, 2], K[1, 2]])
     shift = np.zeros((n, 3))
-    shift[:, :2] = (target - centre) / focal - source[:, :2]
-    ones = np.ones(n)
-    normal = np.tile([0.0, 0.0, -1.0], (n, 1))
-    return Soup(ones, normal, ones, np.tile(np.eye(3), (n, 1, 1)), shift)
-
-
-def problems(chosen: Sequence[Instance]) -> Iterator[tuple[str, int, list[Instance]]]:
-    """Scene, size and their instances, which share a record."""
-    for scene, size in dict.fromkeys((i.scene, i.size) for i in chosen):
-        yield scene, size, [i for i in chosen if (i.scene, i.size) == (scene, size)]
+    shift[:, :2] = (target - K[:2, 2]) / np.diag(K)[:2] - source[:, :2]
+    normal, still = np.tile([0.0, 0.0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
+    return Soup(np.ones(n), normal, np.ones(n), still, shift)

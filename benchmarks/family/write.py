@@ -1,23 +1,19 @@
 """Writing of the family: .nl files, best known points, index, README; answers of solvers."""
 
 import json
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from typing_extensions import TypedDict
 
-from benchmarks.family.frozen import RECORDS, Frozen, load_frozen
-from benchmarks.family.instances import (
-    VERSION,
-    Instance,
-    build_instance,
-    case_of,
-    parse_name,
-    problems,
-)
+from benchmarks.family.frozen import RECORDS, load_frozen
+from benchmarks.family.instances import VERSION, Instance, build_instance, case_of, parse_name
+from benchmarks.table import markdown
 from soup_nlp import Pair, __version__
 from soup_nlp.errors import DataError
 from soup_nlp.export.compare import Labelled, make_task
@@ -65,7 +61,10 @@ def write_family(
     def rendered(scene: str) -> Pair:
         return load_frozen(scene, chosen[0].size).problem.load_pair()
 
-    for scene, size, members in problems(chosen):
+    members_of = defaultdict(list)
+    for instance in chosen:
+        members_of[instance.scene, instance.size].append(instance)
+    for (scene, size), members in members_of.items():
         record = load_frozen(scene, size)
         case = case_of(record, rendered(scene))
         for instance in members:
@@ -130,32 +129,24 @@ def readme(entries: Sequence[Entry]) -> str:
     """README of the folder, for the entries of its index."""
     scenes = ", ".join(dict.fromkeys(e["scene"] for e in entries))
     sizes = ", ".join(str(n) for n in sorted({e["size"] for e in entries}))
-    head = (
-        (RECORDS / "README.md")
-        .read_text(encoding="utf-8")
-        .format(scenes=scenes, sizes=sizes, package=__version__, version=VERSION)
-    )
-    columns = (
-        "file",
-        "n",
-        "m",
-        "Jacobian",
-        "Hessian",
-        "start",
-        "best known",
-        "reached by",
-        "SHA-256",
-    )
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    for e in entries:
-        best = e["best_known"]
-        sizes_of = "variables", "constraints", "jacobian_nonzeros", "hessian_nonzeros"
-        cells = [e["file"], *(str(e[k]) for k in sizes_of)]
-        cells += [f"{e['objective_at_start']:.6g}", f"{best['objective']:.8g}"]
-        cells += [f"{len(best.get('reached_by', []))} of {len(best.get('tried_by', []))} solvers"]
-        lines.append("| " + " | ".join([*cells, f"{e['sha256'][:16]}..."]) + " |")
-    note = "Nonzeros of the Hessian are of its upper triangle."
-    return "\n".join([head, *lines, "", note]) + "\n"
+    head = (RECORDS / "README.md").read_text(encoding="utf-8")
+    head = head.format(scenes=scenes, sizes=sizes, package=__version__, version=VERSION)
+    rows = [
+        {
+            "file": e["file"],
+            **{"n": e["variables"], "m": e["constraints"]},
+            **{"Jacobian": e["jacobian_nonzeros"], "Hessian": e["hessian_nonzeros"]},
+            "start": f"{e['objective_at_start']:.6g}",
+            "best known": f"{e['best_known']['objective']:.8g}",
+            "reached by": "{} of {} solvers".format(
+                *(len(e["best_known"].get(k, [])) for k in ("reached_by", "tried_by"))
+            ),
+            "SHA-256": f"{e['sha256'][:16]}...",
+        }
+        for e in entries
+    ]
+    table = markdown(pd.DataFrame(rows).set_index("file"))
+    return f"{head}\n{table}\n\nNonzeros of the Hessian are of its upper triangle.\n"
 
 
 # --- answers of solvers --------------------------------------------------------------------------
@@ -191,17 +182,17 @@ def check_sol(path: Path) -> tuple[str, bool]:
     return text, r.optimal
 
 
-class BestKnown(TypedDict):
-    """Lowest objective that was found."""
+class Objective(TypedDict):
+    """A point of an instance."""
 
     objective: float
 
 
 class Indexed(TypedDict):
-    """An instance."""
+    """An instance, as it is read back."""
 
     name: str
-    best_known: BestKnown
+    best_known: Objective
 
 
 class Index(TypedDict):
@@ -217,17 +208,16 @@ def family_tasks(folder: Path) -> Iterator[Labelled]:
         DataError: the index cannot be read.
     """
     entries = read_json(folder / INDEX, "index of the family", Index)["instances"]
-    best = {e["name"]: e["best_known"]["objective"] for e in entries}
-    for name, objective in best.items():
-        instance = parse_name(name)
+    for entry in entries:
+        instance = parse_name(entry["name"])
         label = {
             "problem": f"{instance.scene} {instance.start}",
             "identity": VERSION,
             "superpixels": instance.size,
             "formulation": instance.formulation,
             "start": instance.start,
-            "name": name,
-            "best_known": objective,
+            "name": entry["name"],
+            "best_known": entry["best_known"]["objective"],
             "energy_limit": 1e300,
         }
         yield label, partial(_task, instance)
@@ -236,5 +226,5 @@ def family_tasks(folder: Path) -> Iterator[Labelled]:
 def _task(instance: Instance, limits: Limits) -> Task:
     record = load_frozen(instance.scene, instance.size)
     case = case_of(record)
-    parts: tuple[Frozen, str, str] = record, instance.formulation, instance.start
-    return make_task(case, lambda: build_instance(case, *parts), limits)
+    parts = case, record, instance.formulation, instance.start
+    return make_task(case, lambda: build_instance(*parts), limits)
