@@ -147,9 +147,9 @@ def speed(
 
     The refinement is left out; --set refine.enabled=true measures whole solves.
     """
-    items = speeds.timed_pairs(listed(scenes), numbers(seeds), numbers(widths))
+    pairs = listed(scenes), numbers(seeds), numbers(widths)
     sizes = numbers(superpixels), numbers(neighbours)
-    cells, page = speeds.speed_cells(items, *sizes, overrides or []), out / f"{name}.md"
+    cells, page = speeds.speed_cells(*pairs, *sizes, overrides or []), out / f"{name}.md"
     frame = measure(cells, speeds.measure_speed, page.with_suffix(".jsonl"), fresh=True)
     return finish(page, frame, speeds.speed_page(frame))
 

@@ -39,11 +39,7 @@ RIGHT, WRONG = 0.10, 0.20
 
 
 def measure_pair(cell: Cell) -> Row:
-    """Solve and score one pair.
-
-    Raises:
-        SoupError: the pair cannot be solved, or has no true depth.
-    """
+    """Solve and score one pair, see `solved`."""
     return scores(solved(cell))
 
 

@@ -25,11 +25,7 @@ FACTORS = {**SHARES, "drawn": DRAWN, "prior": PRIOR}
 
 
 def measure_terms(cell: Cell) -> Row:
-    """Errors of log depth after the median scale, and terms of sigma, at pixels of one pair.
-
-    Raises:
-        SoupError: the pair cannot be solved, or has no true depth.
-    """
+    """Errors of log depth after the median scale, and terms of sigma, at pixels of one pair."""
     run = solved(cell)
     truth, sure = run.pair.truth, run.confidence
     assert truth is not None
@@ -60,13 +56,13 @@ def loss(error: Float, sigma: Float) -> float:
     return float(np.mean(np.where(q < HEAVY, q**2 / 2, HEAVY * q - HEAVY**2 / 2) + np.log(sigma)))
 
 
-Pairs = Mapping[str, list[tuple[Float, dict[str, Float]]]]
+Pairs = dict[str, list[tuple[Float, dict[str, Float]]]]
 """Errors and terms of the pairs of every family."""
 
 
-def pairs_of(frame: pd.DataFrame) -> dict[str, list[tuple[Float, dict[str, Float]]]]:
+def pairs_of(frame: pd.DataFrame) -> Pairs:
     """Errors and terms of the rows that were measured, by family."""
-    out: dict[str, list[tuple[Float, dict[str, Float]]]] = {}
+    out: Pairs = {}
     for _, row in frame[frame["ok"].eq(True)].iterrows():
         terms = {name: np.array(row[f"terms.{name}"]) for name in (*SHARES, "drawn")}
         out.setdefault(row["family"], []).append((np.array(row["error"]), terms))
@@ -75,9 +71,8 @@ def pairs_of(frame: pd.DataFrame) -> dict[str, list[tuple[Float, dict[str, Float
 
 def mean_loss(pairs: Pairs, factor: Mapping[str, float]) -> float:
     """Mean over families of the mean over their pairs."""
-    return float(
-        np.mean([np.mean([loss(e, sigma_of(t, factor)) for e, t in p]) for p in pairs.values()])
-    )
+    means = [np.mean([loss(e, sigma_of(t, factor)) for e, t in p]) for p in pairs.values()]
+    return float(np.mean(means))
 
 
 def fitted(pairs: Pairs) -> dict[str, float]:
@@ -89,10 +84,8 @@ def fitted(pairs: Pairs) -> dict[str, float]:
         pull = PULL * float(np.sum((x - first) ** 2))
         return mean_loss(pairs, dict(zip(names, np.exp(x), strict=True))) + pull
 
-    options = {"maxiter": 4, "ftol": 1e-3, "xtol": 1e-2}
-    best = minimize(
-        value, first, method="Powell", bounds=[(-7.0, 3.0)] * len(first), options=options
-    )
+    bounds, options = [(-7.0, 3.0)] * len(first), {"maxiter": 4, "ftol": 1e-3, "xtol": 1e-2}
+    best = minimize(value, first, method="Powell", bounds=bounds, options=options)
     return dict(zip(names, np.exp(best.x).tolist(), strict=True))
 
 

@@ -13,7 +13,7 @@ import psutil
 
 from benchmarks.scores import scores
 from benchmarks.suites import MOTORCYCLE, Options, list_suite
-from benchmarks.table import Cell, Item, page_text, provenance, titled
+from benchmarks.table import Cell, page_text, provenance, titled
 from soup_nlp import run
 from soup_nlp.storage.each import Row, peak_bytes
 from soup_nlp.storage.versions import versions
@@ -40,28 +40,23 @@ NOTE = (
 )
 
 
-def timed_pairs(
+def speed_cells(
     scenes: Sequence[str],
     seeds: Sequence[int],
-    widths: Sequence[int] = (1024,),
-) -> list[Item]:
-    """Rendered scenes and the motorcycle, with DIS flow."""
-    sizes = [Options(("dis",), width, tuple(seeds)) for width in widths]
-    rendered = [i for size in sizes for i in list_suite("rendered", None, size)]
-    items = [i for i in rendered if i.family in scenes]
-    return items + [MOTORCYCLE] * (MOTORCYCLE.name in scenes)
-
-
-def speed_cells(
-    items: Sequence[Item],
+    widths: Sequence[int],
     sizes: Sequence[int],
     neighbours: Sequence[int],
     overrides: Sequence[str] = (),
 ) -> list[Cell]:
-    """Timed runs of pairs over N and K, small N first: the NLP without refinement.
+    """Timed runs of rendered scenes and the motorcycle with DIS flow: the NLP without refinement.
 
-    A rendered scene has its seed in the solve as well.
+    N = `sizes` and K = `neighbours` vary, small N first. A rendered scene has its seed in the solve
+    as well.
     """
+    options = [Options(("dis",), width, tuple(seeds)) for width in widths]
+    rendered = [item for each in options for item in list_suite("rendered", None, each)]
+    items = [i for i in rendered if i.family in scenes]
+    items += [MOTORCYCLE] * (MOTORCYCLE.name in scenes)
     cells = []
     for n, k, item in product(sorted(sizes), sorted(neighbours), items):
         sections = f"segmentation.superpixels={n}", f"segmentation.neighbours={k}"

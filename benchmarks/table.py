@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Overrides = tuple[str, ...]
+PATHS = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
+"""Keys of an input that name files."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +87,6 @@ class Cell:
             # the same for a pair in every folder
             "input": _hash(problem.input, PATHS),
         }
-
-
-PATHS = {"root", "path", "ref", "next", "depth", "depth_next", "intrinsics"}
-"""Keys of an input that name files."""
 
 
 def _hash(section: Any, exclude: set[str]) -> str:

@@ -4,13 +4,13 @@ import pytest
 from helpers_files import sets
 
 from benchmarks.__main__ import main
-from benchmarks.speed import speed_cells, speed_page, timed_pairs
+from benchmarks.speed import speed_cells, speed_page
 from benchmarks.table import Cell, frame_of
 from soup_nlp.storage.rows import read_rows
 
 
 def speed_cell(scene: str = "street", superpixels: int = 250, neighbours: int = 10) -> Cell:
-    return speed_cells(timed_pairs([scene], [0]), [superpixels], [neighbours])[0]
+    return speed_cells([scene], [0], [1024], [superpixels], [neighbours])[0]
 
 
 def made(scene: str = "street", superpixels: int = 250, neighbours: int = 10, **changes) -> dict:
@@ -34,8 +34,8 @@ def failed(reason: str) -> dict:
 
 
 def test_the_plan_has_every_run_once_small_ones_first():
-    items = timed_pairs(["street", "motorcycle"], [3, 4], [512])
-    cells = speed_cells(items, [500, 250], [20, 10], ["solver.tol=0.5"])
+    pairs = ["street", "motorcycle"], [3, 4], [512]
+    cells = speed_cells(*pairs, [500, 250], [20, 10], ["solver.tol=0.5"])
     assert len({c.identity()["key"] for c in cells}) == len(cells) == 2 * 2 * (2 + 1)
     problems = [c.item.problem(c.overrides) for c in cells]
     sizes = [p.segmentation.superpixels for p in problems]
