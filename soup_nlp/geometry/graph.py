@@ -155,19 +155,14 @@ def _fold(knn: Int) -> tuple[Int, Int]:
 def _shared_boundaries(
     labels: NDArray[np.int32], image: Image, samples: int | None
 ) -> tuple[Int, Float, Int, Float]:
-    width = labels.shape[1]
-    n = int(labels.max()) + 1
-    index = np.arange(labels.size).reshape(labels.shape)
-    first, second = [], []
-    for a, b in ((index[:, :-1], index[:, 1:]), (index[:-1], index[1:])):
-        differ = labels.ravel()[a] != labels.ravel()[b]
-        first.append(a[differ])
-        second.append(b[differ])
-    p, q = np.concatenate(first), np.concatenate(second)
-    i, k = labels.ravel()[p].astype(np.int64), labels.ravel()[q].astype(np.int64)
-    swap = i > k
-    p, q = np.where(swap, q, p), np.where(swap, p, q)
-    i, k = np.where(swap, k, i), np.where(swap, i, k)
+    width, n = labels.shape[1], int(labels.max()) + 1
+    of, index = labels.ravel().astype(np.int64), np.arange(labels.size).reshape(labels.shape)
+    beside = (index[:, :-1], index[:, 1:]), (index[:-1], index[1:])
+    ends = np.concatenate([np.stack([a.ravel(), b.ravel()]) for a, b in beside], axis=1)
+    ends = ends[:, of[ends[0]] != of[ends[1]]]
+    # the pixel of the lower superpixel first
+    p, q = np.where(of[ends[0]] < of[ends[1]], ends, ends[::-1])
+    i, k = of[p], of[q]
     key, which = np.unique(i * n + k, return_inverse=True)
     pairs = np.stack([key // n, key % n], axis=1)
     count = np.bincount(which)
@@ -201,7 +196,7 @@ def _sample_along(points: Float, which: Int, count: Int, samples: int | None) ->
     angle = 0.5 * np.arctan2(2 * sxy, sxx - syy)
     along = off[:, 0] * np.cos(angle)[which] + off[:, 1] * np.sin(angle)[which]
     order = np.lexsort((along, which))
-    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    start = np.cumsum(count) - count
     b = int(count.max(initial=1)) if samples is None else samples
     # midpoints of b equal parts: b = 1 is the middle, large b tends to the whole boundary
     fraction = (np.arange(b) + 0.5) / b
@@ -222,7 +217,7 @@ def _rim(labels: NDArray[np.int32], u: Float, v: Float, n: int) -> Float:
     """(N, RIM, 2) extreme pixels of every superpixel by direction."""
     order = np.argsort(labels.ravel(), kind="stable")
     count = np.bincount(labels.ravel(), minlength=n)
-    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    start = np.cumsum(count) - count
     owner, u, v = labels.ravel()[order], u[order], v[order]
     out = np.empty((n, RIM, 2))
     last = np.empty(n, np.int64)

@@ -134,7 +134,7 @@ def sample_pixels(
     order = usable[np.argsort(flat[usable] + rng.random(len(usable)))]
     count = np.bincount(flat[order], minlength=n)
     s = int(count.max(initial=1)) if samples is None else samples
-    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    start = np.cumsum(count) - count
     slot = np.arange(s)[None, :]
     filled = slot < count[:, None]
     if not len(order):

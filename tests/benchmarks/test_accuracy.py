@@ -1,6 +1,5 @@
 """Accuracy of pairs: contents of rows, scores of sigma, the page, comparison of two pages."""
 
-import json
 from dataclasses import replace
 
 import cv2
@@ -15,6 +14,7 @@ from benchmarks.table import Cell, Item, frame_of
 from soup_nlp import Pair, Truth
 from soup_nlp.errors import ConfigError
 from soup_nlp.storage.each import Row, attempt
+from soup_nlp.storage.rows import read_rows
 
 QUICK = (
     "segmentation.superpixels=20",
@@ -39,22 +39,6 @@ def row_of(item: Item, overrides: tuple[str, ...] = QUICK) -> Row:
 
 def text_of(*rows: Row) -> str:
     return suite_page("T", frame_of(rows))
-
-
-@pytest.mark.slow
-def test_a_row_has_every_number():
-    row = row_of(item())
-    assert row["ok"], row["error"]
-    json.dumps(row, allow_nan=False)
-    table = row["metrics"]
-    assert set(table) == set(METHODS)
-    assert table["constant"]["skill"] == 0.0
-    # one rigid motion with the true flow is exact on a scene of one component
-    assert table["rigid"]["mre"] < 1e-3
-    # the true flow has confidence everywhere
-    assert row["seen"] == {"share": 1.0, "mre": table["solution"]["mre"], "rest": None}
-    assert 0 <= row["sigma"]["within1"] <= row["sigma"]["within2"] <= 1
-    assert row["sigma"]["curve"][0][0] == 1.0
 
 
 def test_a_pair_that_cannot_be_measured_has_a_reason(tmp_path):
@@ -193,7 +177,7 @@ def test_two_pages_are_compared_by_family_and_half(tmp_path):
     assert main(["compare", str(tmp_path), str(tmp_path)]) == 2
 
 
-def test_command_line(tmp_path, capsys):
+def test_a_suite_is_measured_once_with_every_number(tmp_path, capsys):
     words = ["accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
     words += ["--width", "128", "--out", str(tmp_path)]
     words += [w for o in QUICK for w in ("--set", o)]
@@ -203,6 +187,16 @@ def test_command_line(tmp_path, capsys):
     assert listed == "suite rendered: 1 of 1 pairs found"
     assert measured.startswith("1/1  rendered/orbit-s0-128x54/truth  MRE 0.")
     assert (tmp_path / "rendered.md").read_text() in out.out
+    (row,) = read_rows(tmp_path / "rendered.jsonl")
+    found = row["metrics"]
+    assert set(found) == set(METHODS)
+    assert found["constant"]["skill"] == 0.0
+    # one rigid motion with the true flow is exact on a scene of one component
+    assert found["rigid"]["mre"] < 1e-3
+    # the true flow has confidence everywhere
+    assert row["seen"] == {"share": 1.0, "mre": found["solution"]["mre"], "rest": None}
+    assert 0 <= row["sigma"]["within1"] <= row["sigma"]["within2"] <= 1
+    assert row["sigma"]["curve"][0][0] == 1.0
     # nothing is measured twice
     before = (tmp_path / "rendered.jsonl").read_text()
     assert main(words) == 0

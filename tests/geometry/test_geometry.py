@@ -66,18 +66,11 @@ def test_exp_and_log_are_inverse_of_each_other(w, angle):
 
 @given(vectors)
 def test_cayley_rotates_by_twice_the_arc_tangent(w):
-    R = rotation.cayley(2 * w)
-    assert_rotations(R)
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", R, w), w, atol=1e-12)
-    cosine = (np.trace(R, axis1=1, axis2=2) - 1) / 2
-    expected = np.cos(2 * np.arctan(np.linalg.norm(w, axis=1)))
-    np.testing.assert_allclose(cosine, expected, atol=1e-12)
-
-
-def test_cayley_equals_exp_to_third_order():
-    w = np.array([0.3, -0.2, 0.5])
-    gap = [np.abs(rotation.cayley(h * w) - rotation.exp(h * w)).max() for h in (1e-1, 5e-2)]
-    assert gap[0] / gap[1] == pytest.approx(8.0, rel=0.05)
+    length = np.linalg.norm(w, axis=1, keepdims=True)
+    axis = w / np.where(length > 0, length, 1.0)
+    np.testing.assert_allclose(
+        rotation.cayley(2 * w), rotation.exp(2 * np.arctan(length) * axis), atol=1e-12
+    )
 
 
 @given(hnp.arrays(float, (4, 3, 3), elements=unit), hnp.arrays(float, (8, 3), elements=unit))

@@ -77,12 +77,11 @@ def random_edges(rng, n, count):
     return np.where(rng.random((len(pairs), 1)) < 0.5, pairs, pairs[:, ::-1])
 
 
-def ragged(rng, n, count, most=5, scale=1.0):
-    """Random problem with different label counts: unary list, edges, table list."""
+def ragged(rng, n, edges, most=5):
+    """Random costs of different label counts: unary list, the edges, table list."""
     counts = rng.integers(1, most + 1, n)
-    edges = random_edges(rng, n, count)
-    unary = [scale * rng.normal(size=k) for k in counts]
-    return unary, edges, [scale * rng.normal(size=(counts[a], counts[b])) for a, b in edges]
+    unary = [rng.normal(size=k) for k in counts]
+    return unary, edges, [rng.normal(size=(counts[a], counts[b])) for a, b in edges]
 
 
 def padded(unary, edges, tables):

@@ -29,7 +29,6 @@ from helpers_model import (
     UNITS,
     disturbed,
     form,
-    random_soup,
     tiny,
     weights_for,
     wiggle,
@@ -366,18 +365,3 @@ def test_the_raw_answer_of_a_default_solve_keeps_every_constraint(scene, gauge):
     found = violations(nlp, solution.stages[-1].x, case.data, f)
     assert max(found.values()) <= RAW, found
     assert solution.residuals["nlp_infeasibility"] <= RAW
-
-
-def test_a_random_soup_breaks_what_it_should():
-    """The measure itself: a violated kind is told by its size, the others stay at 0."""
-    problem = tiny("pixels")
-    nlp, layout = problem.nlp(PAPER, form())
-    soup = random_soup(7, 12)
-    x = layout.pack(replace(soup, n=1.1 * soup.n))
-    found = violations(nlp, x, problem.data, form())
-    assert found["normal"] == pytest.approx(0.21)
-    assert found["so3"] <= 1e-12
-    x = layout.pack(replace(soup, R=soup.R @ np.diag([1.0, 1.0, -1.0])))
-    found = violations(nlp, x, problem.data, form())
-    assert found["det"] == pytest.approx(2.0)
-    assert found["so3"] <= 1e-12
