@@ -109,16 +109,13 @@ class Builder:
         data: Float | None = None,
         total: bool = False,
     ) -> None:
-        """Add a constraint kernel of every superpixel with its table and rows.
+        """Add a constraint of every superpixel: kernel, table and rows.
 
         Args:
             name: Of the kernel; the rows are named without a prefix "t_".
-            x: (k,) symbols of the variables.
-            body: (r,) constraints.
-            index: (N, k) variables of every superpixel.
-            lower, upper: Bounds of every row.
-            row: (m,) symbols of the data, if there are any.
-            data: (N, m) data of every superpixel.
+            x: (k,) symbols of the variables, and `index` (N, k) the variables.
+            body: (r,) constraints between `lower` and `upper`.
+            row: (m,) symbols of the data, if there are any, and `data` (N, m) the numbers.
             total: Whether the superpixels add up to one row (r = 1).
         """
         size, count = len(index), body.numel()
@@ -131,11 +128,8 @@ class Builder:
         self.groups.append(Group(kernel, index, data, rows))
 
     def add_ridge(self, metric: Float) -> None:
-        """Zero objective whose majorant is ridge x metric on the diagonal.
-
-        Args:
-            metric: (n,) squared inverse length of a natural step of the first n variables.
-        """
+        """Zero objective whose majorant is ridge x metric on the diagonal: metric (n,) has squared
+        inverse lengths of natural steps of the first n variables."""
         x, m = ca.SX.sym("x"), ca.SX.sym("metric")
         kernel = Kernel("ridge", x, m, _SYMBOLS, objective=0 * x, curvature=_SYMBOLS[3] * m)
         index, none = np.arange(len(metric))[:, None], np.zeros((len(metric), 0), np.int64)

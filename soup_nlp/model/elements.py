@@ -39,13 +39,7 @@ class Norms(NamedTuple):
 
 @dataclass(frozen=True)
 class Element:
-    """One kind of element.
-
-    Attributes:
-        superpixels: (E, a) of every element.
-        columns: (E, ...) data by column.
-        norms: Makes the norms from the a views, a data row, eps and eps_pixel.
-    """
+    """One kind of element: its superpixels (E, a), data (E, ...) by column, and norms."""
 
     superpixels: Int
     columns: dict[str, Float]
@@ -93,16 +87,8 @@ def present(data: EnergyData) -> tuple[str, ...]:
 
 
 def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]:
-    """The terms as element kinds, with the columns that the layout's views need.
-
-    Args:
-        data: Pixels, graphs and weights of the pair.
-        w: Constants of the energy.
-        layout: Whose variables the views are made of.
-
-    Returns:
-        The paper's terms, and others that are present and have a factor.
-    """
+    """The elements of the paper's terms, and of others that are present and have a factor, with the
+    columns that the layout's views need."""
     used = [TERMS[k] for k in present(data) if not TERMS[k].optional or getattr(w, k) > 0]
     return {term.name: term.table(data, w).viewed(layout) for term in used}
 

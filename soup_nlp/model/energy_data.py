@@ -115,13 +115,7 @@ class EnergyData:
 def sample_pixels(
     labels: NDArray[np.int32], flow: Flow, samples: int | None, seed: int
 ) -> tuple[Int, Mask]:
-    """A random sample of every superpixel's pixels of nonzero confidence.
-
-    Args:
-        labels: (H, W) superpixel labels.
-        flow: Flow with confidence; pixels of confidence 0 are never taken.
-        samples: Pixels per superpixel, None for all.
-        seed: Of the draw.
+    """A random sample of every superpixel's pixels of nonzero confidence, None for all of them.
 
     Returns:
         (N, S) flat pixel indices and (N, S) bool, False where a superpixel has fewer pixels.
@@ -152,16 +146,9 @@ def build_energy_data(
     seed: int = 0,
     arap_at_anchors: bool = False,
 ) -> EnergyData:
-    """Collect rays, targets and weights of a segmented pair, in the paper's units.
+    """Rays, targets and weights of a segmented pair, in the paper's units.
 
-    Args:
-        seg: Superpixels and graphs.
-        flow: Flow with confidence.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        K_next: (3, 3) intrinsics of the next frame.
-        samples: Pixels per superpixel in E_proj, None for all.
-        seed: Of the sample.
-        arap_at_anchors: Motion difference taken at the anchors.
+    E_proj has `samples` pixels per superpixel, drawn by the seed, or all (None).
     """
     width = seg.labels.shape[1]
     index, filled = sample_pixels(seg.labels, flow, samples, seed)

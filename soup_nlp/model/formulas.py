@@ -65,11 +65,7 @@ class States:
         return np.asarray(np.einsum("ilcd,ibd->cbil", self._motion[0][nodes], ray))
 
     def boundary(self, nodes: Int, ray: Float) -> tuple[AnyFloat, AnyFloat]:
-        """Distances along boundary rays (b, B, 3), and next-frame points.
-
-        Returns:
-            (B, b, L) depths times |r|, and (3 B, b, L) points.
-        """
+        """Distances (B, b, L) along boundary rays (b, B, 3), and next-frame points (3 B, b, L)."""
         inverse = self.inverse_along(nodes, ray)
         z = 1 / np.where(np.abs(inverse) < 1e-12, 1e-12, inverse)
         points = z * self.turned(nodes, ray) + np.moveaxis(self._motion[1][nodes], 2, 0)[:, None]
@@ -93,15 +89,8 @@ class Ends:
         unit: float,
         rows: Int | None = None,
     ) -> None:
-        """Take rows of a graph.
-
-        Args:
-            states: Of all superpixels.
-            data: Graphs, and the numbers of their rows.
-            graph: The one whose rows are taken.
-            unit: The scene's length unit `sum_i c_i D_i` where lengths are not local.
-            rows: (b,) rows of it; default all.
-        """
+        """Take rows (b,) of a graph, default all; lengths that are not local have the scene's unit
+        `sum_i c_i D_i`."""
         self.states, self.data, self.unit = states, data, unit
         every = getattr(data, graph)
         self.rows = np.arange(len(every)) if rows is None else rows
@@ -124,12 +113,8 @@ class Ends:
         return np.sqrt(np.sqrt(a[self.i][:, :, None] + a[self.k][:, None, :]))
 
     def per_length(self, unit: Float) -> AnyFloat:
-        """(b, L, L) or (b, 1, 1) one over the length unit of every row.
-
-        Args:
-            unit: `edge_unit` or `pair_unit` of the data, a share of the anchors' depth where
-                lengths are local, else of the scene's unit.
-        """
+        """(b, L, L) or (b, 1, 1) one over the length unit of every row: its `edge_unit` or
+        `pair_unit`, a share of the anchors' depth where lengths are local, else of the scene's."""
         if self.data.local_units:
             return self.nearness * self.column(1 / unit)
         return self.column(1 / (unit * self.unit))
@@ -192,14 +177,8 @@ def reprojection(
 ) -> tuple[Float, Mask]:
     """E_proj of every superpixel, Eq. 3: mean distance in pixels of flow and homography.
 
-    Args:
-        H: (N, L, 3, 3) homographies `R - T n^T / D`.
-        data: Pixels of the pair.
-        weights: Truncation.
-        superpixels: Those that H belongs to; default all, in order.
-
-    Returns:
-        (N, L) costs, and (N, L) whether all pixels are in front of the camera.
+    Of homographies H (N, L, 3, 3), `R - T n^T / D`, of all superpixels in order or of some of them:
+    (N, L) costs, and (N, L) whether all pixels are in front of the camera.
     """
     ray, confidence = data.pixel_ray[superpixels], data.pixel_weight[superpixels]
     target = data.pixel_target[superpixels][:, None]

@@ -75,12 +75,8 @@ class Kernel:
 
     @_once
     def first_order(self) -> dict[str, ca.Function]:
-        """Value, gradient, constraints and Jacobian of one element.
-
-        Returns:
-            Functions "f" and "grad", "con" and "jac" (sparse) of (x, row, theta); absent where
-            there is nothing to compute.
-        """
+        """Functions "f" and "grad", "con" and "jac" (sparse) of (x, row, theta) of one element;
+        absent where there is nothing to compute."""
         out: dict[str, ca.SX] = {}
         if self.objective is not None:
             out["f"] = self.objective
@@ -93,14 +89,8 @@ class Kernel:
 
     @_once
     def second_order(self, hessian: str) -> dict[str, ca.Function]:
-        """The upper triangle of the Hessian of one element, sparse.
-
-        Args:
-            hessian: One of HESSIANS.
-
-        Returns:
-            Function "hess" of (x, row, theta, lam_f, lam_c); absent where it is 0.
-        """
+        """Function "hess" of (x, row, theta, lam_f, lam_c), absent where it is 0: upper triangle of
+        the Hessian of one element, of a kind of HESSIANS, sparse."""
         lam_f, lam_c = ca.SX.sym("lam_f"), ca.SX.sym("lam_c", self.nc)
         H = ca.SX(self.nx, self.nx)
         if self.objective is not None:

@@ -128,15 +128,8 @@ class NLP:
         functions: Sequence[Mapping[str, ca.Function]],
         places: Mapping[str, tuple[int, Sequence[NDArray[np.integer]]]],
     ) -> Mapping[str, Terms]:
-        """Terms of sums.
-
-        Args:
-            functions: Of every group, by the sum that they belong to.
-            places: Size of every sum, and where (E, k) the entries of every group are added.
-
-        Raises:
-            ModelError: a kernel has an unknown operation.
-        """
+        """Terms of sums, of functions of every group; `places` has the size of every sum, and where
+        (E, k) the entries of every group are added."""
         out: dict[str, Terms] = {key: (size, []) for key, (size, _) in places.items()}
         for k, (group, own) in enumerate(zip(self.groups, functions)):
             for key, f in own.items():

@@ -13,15 +13,9 @@ from soup_nlp.model.formulas import Ends, GraphName, ends_of, reprojection
 
 
 def energy(soup: Soup, data: EnergyData, weights: Weights) -> dict[str, float]:
-    """E and its weighted terms.
+    """E ("total") and every term that is present, with its factor.
 
-    Args:
-        soup: State; only its geometry matters, not its gauge nor its global scale.
-        data: Pixels, graphs and weights of the pair.
-        weights: alpha1 to alpha4 and the truncations.
-
-    Returns:
-        "total" and every term that is present, with its factor.
+    Only the geometry of the soup matters, not its gauge nor its global scale.
     """
     ends = ends_of(soup, data)
     terms = {
@@ -40,12 +34,7 @@ def values(
 ) -> Float:
     """A term of every superpixel ("proj", (N,)), edge (E,) or neighbour pair (P,), without factor.
 
-    Args:
-        name: One of `elements.TERMS`.
-        soup: State.
-        data: Pixels, graphs and weights of the pair.
-        weights: Truncations.
-        ends: `ends_of` the soup where it is known.
+    The name is one of `elements.TERMS`, `ends` are `ends_of` the soup where they are known.
     """
     term = TERMS[name]
     if term is PROJ:

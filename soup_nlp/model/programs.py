@@ -24,13 +24,7 @@ MIN_SCALE = 1e-4
 def build_matrix_nlp(
     soup: Soup, data: EnergyData, weights: Weights, form: Formulation
 ) -> tuple[NLP, MatrixLayout]:
-    """The constrained NLP: matrix rotations with SO(3), unit normals, simplex, visibility.
-
-    Args:
-        soup: Start; SO(3) and unit normals should hold.
-        data: Pixels, graphs and weights of the pair.
-        weights: Constants of the energy.
-        form: Gauge, norm, Hessian, smoothing.
+    """The constrained NLP from a soup, whose SO(3) and unit normals should hold.
 
     Returns:
         The NLP and the layout that turns its vectors into soups.
@@ -116,16 +110,10 @@ def build_tangent_nlp(
     chart: Chart = "depth",
     layout: TangentLayout | None = None,
 ) -> tuple[NLP, TangentLayout]:
-    """The presolve: 9 coordinates per superpixel about the soup, linear constraints only.
+    """The presolve from a soup: 9 coordinates per superpixel, linear constraints only.
 
-    Args:
-        soup: Start.
-        data: Pixels, graphs and weights of the pair.
-        weights: Constants of the energy.
-        form: Smoothing and Hessian; gauge is not used.
-        chart: See TangentLayout.
-        layout: Base; default one about the start. With a base of its own the program is the same
-            for every start, and the simplex is exact.
+    The coordinates are about the soup. About the base of a given `layout` the program is the same
+    for every start, and the simplex is exact.
 
     Returns:
         The NLP and the layout that turns its vectors into soups.

@@ -50,13 +50,9 @@ class Known:
 
 
 def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions) -> EnergyData:
-    """The data with the weights of all edges and pairs.
+    """The data, which has the weights of the paper, with the weights of all edges and pairs.
 
-    Args:
-        data: Data of the pair with the weights of the paper, which follow from the image.
-        soup: Start, for the steps of depth that order asks for.
-        known: What the weights depend on.
-        options: Factors.
+    The steps of depth that order asks for are those of the soup, the start.
     """
     (i, k), (a, b) = data.edges.T, data.pairs.T
     group, bends = known.component, known.bends
@@ -152,13 +148,8 @@ def in_pixels(
     one global unit, the depth of superpixels without parallax diverges, because that shortens all
     other lengths. It is their power mean of exponent -4, close to the nearer one: with the
     arithmetic mean the energy falls as one of the two recedes. The ratio T / Z is a constant of the
-    energy: its median around the superpixels at the start.
-
-    Args:
-        data: Data in the paper's units.
-        soup: Start, for the ratio of baseline and depth.
-        seg: For the neighbourhoods.
-        bends: (N,) True where rotations cost next to nothing.
+    energy: its median around the superpixels of the soup, the start. Rotations cost next to nothing
+    where superpixels bend, `bends` (N,).
     """
     ratio = np.linalg.norm(soup.translation, axis=1) / soup.depth_at(data.anchor_ray)
     if seg.knn.shape[1]:
@@ -182,11 +173,7 @@ def in_translations(data: EnergyData, soup: Soup) -> EnergyData:
 
     `sum_i lam_i = 1` fixes the unit, and the paper does not say what a scale multiplies; here it is
     the translation t-hat of unit length. Translations have the ratio to their plane distances that
-    the start has.
-
-    Args:
-        data: Data in the paper's units, the mean plane distance being 1.
-        soup: Start, for the length of translations.
+    the soup, the start, has.
     """
     share = np.maximum(np.linalg.norm(soup.translation, axis=1) / soup.distance, 1e-9)
     # lengths have sum_i c_i D_i = 1, shares c add up to 1; the unit is that of sum_i s_i D_i = 1

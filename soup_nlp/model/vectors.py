@@ -73,15 +73,7 @@ class Vectors:
         return calls
 
     def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
-        """Add the elements' entries to `out`.
-
-        Args:
-            out: Added to.
-            x: (nx,) variables.
-            theta: Shared parameters.
-            lam_f: Multiplier of f, for Hessians.
-            lam_g: (ng,) multipliers of g, for Hessians.
-        """
+        """Add the elements' entries at x (nx,) to `out`; multipliers are those of Hessians."""
         self._theta[:], self._lam_f[0] = theta[: len(self._theta)], lam_f
         with np.errstate(all="ignore"):
             for index, data, rows, target in self._blocks:
