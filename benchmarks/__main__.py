@@ -29,6 +29,8 @@ app = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, help="Accuracy and speed, measured."
 )
 Words = list[str] | None
+Suites = Annotated[list[str], typer.Option(help=f"{', '.join(SUITES)}; may be repeated.")]
+Width = Annotated[int, typer.Option(min=64, help="Columns of rendered scenes.")]
 Data = Annotated[Path | None, typer.Option(help="Root folder of the dataset.")]
 Set = Annotated[Words, typer.Option("--set", help="Set any key; may be repeated.")]
 Flow = Annotated[Words, typer.Option(help="Flow source instead of the suite's own.")]
@@ -37,17 +39,26 @@ Workers = Annotated[int, typer.Option(min=1, help="Processes of this machine.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder of the pages and rows.")]
 
 
+def listed(text: str) -> list[str]:
+    """Different words of a comma-separated list."""
+    return [*dict.fromkeys(word.strip() for word in text.split(",") if word.strip())]
+
+
 def numbers(text: str) -> list[int]:
     """Different whole numbers of a comma-separated list."""
     try:
-        return list(dict.fromkeys(int(word) for word in text.split(",")))
+        return [int(word) for word in listed(text)]
     except ValueError:
         raise typer.BadParameter(f"{text!r} is no comma-separated list of whole numbers") from None
 
 
-def listed(text: str) -> list[str]:
-    """Different words of a comma-separated list."""
-    return [*dict.fromkeys(word.strip() for word in text.split(",") if word.strip())]
+def cells_of(
+    suites: list[str], data: Path | None, wanted: Options, overrides: Words
+) -> dict[str, list[Cell]]:
+    """The available pairs of suites under overrides."""
+    say = partial(print, file=sys.stderr)
+    items = {suite: list_suite(suite, data, wanted, say) for suite in suites}
+    return {suite: [Cell(i, tuple(overrides or ())) for i in own] for suite, own in items.items()}
 
 
 def finish(page: Path, frame: pd.DataFrame, text: str | None = None) -> int:
@@ -60,13 +71,13 @@ def finish(page: Path, frame: pd.DataFrame, text: str | None = None) -> int:
 
 @app.command()
 def accuracy(
-    suite: Annotated[list[str], typer.Option(help=f"{', '.join(SUITES)}; may be repeated.")],
+    suite: Suites,
     overrides: Set = None,
     flow: Flow = None,
     only: Only = None,
     data: Data = None,
     out: Out = Path("out/bench/accuracy"),
-    width: Annotated[int, typer.Option(min=64, help="Columns of rendered scenes.")] = 1024,
+    width: Width = 1024,
     seeds: Annotated[str, typer.Option(help="Seeds of rendered scenes.")] = "0",
     workers: Workers = 1,
     cluster: Annotated[str | None, typer.Option(help="Dask scheduler, tcp://HOST:PORT.")] = None,
@@ -74,12 +85,9 @@ def accuracy(
 ) -> int:
     """Depth against truth on suites of pairs; a run that was stopped goes on."""
     wanted = Options(tuple(flow or ()), width, tuple(numbers(seeds)), tuple(only or ()))
-    say = partial(print, file=sys.stderr)
-    suites = {each: list_suite(each, data, wanted, say) for each in suite}
     codes = []
-    for each, items in suites.items():
+    for each, cells in cells_of(suite, data, wanted, overrides).items():
         page = out / f"{name or each}.md"
-        cells = [Cell(item, tuple(overrides or ())) for item in items]
         rows = page.with_suffix(".jsonl")
         frame = measure(cells, measure_pair, rows, workers, cluster=cluster)
         write_suite(page, frame, f"Suite `{each}`: {SUITES[each].text}.")
@@ -89,20 +97,20 @@ def accuracy(
 
 @app.command()
 def sigma(
-    suite: Annotated[list[str], typer.Option(help=f"{', '.join(SUITES)}; may be repeated.")],
+    suite: Suites,
     overrides: Set = None,
     only: Only = None,
     data: Data = None,
     out: Out = Path("out/bench/sigma"),
-    width: Annotated[int, typer.Option(min=64, help="Columns of rendered scenes.")] = 1024,
+    width: Width = 1024,
     workers: Workers = 1,
 ) -> int:
     """The factors of sigma, fitted with families left out in turn; a stopped run goes on."""
     wanted = Options(("dis",), width, (0,), tuple(only or ()))
-    say = partial(print, file=sys.stderr)
-    items = [item for each in suite for item in list_suite(each, data, wanted, say)]
-    cells = [Cell(item, tuple(overrides or ())) for item in items]
-    frame = measure(cells, measure_terms, out / "sigma.jsonl", workers)
+    suites = cells_of(suite, data, wanted, overrides).values()
+    frame = measure(
+        [cell for cells in suites for cell in cells], measure_terms, out / "sigma.jsonl", workers
+    )
     return finish(out / "sigma.md", frame, sigma_page(frame))
 
 

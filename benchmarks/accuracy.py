@@ -181,9 +181,9 @@ def plot_sigma(path: Path, frame: pd.DataFrame) -> bool:
         ax.axhline(1.0, color="#cc6677", lw=0.8, ls="--")
         ax.set(ylim=(0, 1.3), xlim=(0, 100))
         ax.set_title(str(family), fontsize=8)
-        mean = np.mean(
-            [k for k in group["sigma.reliability"] if len(k) == 10] or [[[1, 1]]], axis=0
-        )
+        # of pairs with few pixels there are fewer tenths
+        tenths = [k for k in group["sigma.reliability"] if len(k) == 10] or [[[1, 1]]]
+        mean = np.mean(tenths, axis=0)
         reliable.loglog(mean[:, 0], mean[:, 1], lw=0.8)
     reliable.plot((0.003, 3), (0.003, 3), color="black", lw=0.8, ls="--")
     reliable.set_title("reliability: RMS error of log depth by sigma", fontsize=6)

@@ -167,12 +167,8 @@ def make_plan(
 ) -> pd.DataFrame:
     """The cells of the pairs that are available in the folder `data`.
 
-    Args:
-        data: Root folder of the datasets.
-        superpixels: Number of superpixels in the comparison of datasets.
-        analysis: Number of superpixels in all other sections.
-        limit: Most pairs of a dataset, evenly spaced; None for all.
-        overrides: Overrides of every problem.
+    The comparison of datasets has `superpixels`, and at most `limit` pairs of a dataset, evenly
+    spaced; all other sections have as many superpixels as `analysis` says.
 
     Returns:
         A line for each cell of each section: section ("comparison", a study, or "departures"),
@@ -272,11 +268,10 @@ def _comparison(rows: pd.DataFrame) -> list[str]:
     index = pd.MultiIndex.from_frame(rows[["name", "method"]])
     forms = dict.fromkeys(by_pair, ".4f") | {"CPU s": ".0f"}
     return [
-        *("## Mean relative error per dataset", markdown(table.rename_axis("dataset"))),
-        *(
-            "Every pair, MRE; the constrained NLP's status:",
-            markdown(by_pair.set_axis(index), forms),
-        ),
+        "## Mean relative error per dataset",
+        markdown(table.rename_axis("dataset")),
+        "Every pair, MRE; the constrained NLP's status:",
+        markdown(by_pair.set_axis(index), forms),
     ]
 
 

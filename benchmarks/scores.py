@@ -28,8 +28,6 @@ METHODS = (
 """Depth maps in the order of the tables: what is delivered, the NLP alone, the start, independent
 superpixels (each with a translation of length 1), the solution where one rigid motion has a depth,
 that motion triangulated, the same with holes filled from the nearest pixel, a constant depth."""
-KEPT_METRICS = ("mre", "median_relative", "delta1", "scale", "coverage")
-"""Depth metrics that a row has beside the skill."""
 SEEN = 0.5
 """Mean confidence of the flow of a superpixel up to which its pixels count as not seen."""
 SURE = 0.10
@@ -81,8 +79,9 @@ def scores(result: Run) -> Row:
         return {**row, "metrics": {}}
     scored = score_depths(truth, maps)
     scale, constant = scored["solution"].scale, scored["constant"].mre
+    kept = "mre", "median_relative", "delta1", "scale", "coverage"
     metrics = {
-        method: {**{k: getattr(m, k) for k in KEPT_METRICS}, "skill": skill(m.mre, constant)}
+        method: {**{k: getattr(m, k) for k in kept}, "skill": skill(m.mre, constant)}
         for method, m in scored.items()
     }
     z, gt = at_truth(truth, result.reconstruction.depth_ref)

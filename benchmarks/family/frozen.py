@@ -114,22 +114,16 @@ def decoded(numbers: Float) -> Soup:
 
 
 STORED = {
-    "component": (np.int16, np.int64),
-    "surface": (np.int16, np.int64),
-    "error": (np.float32, np.float64),
-    "bending": (np.bool_, np.bool_),
-    "pair_weight": (np.float64, np.float64),
-    "prior_weight": (np.float64, np.float64),
-    "edge_share": (np.float64, np.float64),
-    "pair_share": (np.float64, np.float64),
-    "orient_share": (np.float64, np.float64),
-    "proposal": (np.float32, np.float64),
-    "minimum": (np.float64, np.float64),
+    **dict.fromkeys(("component", "surface"), np.int16),
+    **dict.fromkeys(("error", "proposal"), np.float32),
+    **dict.fromkeys(("pair_weight", "prior_weight", "minimum"), np.float64),
+    **dict.fromkeys(("edge_share", "pair_share", "orient_share"), np.float64),
+    "bending": np.bool_,
 }
-"""Types of the arrays of a record in its file and in memory. The file also has the text, and the
-labels as differences along rows, which are mostly 0."""
-
-
+"""Types of the arrays of a record in its file. The file also has the text, and the labels as
+differences along rows, which are mostly 0."""
+WIDE = {"i": np.int64, "f": np.float64, "b": np.bool_}
+"""Types in memory by kind."""
 RECORDS = Path(__file__).with_name("records")
 
 
@@ -149,7 +143,7 @@ def read_frozen(path: Path) -> Frozen:
             return Frozen(
                 text=a["problem"].tobytes().decode(),
                 labels=np.cumsum(a["labels"].astype(np.int32), axis=1, dtype=np.int32),
-                **{name: a[name].astype(kind)[()] for name, (_, kind) in STORED.items()},
+                **{name: a[name].astype(WIDE[a[name].dtype.kind])[()] for name in STORED},
             )
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise DataError("record of the family cannot be read", where=path, found=error) from error

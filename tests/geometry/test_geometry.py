@@ -16,6 +16,7 @@ from soup_nlp.geometry.plane import (
     tilt_to_camera,
 )
 from soup_nlp.geometry.soup import Soup, nearest_on_top, reconstruct
+from soup_nlp.geometry.surface import at_jumps
 
 unit = st.floats(-1.0, 1.0)
 vectors = hnp.arrays(float, (5, 3), elements=unit)
@@ -71,6 +72,13 @@ def test_cayley_rotates_by_twice_the_arc_tangent(w):
     np.testing.assert_allclose(
         rotation.cayley(2 * w), rotation.exp(2 * np.arctan(length) * axis), atol=1e-12
     )
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, 2.0])
+def test_the_right_jacobian_is_the_derivative_of_exp(angle):
+    w, d = angle * np.array([0.6, -0.48, 0.64]), 1e-6 * np.array([1.0, 2.0, -1.5])
+    step = rotation.log(rotation.exp(w).T @ rotation.exp(w + d))
+    np.testing.assert_allclose(step, rotation.right_jacobian(w) @ d, rtol=0, atol=1e-11)
 
 
 @given(hnp.arrays(float, (4, 3, 3), elements=unit), hnp.arrays(float, (8, 3), elements=unit))
@@ -269,3 +277,11 @@ def test_splat_has_no_cracks_below_twofold_stretch(seed):
     depth = splat_depth(target, np.full((12, 12), 2.0), (24, 24))
     last = int(11 * scale)
     assert np.isfinite(depth[1:last, 1:last]).all()
+
+
+def test_both_sides_of_a_break_of_the_surface_are_at_a_jump():
+    right, below = np.ones((3, 3), bool), np.ones((2, 4), bool)
+    right[0, 1] = below[1, 3] = False
+    expected = np.zeros((3, 4), bool)
+    expected[0, 1:3] = expected[1:, 3] = True
+    np.testing.assert_array_equal(at_jumps(right, below), expected)

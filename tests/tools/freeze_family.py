@@ -96,7 +96,7 @@ def save_frozen(path: Path, record: Frozen) -> None:
     arrays: dict[str, NDArray[Any]] = {
         "problem": np.frombuffer(record.text.encode(), np.uint8),
         "labels": np.diff(record.labels, axis=1, prepend=0).astype(np.int16),
-        **{name: np.asarray(getattr(record, name), kind) for name, (kind, _) in STORED.items()},
+        **{name: np.asarray(getattr(record, name), kind) for name, kind in STORED.items()},
     }
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w", zipfile.ZIP_LZMA) as archive:
