@@ -20,14 +20,13 @@ from soup_nlp.errors import ConfigError, expect, printable
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
-from soup_nlp.schema.limits import MAX_NEIGHBOURS, MAX_SUPERPIXELS
 from soup_nlp.schema.section import (
     Keys,
     Positive,
-    Samples,
     Section,
     Seed,
     Share,
+    Whole,
     explain,
     nearest,
     texts_expected,
@@ -43,16 +42,16 @@ LONGEST_NAME = 100
 class SegmentationOptions(Section):
     """Superpixels and graphs."""
 
-    superpixels: Annotated[int, Field(ge=1, le=MAX_SUPERPIXELS)] = 1000
+    superpixels: Annotated[int, Field(ge=1, le=20_000)] = 1000
     """Number that is asked for; the actual number differs by about 3 % at most."""
     method: Literal["slic", "grid"] = "slic"
     """slic, or grid (the paper's worst case)."""
     follow_flow_px: Positive | None = 1.0
     """A pixel on a border goes to the neighbour whose affine flow is nearer to its own by more
     than this, pixels; null leaves the borders to the image alone."""
-    neighbours: Annotated[int, Field(ge=1, le=MAX_NEIGHBOURS)] = 15
+    neighbours: Annotated[int, Field(ge=1, le=100)] = 15
     """K of the K-NN graph, less than the number of superpixels."""
-    boundary_samples: Samples | Literal["all"] = 3
+    boundary_samples: Whole | Literal["all"] = 3
     """Points per shared boundary, or all."""
 
 

@@ -16,7 +16,7 @@ from soup_nlp.data.formats.images import read_image
 from soup_nlp.data.formats.map_files import known_depth, read_prior
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.schema.limits import check_image_size
+from soup_nlp.schema.section import check_image_size
 
 ImageLike: TypeAlias = Any
 """An array (H, W), (H, W, C) or (C, H, W) with 1, 3 or 4 channels, of 8 bits or of floats from 0 to

@@ -13,9 +13,15 @@ from pydantic_core import PydanticKnownError
 
 from soup_nlp.arrays import Float
 from soup_nlp.data.accept import prior_of
-from soup_nlp.data.datasets.benchmarks import KittiInput, SintelInput, VkittiInput
-from soup_nlp.data.datasets.folders import FolderInput, MotorcycleInput, TumInput
-from soup_nlp.data.datasets.layout import FramesInput, PairInput, Resolve, make_pair
+from soup_nlp.data.datasets.benchmarks import KittiInput, SintelInput, TumInput, VkittiInput
+from soup_nlp.data.datasets.folders import (
+    FolderInput,
+    FramesInput,
+    MotorcycleInput,
+    PairInput,
+    Resolve,
+    make_pair,
+)
 from soup_nlp.data.flow.sources import is_network
 from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
 from soup_nlp.data.formats.map_files import read_depth
@@ -24,8 +30,7 @@ from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes.catalogue import LAYOUTS, render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.schema.limits import MAX_SIDE
-from soup_nlp.schema.section import Finite, Index, NonNegative, Positive, Section, Seed
+from soup_nlp.schema.section import MAX_SIDE, Finite, Index, NonNegative, Positive, Section, Seed
 
 SAME_SHAPE = 0.02
 """Largest relative difference of the aspect ratios of a prior and its image."""

@@ -4,7 +4,7 @@ from typing import Literal
 
 import numpy as np
 
-from soup_nlp.schema.section import NonNegative, Samples, Section, Share, Truncation
+from soup_nlp.schema.section import NonNegative, Section, Share, Truncation, Whole
 
 
 class Weights(Section):
@@ -87,7 +87,7 @@ class EnergyOptions(Section):
     arap_scene: Share = 0.1
     """Weight w1 of further edges of E_arap, from the scene's superpixel of median depth to all of
     the scene with a flow and depth of their own; 0 is the paper's graph."""
-    pixel_samples: Samples | Literal["all"] = 16
+    pixel_samples: Whole | Literal["all"] = 16
     """Pixels per superpixel in E_proj, or all."""
     weights: Weights = Weights()
     """Factors of the terms and their truncations."""

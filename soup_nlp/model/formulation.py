@@ -7,8 +7,7 @@ from pydantic import Field
 from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Gauge
 from soup_nlp.model.norms import NormForm
-from soup_nlp.schema.limits import MOST
-from soup_nlp.schema.section import NonNegative, Section, Share
+from soup_nlp.schema.section import MOST, NonNegative, Section, Share
 
 
 class FormulationOptions(Section):

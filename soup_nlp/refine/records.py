@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.schema.limits import MAX_PARTICLES
 from soup_nlp.schema.section import Count, NonNegative, Section, Tolerance
 
 
@@ -20,7 +19,7 @@ class RefineOptions(Section):
     """Refine the start: the NLP is skipped."""
     rounds: Count = 4
     """Most rounds of particles."""
-    particles: Annotated[int, Field(ge=2, le=MAX_PARTICLES)] = 50
+    particles: Annotated[int, Field(ge=2, le=1_000)] = 50
     """Labels of every superpixel, the current belief among them."""
     proposals: Literal["all", "walks"] = "all"
     """all, or walks: steps around the current belief alone, to any depth, as in the paper."""

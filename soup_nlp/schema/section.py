@@ -1,6 +1,7 @@
-"""Base class of every option record and section of a problem file, and its validation errors.
+"""Base class of every option record and section of a problem file, its limits, and its errors.
 
-A validation error becomes a message: where, found, expected, nearest spelling.
+A validation error becomes a message: where, found, expected, nearest spelling. Larger inputs than
+the limits are of no use and would take all memory or time.
 """
 
 import difflib
@@ -12,8 +13,7 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic._internal._model_construction import ModelMetaclass
 
-from soup_nlp.errors import ConfigError, printable
-from soup_nlp.schema.limits import LEAST, MAX_ROUNDS, MAX_SAMPLES, MAX_SEED, MOST
+from soup_nlp.errors import ConfigError, DataError, printable
 
 Keys = tuple[str, ...]
 """Keys that lead to a value, from the top."""
@@ -149,6 +149,19 @@ def _expected(item: Mapping[str, Any]) -> str:
     return str(item["msg"]).removeprefix("Input should be ").removeprefix("Value error, ")
 
 
+# --- limits ---------------------------------------------------------------------------------------
+
+MAX_SIDE = 20_000
+"""Largest width or height of an image, flow or depth, pixels."""
+MAX_PIXELS = 64_000_000
+"""Most pixels of an image; an 8K picture has half as many."""
+MAX_ASPECT = 32
+"""Largest ratio of the sides of an image; that of a panorama is up to 10."""
+MAX_SEED = 2**31 - 1
+"""OpenCV's random generator takes signed integers of 32 bits."""
+LEAST, MOST = 1e-9, 1e9
+"""Magnitude of real numbers: products and squares of them stay far from overflow."""
+
 Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=LEAST, le=MOST, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=MOST, allow_inf_nan=False)]
@@ -156,11 +169,33 @@ Tolerance = Annotated[float, Field(ge=1e-12, le=MOST, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Truncation = Annotated[float, Field(ge=LEAST)]
 """A truncation may be infinite: the untruncated norm."""
-Count = Annotated[int, Field(ge=0, le=MAX_ROUNDS)]
-Whole = Annotated[int, Field(ge=1, le=MAX_ROUNDS)]
+Count = Annotated[int, Field(ge=0, le=10_000)]
+Whole = Annotated[int, Field(ge=1, le=10_000)]
 Index = Annotated[int, Field(ge=0, le=MAX_SEED)]
-Samples = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
+
+
+def check_image_size(width: int, height: int, what: str, where: object) -> None:
+    """Raise DataError unless an image of `width` x `height` pixels is within the limits.
+
+    `what` and `where` name the image and its file or array in the message.
+    """
+    size = f"{width} x {height} (width x height)"
+    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
+        raise DataError(
+            f"{what} has an impossible size",
+            where=where,
+            found=size,
+            expected=f"1 to {MAX_SIDE} on each side, at most {MAX_PIXELS} pixels",
+            hint="scale the images and their intrinsics down; or the file is damaged",
+        )
+    if max(width, height) > MAX_ASPECT * min(width, height):
+        raise DataError(
+            f"{what} is too long for its width",
+            where=where,
+            found=size,
+            expected=f"sides of a ratio from 1 to {MAX_ASPECT}",
+        )
 
 
 class _Checked(ModelMetaclass):

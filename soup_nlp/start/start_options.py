@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from soup_nlp.schema.section import NonNegative, Samples, Section, Seed
+from soup_nlp.schema.section import NonNegative, Section, Seed, Whole
 
 
 class StartOptions(Section):
@@ -11,7 +11,7 @@ class StartOptions(Section):
     method: Literal["shared", "homography"] = "shared"
     """shared (every superpixel takes one of the motions of the whole image) or homography (the
     paper's: epipolar geometry and homography of every superpixel, equal scales)."""
-    samples: Samples = 40
+    samples: Whole = 40
     """Sampled pixels per superpixel."""
     threshold_px: NonNegative = 1.0
     """Inlier distance of a motion, pixels."""

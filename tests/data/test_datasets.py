@@ -260,7 +260,7 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cameras = {"freiburg3": (535.4, 539.2, 4, 2.5), "": (525, 525, 4, 2.5)}
-    monkeypatch.setattr("soup_nlp.data.datasets.folders._TUM_CAMERAS", cameras)
+    monkeypatch.setattr("soup_nlp.data.datasets.benchmarks._TUM_CAMERAS", cameras)
     root = tmp_path / "rgbd_dataset_freiburg3_x"
     for k in range(3):
         picture(root / "rgb" / f"{k}.png", k)

@@ -1,15 +1,16 @@
-"""KITTI stereo/flow 2012 and scene flow 2015, Virtual KITTI 1 and 2, MPI Sintel, in metres."""
+"""KITTI stereo/flow 2012 and scene flow 2015, Virtual KITTI 1 and 2, MPI Sintel, TUM RGB-D."""
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BeforeValidator
 
 from soup_nlp.arrays import Float
-from soup_nlp.data.datasets.layout import Folder, PairInput, Resolve, make_pair
-from soup_nlp.data.formats.camera_files import check_intrinsics, number, read_cam
+from soup_nlp.data.datasets.folders import Folder, PairInput, Resolve, make_pair
+from soup_nlp.data.formats.camera_files import check_intrinsics, number, read_cam, read_intrinsics
 from soup_nlp.data.formats.images import assumed, decode, read_mask
 from soup_nlp.data.formats.map_files import (
     KITTI_DISPARITY,
@@ -22,7 +23,7 @@ from soup_nlp.data.formats.map_files import (
 from soup_nlp.data.pair import Pair, Truth, check_size
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.schema.section import Index, Whole
+from soup_nlp.schema.section import Index, Positive, Whole
 from soup_nlp.storage.files import PathLike, read_text
 
 _KITTI = {
@@ -61,6 +62,18 @@ SINTEL_LAYOUT = (
 DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
 """fx, fy, cx, cy of `DEFAULT_SCENE`, pixels; other scenes differ (some have 1120)."""
 DEFAULT_SCENE = "alley_1"
+
+TUM_SCALE = 5000.0
+"""Values per metre of a TUM RGB-D depth image."""
+
+TUM_LAYOUT = "rgb.txt, depth.txt, rgb/*.png, depth/*.png, optional K.txt or camera.txt"
+_TUM_CAMERAS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+    "": (525.0, 525.0, 319.5, 239.5),
+}
+_TUM_SLACK = 0.02  # seconds between a colour image and its depth image
 
 
 def _pair_number(index: object) -> str:
@@ -219,3 +232,79 @@ class SintelInput(SceneFrames):
             check_size("mask and flow", invalid.shape, flow.shape, where)
             flow[invalid] = np.nan
         return make_pair(images, cameras, Truth(depths[0], depths[1], flow))
+
+
+class TumInput(PairInput):
+    """TUM RGB-D, official layout, depth in metres.
+
+    `rgb.txt` and `depth.txt` list time stamps and files; a depth image belongs to a colour image
+    within 20 ms. Without `K.txt` or `camera.txt` the intrinsics are those published for the sensor
+    in the name of the folder (freiburg1, 2 or 3), else 525, 525, 319.5, 239.5; lens distortion is
+    not removed.
+    """
+
+    kind: Literal["tum"]
+    """Kind of input."""
+    path: str
+    """Folder of the sequence."""
+    frame: Index = 0
+    """Index of the reference image in rgb.txt."""
+    step: Whole = 1
+    """Distance of the next image."""
+    depth_scale: Positive | None = None
+    """Values per metre of the depth images; null for the 5000 of TUM, with a warning."""
+
+    def load(self, path: Resolve) -> Pair:
+        """See `PairInput`."""
+        folder = Folder(path(self.path), TUM_LAYOUT)
+        images = _tum_list(folder.need("rgb.txt"))
+        depths = folder.read(_tum_list, "depth.txt") or []
+        numbers = self.frame, self.frame + self.step
+        if numbers[1] >= len(images):
+            raise DataError(
+                "frame is not in the sequence",
+                where=folder.path / "rgb.txt",
+                found=numbers[1],
+                expected=f"0 to {len(images) - 1}",
+            )
+        K = folder.read(read_intrinsics, "K.txt", "camera.txt")
+        K = _tum_camera(folder.path) if K is None else K
+        maps = []
+        for time, _ in (images[k] for k in numbers):
+            near = [entry for entry in depths if abs(entry[0] - time) <= _TUM_SLACK]
+            best = [name for _, name in sorted(near, key=lambda entry: abs(entry[0] - time))[:1]]
+            maps.append(folder.read(read_depth, *best, scale=self.depth_scale, usual=TUM_SCALE))
+        files = [folder.need(images[k][1]) for k in numbers]
+        return make_pair(files, [K, K], Truth(maps[0], maps[1]))
+
+
+def _tum_camera(folder: Path) -> Float:
+    """Intrinsics of TUM's sensors, by the name of the folder, with a warning."""
+    sensor = re.search(r"freiburg[123]", str(folder.resolve()))
+    name = sensor.group() if sensor else ""
+    numbers = ",".join(f"{x:g}" for x in _TUM_CAMERAS[name])
+    assumed(
+        folder,
+        "neither K.txt nor camera.txt beside rgb.txt",
+        f"the intrinsics of {name or 'the default camera of TUM RGB-D'}, {numbers}",
+    )
+    return intrinsics(*_TUM_CAMERAS[name])
+
+
+def _tum_list(path: Path) -> list[tuple[float, str]]:
+    """(time stamp in seconds, name of a file) of each line of rgb.txt or depth.txt."""
+    out = []
+    for row, line in enumerate(read_text(path, "file list").splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split()
+        try:
+            out.append((float(words[0]), words[1]))
+        except (ValueError, IndexError):
+            raise DataError(
+                "line of a file list is not understood",
+                where=f"{path}, line {row}",
+                found=repr(line[:60]),
+                expected="'timestamp file'",
+            ) from None
+    return out

@@ -1,27 +1,142 @@
-"""Inputs with truth: plain folders, TUM RGB-D and the Motorcycle pair.
+"""Inputs from files: what all kinds share, folders of two frames, the Motorcycle pair.
 
 Each needs the two images and the camera. The truth is None without its file, and NaN where unknown.
 """
 
-import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import skimage
+from pydantic import Field
 
 from soup_nlp.arrays import Float
-from soup_nlp.data.datasets.layout import Folder, FramesInput, PairInput, Resolve, make_pair
-from soup_nlp.data.formats.camera_files import read_intrinsics
-from soup_nlp.data.formats.images import assumed, read_mask
+from soup_nlp.data.formats.camera_files import read_intrinsics, undistorted
+from soup_nlp.data.formats.cameras import check_cameras, estimated_cameras
+from soup_nlp.data.formats.images import read_images, read_mask
 from soup_nlp.data.formats.map_files import read_depth, read_flow, read_npz
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.schema.section import Index, Positive, Whole
-from soup_nlp.storage.files import read_json, read_text
+from soup_nlp.schema.section import Positive, Section
+from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder, read_json
 from soup_nlp.storage.folders import SUMS, read_sums
+
+T = TypeVar("T")
+Resolve = Callable[[str], Path]
+"""Full path of a name in the problem file."""
+White = Annotated[int, Field(ge=1, le=65535)]
+
+
+class PairInput(Section, ABC):
+    """Base of every kind of input."""
+
+    @abstractmethod
+    def load(self, path: Resolve) -> Pair:
+        """The pair, without its flow; `path` resolves the names of files."""
+
+    def files(self) -> list[str]:
+        """Names of the files and folders that are read."""
+        return [getattr(self, name) for name in ("root", "path") if name in type(self).model_fields]
+
+
+class FramesInput(PairInput):
+    """Base of the inputs of image files: options about the truth and the pixels."""
+
+    depth_scale: Positive | None = None
+    """Values per unit of length of a 16-bit .png depth; null for 1000, with a warning."""
+    unit: str = "m"
+    """Unit of the true depth."""
+    white: White | None = None
+    """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for the values that
+    occur."""
+    cropped: bool = False
+    """The images are parts of larger ones: the principal point may be anywhere."""
+
+
+class Folder:
+    """The folder of a dataset, or the folder `below` in it; `layout` names the expected files."""
+
+    def __init__(self, path: PathLike, layout: str, below: str = "") -> None:
+        self.path, self.layout = as_path(path, "dataset folder"), layout
+        if not is_folder(self.path):
+            raise DataError(
+                "dataset folder is missing",
+                where=path,
+                found="a file" if is_file(path) else "nothing",
+                expected=f"a folder with {layout}",
+            )
+        self.path = self.path / below if is_folder(self.path / below) else self.path
+
+    def find(self, *names: str) -> Path | None:
+        """The first of these files that exists; None if there is none."""
+        return next((self.path / name for name in names if is_file(self.path / name)), None)
+
+    def need(self, *names: str) -> Path:
+        """The first of these files that exists; the error names the first missing folder."""
+        file = self.find(*names)
+        if file is not None:
+            return file
+        path = self.path / names[0]
+        folder = path.parent
+        while not is_folder(folder) and folder != folder.parent:
+            folder = folder.parent
+        raise DataError(
+            "file of the dataset is missing",
+            where=path,
+            found=f"{folder} has no {path.relative_to(folder).parts[0]}",
+            expected=self.layout,
+            hint="check the root folder and the frame, or rearrange the files to this layout",
+        )
+
+    def read(self, reader: Callable[..., T], *names: str, **options: Any) -> T | None:
+        """Contents of the first of these files that exists; None if there is none."""
+        file = self.find(*names)
+        return None if file is None else reader(file, **options)
+
+
+def make_pair(
+    images: Sequence[Path],
+    cameras: Sequence[Float | None],
+    truth: Truth,
+    white: int | None = None,
+    *,
+    fov: float | None = None,
+    focal_sigma: float = 0.0,
+    cropped: bool = False,
+    distortion: Sequence[Float] = (),
+) -> Pair:
+    """The pair of two image files; its truth is None if no part of it is known.
+
+    Args:
+        images: Reference and next image.
+        cameras: (3, 3) intrinsics of both frames, pixels; None is estimated (`estimated_cameras`).
+            If both are None, images are rotated by their EXIF orientation.
+        truth: Truth from its files.
+        white: Value of white in 16-bit images, see `read_images`.
+        fov: Horizontal field of view, degrees, if the cameras are not known.
+        focal_sigma: Standard deviation of the log focal length of `fov`.
+        cropped: The images are parts of larger ones, see `check_cameras`.
+        distortion: Coefficients (n,) of both lenses, removed from the images, see `undistorted`.
+    """
+    # a given camera may belong to the stored or to the rotated image
+    pictures = read_images(images, white, turn=all(K is None for K in cameras))
+    if any(K is None for K in cameras):
+        estimated, guessed = estimated_cameras(images, pictures, fov)
+        focal_sigma = max(focal_sigma, guessed)
+    matrices = [estimated[k] if K is None else K for k, K in enumerate(cameras)]
+    check_cameras(matrices, pictures, images, cropped)
+    for k, coefficients in enumerate(distortion):
+        pictures[k], matrices[k] = undistorted(pictures[k], matrices[k], coefficients)
+    (ref, following), (K_ref, K_next) = pictures, matrices
+    known = truth if truth.known() else None
+    return Pair(ref, following, K_ref, K_next, truth=known, focal_sigma=focal_sigma)
+
+
+# --- a folder of two frames -----------------------------------------------------------------------
 
 LAYOUT = (
     "frame_0.png, frame_1.png, K.txt; optional K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, "
@@ -29,18 +144,6 @@ LAYOUT = (
 )
 _IMAGES = ".png .jpg .jpeg .tif .tiff .ppm .pgm .bmp"
 _DEPTHS = ".npy .dpt .pfm .png"
-
-TUM_SCALE = 5000.0
-"""Values per metre of a TUM RGB-D depth image."""
-
-TUM_LAYOUT = "rgb.txt, depth.txt, rgb/*.png, depth/*.png, optional K.txt or camera.txt"
-_TUM_CAMERAS = {
-    "freiburg1": (517.3, 516.5, 318.6, 255.3),
-    "freiburg2": (520.9, 521.0, 325.1, 249.7),
-    "freiburg3": (535.4, 539.2, 320.1, 247.6),
-    "": (525.0, 525.0, 319.5, 239.5),
-}
-_TUM_SLACK = 0.02  # seconds between a colour image and its depth image
 
 
 def _names(stems: str, suffixes: str) -> list[str]:
@@ -127,82 +230,6 @@ def _read_points(path: Path, unit: str) -> Float:
         raise DataError("points are in millimetres", where=path, found=unit, expected="m or mm")
     points = np.column_stack([uv, xyz[:, 2] / scales[unit]]).astype(np.float64)
     return np.asarray(points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)])
-
-
-class TumInput(PairInput):
-    """TUM RGB-D, official layout, depth in metres.
-
-    `rgb.txt` and `depth.txt` list time stamps and files; a depth image belongs to a colour image
-    within 20 ms. Without `K.txt` or `camera.txt` the intrinsics are those published for the sensor
-    in the name of the folder (freiburg1, 2 or 3), else 525, 525, 319.5, 239.5; lens distortion is
-    not removed.
-    """
-
-    kind: Literal["tum"]
-    """Kind of input."""
-    path: str
-    """Folder of the sequence."""
-    frame: Index = 0
-    """Index of the reference image in rgb.txt."""
-    step: Whole = 1
-    """Distance of the next image."""
-    depth_scale: Positive | None = None
-    """Values per metre of the depth images; null for the 5000 of TUM, with a warning."""
-
-    def load(self, path: Resolve) -> Pair:
-        """See `PairInput`."""
-        folder = Folder(path(self.path), TUM_LAYOUT)
-        images = _tum_list(folder.need("rgb.txt"))
-        depths = folder.read(_tum_list, "depth.txt") or []
-        numbers = self.frame, self.frame + self.step
-        if numbers[1] >= len(images):
-            raise DataError(
-                "frame is not in the sequence",
-                where=folder.path / "rgb.txt",
-                found=numbers[1],
-                expected=f"0 to {len(images) - 1}",
-            )
-        K = folder.read(read_intrinsics, "K.txt", "camera.txt")
-        K = _tum_camera(folder.path) if K is None else K
-        maps = []
-        for time, _ in (images[k] for k in numbers):
-            near = [entry for entry in depths if abs(entry[0] - time) <= _TUM_SLACK]
-            best = [name for _, name in sorted(near, key=lambda entry: abs(entry[0] - time))[:1]]
-            maps.append(folder.read(read_depth, *best, scale=self.depth_scale, usual=TUM_SCALE))
-        files = [folder.need(images[k][1]) for k in numbers]
-        return make_pair(files, [K, K], Truth(maps[0], maps[1]))
-
-
-def _tum_camera(folder: Path) -> Float:
-    """Intrinsics of TUM's sensors, by the name of the folder, with a warning."""
-    sensor = re.search(r"freiburg[123]", str(folder.resolve()))
-    name = sensor.group() if sensor else ""
-    numbers = ",".join(f"{x:g}" for x in _TUM_CAMERAS[name])
-    assumed(
-        folder,
-        "neither K.txt nor camera.txt beside rgb.txt",
-        f"the intrinsics of {name or 'the default camera of TUM RGB-D'}, {numbers}",
-    )
-    return intrinsics(*_TUM_CAMERAS[name])
-
-
-def _tum_list(path: Path) -> list[tuple[float, str]]:
-    """(time stamp in seconds, name of a file) of each line of rgb.txt or depth.txt."""
-    out = []
-    for number, line in enumerate(read_text(path, "file list").splitlines(), 1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        words = line.split()
-        try:
-            out.append((float(words[0]), words[1]))
-        except (ValueError, IndexError):
-            raise DataError(
-                "line of a file list is not understood",
-                where=f"{path}, line {number}",
-                found=repr(line[:60]),
-                expected="'timestamp file'",
-            ) from None
-    return out
 
 
 class MotorcycleInput(PairInput):

@@ -21,7 +21,7 @@ from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
 
 from soup_nlp.arrays import Mask
 from soup_nlp.errors import DataError
-from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
+from soup_nlp.schema.section import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, read_bytes
 
 OUTER = (0.5, 99.5)

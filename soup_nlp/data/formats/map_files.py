@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, FloatMap
 from soup_nlp.data.formats.images import assumed, check_body, decode, decode_png16
 from soup_nlp.errors import DataError, repr_of
-from soup_nlp.schema.limits import MAX_PIXELS, check_image_size
+from soup_nlp.schema.section import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, as_path, read_bytes
 
 Reader = Callable[[PathLike], NDArray[Any]]

@@ -26,7 +26,7 @@ from soup_nlp.data.scenes.things import (
     windows,
 )
 from soup_nlp.geometry import camera, rotation
-from soup_nlp.schema.limits import check_image_size
+from soup_nlp.schema.section import check_image_size
 
 
 def render_scene(
