@@ -8,6 +8,7 @@ import pytest
 from helpers_files import put, raises, write_cam, write_dpt, write_flo, write_kitti_flow
 
 from soup_nlp.config.problem import make_problem
+from soup_nlp.data.datasets.benchmarks import CAMERAS
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.formats.map_files import KITTI_DISPARITY, read_depth_png16
 from soup_nlp.errors import ConfigError
@@ -119,14 +120,14 @@ KITTI = {
     "kitti2012": ("image_0", "calib", "P0", "P1", "disp_occ"),
     "kitti2015": ("image_2", "calib_cam_to_cam", "P_rect_02", "P_rect_03", "disp_occ_0"),
 }
-CAMERAS = "time: 09-Jan\n{}: 100 0 4 5 0 100 3 0 0 0 1 0\n{}: 100 0 4 -49 0 100 3 0 0 0 1 0\n"
+CALIBRATION = "time: 09-Jan\n{}: 100 0 4 5 0 100 3 0 0 0 1 0\n{}: 100 0 4 -49 0 100 3 0 0 0 1 0\n"
 
 
 def kitti(root: Path, kind: str) -> Path:
     images, calibration, left, right, disparities = KITTI[kind]
     for k in (10, 11):
         picture(root / "training" / images / f"000007_{k}.png", k)
-    text = CAMERAS.format(left, right).encode()
+    text = CALIBRATION.format(left, right).encode()
     put(root / "training" / calibration / "000007.txt", text)
     disparity = np.full((H, W), 10 * 256)
     disparity[0, 0] = 0
@@ -164,9 +165,9 @@ def test_kitti_errors(tmp_path: Path, kind: str) -> None:
         with pytest.raises(ConfigError, match=r"input\.index[\s\S]*such as 27 or '000027'"):
             load(kind, root, index=index)
     for text, match in {
-        CAMERAS.format(left, "P9"): f"lacks the numbers of {right}:",
+        CALIBRATION.format(left, "P9"): f"lacks the numbers of {right}:",
         f"{left}: 1 2 3\n{right}: 1 2 3\n": f"lacks the numbers of {left}:",
-        CAMERAS.format(left, right).replace("-49", "5"): "no baseline",
+        CALIBRATION.format(left, right).replace("-49", "5"): "no baseline",
     }.items():
         put(root / "training" / calibration / "000007.txt", text.encode())
         with raises(match):
@@ -185,13 +186,13 @@ def vkitti_flow(path: Path) -> None:
 
 
 def test_vkitti1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("soup_nlp.data.datasets.benchmarks.VKITTI1_CAMERA", (725, 725, 4, 2.5))
+    monkeypatch.setitem(CAMERAS, "Virtual KITTI 1", (725, 725, 4, 2.5))
     for number in (0, 1):
         name = f"0001/clone/{number:05d}.png"
         picture(tmp_path / "vkitti_1.3.1_rgb" / name, number)
         png16(tmp_path / "vkitti_1.3.1_depthgt" / name, np.full((H, W), 1234))
     vkitti_flow(tmp_path / "vkitti_1.3.1_flowgt" / "0001/clone/00000.png")
-    with pytest.warns(DataWarning, match="assumed: fx,fy,cx,cy 725.* of 1242 x 375"):
+    with pytest.warns(DataWarning, match="assumed: fx,fy,cx,cy 725.* for 1242 x 375"):
         pair = load("vkitti1", tmp_path, scene="0001", frame=0)
     np.testing.assert_allclose(pair.truth.depth_next, 12.34)
     assert pair.truth.flow[1, 1].tolist() == [W - 1, H - 1]
@@ -224,7 +225,7 @@ def test_vkitti2(tmp_path: Path) -> None:
 
 
 def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("soup_nlp.data.datasets.benchmarks.DEFAULT_CAMERA", (688, 688, 4, 2.5))
+    monkeypatch.setitem(CAMERAS, "alley_1", (688, 688, 4, 2.5))
     base = tmp_path / "training"
     for scene in ("cave_2", "alley_1"):
         for number in (1, 2):
@@ -234,7 +235,7 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert pair.K_ref[0, 0] == 688
     # the default camera is that of alley_1, but the warning still says that no file gives it
     with pytest.warns(
-        DataWarning, match=r"camdata_left.*assumed: the focal length of alley_1, 688 pixels$"
+        DataWarning, match=r"camdata_left.*assumed: fx,fy,cx,cy 688,688,4,2.5 of alley_1$"
     ):
         assert load("sintel", tmp_path, scene="alley_1", frame=1, render="final").K_ref[0, 0] == 688
     for number, focal in ((1, 100.0), (2, 120.0)):
@@ -259,17 +260,15 @@ def test_sintel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cameras = {"freiburg3": (535.4, 539.2, 4, 2.5), "": (525, 525, 4, 2.5)}
-    monkeypatch.setattr("soup_nlp.data.datasets.benchmarks._TUM_CAMERAS", cameras)
+    monkeypatch.setitem(CAMERAS, "freiburg3", (535.4, 539.2, 4, 2.5))
+    monkeypatch.setitem(CAMERAS, "TUM RGB-D", (525, 525, 4, 2.5))
     root = tmp_path / "rgbd_dataset_freiburg3_x"
     for k in range(3):
         picture(root / "rgb" / f"{k}.png", k)
         png16(root / "depth" / f"{k}.png", np.full((H, W), 5000 * (k + 1)))
     (root / "rgb.txt").write_text("# colour\n1.00 rgb/0.png\n1.03 rgb/1.png\n1.06 rgb/2.png\n")
     (root / "depth.txt").write_text("1.001 depth/0.png\n1.2 depth/1.png\n1.055 depth/2.png\n")
-    with pytest.warns(
-        DataWarning, match=r"assumed: the intrinsics of freiburg3, 535.4,539.2,4,2.5"
-    ):
+    with pytest.warns(DataWarning, match=r"assumed: fx,fy,cx,cy 535.4,539.2,4,2.5 of freiburg3"):
         pair = load("tum", root, frame=0, step=2, depth_scale=5000.0)
     assert pair.K_ref[0, 0] == 535.4
     np.testing.assert_array_equal(pair.truth.depth_ref, 1.0)
@@ -285,7 +284,7 @@ def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert load("tum", root, depth_scale=5000.0).K_ref[0, 0] == 90
     (root / "K.txt").unlink()
     other = root.rename(tmp_path / "other")
-    with pytest.warns(DataWarning, match="assumed: the intrinsics of the default camera"):
+    with pytest.warns(DataWarning, match="assumed: .* of TUM RGB-D"):
         assert load("tum", other, depth_scale=5000.0).K_ref[0, 0] == 525
     other.rename(root)
     (root / "K.txt").write_text("90 91 4 3")
@@ -340,9 +339,9 @@ def test_real_pairs(shared_data: Path) -> None:
     finite = np.isfinite(disparity)
     np.testing.assert_array_equal(np.isfinite(depth), finite)
     np.testing.assert_allclose(depth[finite] * disparity[finite], 718.856 * 0.53717, rtol=1e-4)
-    with pytest.warns(DataWarning, match="688 pixels"):
+    with pytest.warns(DataWarning, match="688,688"):
         sintel = load("sintel", shared_data / "sintel", scene="alley_1", frame=2)
-    with pytest.warns(DataWarning, match="688 pixels"):
+    with pytest.warns(DataWarning, match="688,688"):
         far = load("sintel", shared_data / "sintel", scene="alley_1", frame=20, step=5)
     assert str(sintel.truth) == "Truth(flow; m)"
     assert "depth_ref" in str(far)

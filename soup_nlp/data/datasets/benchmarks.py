@@ -11,6 +11,7 @@ from pydantic import BeforeValidator
 from soup_nlp.arrays import Float
 from soup_nlp.data.datasets.folders import Folder, PairInput, Resolve, make_pair
 from soup_nlp.data.formats.camera_files import check_intrinsics, number, read_cam, read_intrinsics
+from soup_nlp.data.formats.cameras import written
 from soup_nlp.data.formats.images import assumed, decode, read_mask
 from soup_nlp.data.formats.map_files import (
     KITTI_DISPARITY,
@@ -50,30 +51,37 @@ _VKITTI = {
 }
 """Paths of image, depth and flow; {} stands for scene, variation and frame, * for a version."""
 
-VKITTI1_CAMERA = (725.0, 725.0, 620.5, 187.0)
-"""fx, fy, cx, cy of every Virtual KITTI 1 image, pixels."""
-VKITTI1_TEXT = "fx,fy,cx,cy 725,725,620.5,187, of its images of 1242 x 375"
-
 SINTEL_LAYOUT = (
     "training/{clean,final,albedo}/SCENE/frame_NNNN.png; optional "
     "camdata_left/SCENE/frame_NNNN.cam, depth/SCENE/frame_NNNN.dpt, "
     "flow/SCENE/frame_NNNN.flo, invalid/SCENE/frame_NNNN.png"
 )
-DEFAULT_CAMERA = (688.00006, 688.00006, 511.5, 217.5)
-"""fx, fy, cx, cy of `DEFAULT_SCENE`, pixels; other scenes differ (some have 1120)."""
 DEFAULT_SCENE = "alley_1"
+"""Scene of Sintel whose camera is assumed; that of other scenes differs (some have 1120 pixels)."""
 
 TUM_SCALE = 5000.0
 """Values per metre of a TUM RGB-D depth image."""
 
 TUM_LAYOUT = "rgb.txt, depth.txt, rgb/*.png, depth/*.png, optional K.txt or camera.txt"
-_TUM_CAMERAS = {
+TUM_SLACK = 0.02
+"""Largest time between a colour image and its depth image, seconds."""
+
+CAMERAS = {
+    "Virtual KITTI 1": (725.0, 725.0, 620.5, 187.0),
+    DEFAULT_SCENE: (688.00006, 688.00006, 511.5, 217.5),
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
-    "": (525.0, 525.0, 319.5, 239.5),
+    "TUM RGB-D": (525.0, 525.0, 319.5, 239.5),
 }
-_TUM_SLACK = 0.02  # seconds between a colour image and its depth image
+"""fx, fy, cx, cy, pixels, of data sets, scenes or sensors, for folders without a camera file."""
+
+
+def assumed_camera(name: str, where: Path, missing: str, doubt: str = "") -> Float:
+    """A camera of `CAMERAS`, with a warning."""
+    K = intrinsics(*CAMERAS[name])
+    assumed(where, missing, f"fx,fy,cx,cy {written(K)} of {name}{doubt}")
+    return K
 
 
 def _pair_number(index: object) -> str:
@@ -183,8 +191,9 @@ class VkittiInput(SceneFrames):
 
         images = [folder.need(file(image, number)) for number in numbers]
         if self.kind == "vkitti1":
-            cameras = [intrinsics(*VKITTI1_CAMERA)] * 2
-            assumed(folder.path, "Virtual KITTI 1 has no file of its camera", VKITTI1_TEXT)
+            missing = "Virtual KITTI 1 has no file of its camera"
+            K = assumed_camera("Virtual KITTI 1", folder.path, missing, ", for 1242 x 375")
+            cameras = [K, K]
         else:
             table = folder.need(f"{self.scene}/{self.variation}/intrinsic.txt")
             rows = read_rows(table, [f"{number} 0" for number in numbers], 4)
@@ -199,7 +208,7 @@ class SintelInput(SceneFrames):
     """MPI Sintel with its depth and camera extension; depth is in the scene's unit.
 
     Pixels of the mask `invalid` have no true flow. Without `camdata_left` the camera is
-    `DEFAULT_CAMERA`, with a warning.
+    that of `DEFAULT_SCENE`, with a warning.
     """
 
     kind: Literal["sintel"]
@@ -217,12 +226,10 @@ class SintelInput(SceneFrames):
         absent = [name for name, K in zip(names, cameras, strict=True) if K is None]
         if absent:
             doubt = f", which may be wrong for {self.scene}" * (self.scene != DEFAULT_SCENE)
-            assumed(
-                folder.path / "camdata_left" / f"{absent[0]}.cam",
-                "no such camera file (camdata_left comes with Sintel's depth training data)",
-                f"the focal length of {DEFAULT_SCENE}, {DEFAULT_CAMERA[0]:g} pixels{doubt}",
-            )
-        cameras = [intrinsics(*DEFAULT_CAMERA) if K is None else K for K in cameras]
+            file = folder.path / "camdata_left" / f"{absent[0]}.cam"
+            missing = "no such camera file (camdata_left comes with Sintel's depth training data)"
+            default = assumed_camera(DEFAULT_SCENE, file, missing, doubt)
+            cameras = [default if K is None else K for K in cameras]
         flow = invalid = None
         if self.step == 1:
             flow = folder.read(read_flow, f"flow/{names[0]}.flo")
@@ -268,27 +275,17 @@ class TumInput(PairInput):
                 expected=f"0 to {len(images) - 1}",
             )
         K = folder.read(read_intrinsics, "K.txt", "camera.txt")
-        K = _tum_camera(folder.path) if K is None else K
+        if K is None:
+            sensor = re.search(r"freiburg[123]", str(folder.path.resolve()))
+            missing = "neither K.txt nor camera.txt beside rgb.txt"
+            K = assumed_camera(sensor.group() if sensor else "TUM RGB-D", folder.path, missing)
         maps = []
         for time, _ in (images[k] for k in numbers):
-            near = [entry for entry in depths if abs(entry[0] - time) <= _TUM_SLACK]
+            near = [entry for entry in depths if abs(entry[0] - time) <= TUM_SLACK]
             best = [name for _, name in sorted(near, key=lambda entry: abs(entry[0] - time))[:1]]
             maps.append(folder.read(read_depth, *best, scale=self.depth_scale, usual=TUM_SCALE))
         files = [folder.need(images[k][1]) for k in numbers]
         return make_pair(files, [K, K], Truth(maps[0], maps[1]))
-
-
-def _tum_camera(folder: Path) -> Float:
-    """Intrinsics of TUM's sensors, by the name of the folder, with a warning."""
-    sensor = re.search(r"freiburg[123]", str(folder.resolve()))
-    name = sensor.group() if sensor else ""
-    numbers = ",".join(f"{x:g}" for x in _TUM_CAMERAS[name])
-    assumed(
-        folder,
-        "neither K.txt nor camera.txt beside rgb.txt",
-        f"the intrinsics of {name or 'the default camera of TUM RGB-D'}, {numbers}",
-    )
-    return intrinsics(*_TUM_CAMERAS[name])
 
 
 def _tum_list(path: Path) -> list[tuple[float, str]]:
