@@ -9,12 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import yaml
 from pydantic import AfterValidator, Field, ValidationError
 
 from soup_nlp.config.trees import PRESETS, Dumper, merged, override, parse
 from soup_nlp.data.flow.sources import FlowOptions
-from soup_nlp.data.inputs import Input, PriorOptions
+from soup_nlp.data.inputs import Input, PriorOptions, pair_hash
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, expect, printable
 from soup_nlp.model.energy_options import EnergyOptions
@@ -34,6 +35,7 @@ from soup_nlp.schema.section import (
 from soup_nlp.solve.solver_options import SolverOptions, refuse_libraries
 from soup_nlp.start.start_options import StartOptions
 from soup_nlp.storage.files import MOST_YAML, as_path, is_file, is_folder, read_text
+from soup_nlp.storage.folders import digest_of
 
 LONGEST_NAME = 100
 """Characters of a problem's name."""
@@ -86,6 +88,14 @@ def _is_title(text: str) -> str:
     return text
 
 
+_FILES = {
+    "input": ("ref", "next", "intrinsics", "intrinsics_next", "depth", "depth_next"),
+    "flow": ("source", "backward", "confidence"),
+    "depth_prior": ("source",),
+}
+"""Keys that may name a file."""
+
+
 class Problem(Section):
     """One problem file."""
 
@@ -134,6 +144,30 @@ class Problem(Section):
         """Hash of all options that change the result: without names, folder and output files."""
         tree = self.model_dump(mode="json", exclude={"name", "base", "preset", "output"})
         return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:12]
+
+    def identity(self) -> str:
+        """Hash of the contents of images, cameras, truth, flow and prior, and of the options.
+
+        Names and places of files do not count: a data set that was moved is the same, a file that
+        was replaced under its name is another one. Of data sets the pair that they hold counts.
+
+        Raises:
+            SoupError: the pair cannot be loaded, or a file cannot be read.
+        """
+        tree = self.model_dump(mode="json", exclude={"name", "base", "preset", "expected"})
+        if self.input.kind not in ("files", "scene"):
+            pair = self.load_pair()
+            tree["input"] = {"pair": pair_hash(pair)}
+            for key in ("depth_ref", "depth_next", "points", "flow"):
+                if (known := getattr(pair.truth, key, None)) is not None:
+                    content = np.ascontiguousarray(known).tobytes()
+                    tree["input"][key] = hashlib.sha256(content).hexdigest()
+        for section, keys in _FILES.items():
+            for key in keys:
+                name = tree[section].get(key)
+                if isinstance(name, str) and (section == "input" or self.path(name).is_file()):
+                    tree[section][key] = digest_of(self.path(name))
+        return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
     def subject(self) -> str:
@@ -294,9 +328,7 @@ USUAL = (
 def dump_problem(problem: Problem, all_keys: bool = True) -> str:
     """The merged problem as YAML with a comment on every key; it can be solved again.
 
-    Args:
-        problem: The problem.
-        all_keys: Write all keys, not only those of `USUAL` and those that are not at a default.
+    Without `all_keys`, only keys of `USUAL` and those that are not at a default are written.
     """
     return "\n".join(_write(problem, "", "", all_keys)) + "\n"
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from soup_nlp.config.identity import identity
 from soup_nlp.export.artefact import form_label
 from soup_nlp.export.solvers import WALL_PER_CPU, Answer, Task, find_solver
 from soup_nlp.export.verify import ENERGY_SLACK, Limits, examine
@@ -82,7 +81,7 @@ def problem_task(case: Case, coordinates: str) -> Labelled:
     ceiling = oracle.energy(case.start.soup, case.data, case.weights)["total"]
     label = {
         "problem": case.problem.name,
-        "identity": identity(case.problem),
+        "identity": case.problem.identity(),
         "superpixels": len(case),
         "formulation": form_label(form),
         "start": "proposal",

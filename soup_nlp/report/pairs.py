@@ -8,7 +8,6 @@ from typing import Required
 import psutil
 from typing_extensions import TypedDict
 
-from soup_nlp.config.identity import identity
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.pipeline.case import solve_bytes
@@ -50,7 +49,7 @@ def head(problem: Problem) -> Row:
         SoupError: a file of the pair cannot be read.
     """
     own = {"key": problem.name, "pair": problem.name, "seed": problem.seed}
-    return {**own, "identity": identity(problem), "code": code_version()}
+    return {**own, "identity": problem.identity(), "code": code_version()}
 
 
 def kept_rows(folder: Path, heads: Mapping[str, Row]) -> dict[str, Row]:

@@ -19,7 +19,6 @@ from soup_nlp.batches.page import interval, page
 from soup_nlp.batches.run import _claimed, batch, table
 from soup_nlp.batches.sources import problems_of
 from soup_nlp.cli.main import main
-from soup_nlp.config.identity import identity
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
@@ -120,7 +119,7 @@ def test_the_same_input_has_the_same_contents(pairs, tmp_path):
         (problem,) = problems_of(
             [{"input": {"kind": "folder", "path": str(folder)}, **keys}]
         ).values()
-        return identity(problem)
+        return problem.identity()
 
     before = named(place)
     assert before == named(pairs / "0_orbit", name="other")
@@ -132,7 +131,7 @@ def test_the_same_input_has_the_same_contents(pairs, tmp_path):
     def files(**keys: object) -> str:
         names = {"ref": "frame_0.png", "next": "frame_1.png", "intrinsics": "K.txt"}
         raw = {"input": {"kind": "files", **names}, "base": str(place), **keys}
-        return identity(make_problem(raw))
+        return make_problem(raw).identity()
 
     np.save(place / "flow.npy", np.zeros((64, 96, 2)))
     flow = {"flow": {"source": "flow.npy"}}
