@@ -12,9 +12,8 @@ from scipy import sparse
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ModelError
-from soup_nlp.model.kernel import Group, Hessian
-from soup_nlp.model.pattern import Pattern, hessian_entries, jacobian_entries
-from soup_nlp.model.vectors import Vectors
+from soup_nlp.model.kernel import Group, Hessian, Pattern, hessian_entries, jacobian_entries
+from soup_nlp.model.operations import Vectors
 
 Terms = tuple[int, list[Vectors]]
 """Size of a vector, and functions of kernels over their tables, whose entries it is the sum of."""

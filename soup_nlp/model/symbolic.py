@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from soup_nlp.model.kernel import Pattern
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.pattern import Pattern
 
 
 class Graph:

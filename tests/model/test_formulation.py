@@ -23,8 +23,8 @@ from hypothesis import strategies as st
 from soup_nlp.errors import ModelError
 from soup_nlp.model import oracle
 from soup_nlp.model.elements import TERMS
+from soup_nlp.model.kernel import Pattern
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
-from soup_nlp.model.pattern import Pattern
 from soup_nlp.model.programs import build_tangent_nlp, exact_chart
 from soup_nlp.model.symbolic import Graph
 

@@ -8,7 +8,7 @@ import pytest
 from helpers_nl import plain_nlp
 
 from soup_nlp.errors import ModelError
-from soup_nlp.model import vectors
+from soup_nlp.model import operations
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.nlp import NLP
@@ -44,7 +44,7 @@ def squares(elements: int, of=lambda x: x) -> NLP:
 
 @pytest.mark.parametrize("elements", [1, 7, 8, 9, 26])
 def test_sums_of_every_size_have_the_values_of_their_formula(elements, monkeypatch):
-    monkeypatch.setattr(vectors, "BLOCK", 8)
+    monkeypatch.setattr(operations, "BLOCK", 8)
     nlp = squares(elements)
     x, e = nlp.x0, np.arange(elements) + 1
     weight = np.linspace(1.0, 2.0, elements)
@@ -112,8 +112,8 @@ def test_every_operation_has_casadis_value(every, block, monkeypatch):
     kernel = Kernel("every", ca.SX.sym("a"), ca.SX.sym("b"), ca.SX(0, 1))
     group = Group(kernel, np.arange(count)[:, None], data, np.zeros((count, 0), np.int64))
     out = np.ones(4 * width + 1)
-    monkeypatch.setattr(vectors, "BLOCK", block)
-    term = vectors.Vectors(every, group, place, 4 * width)
+    monkeypatch.setattr(operations, "BLOCK", block)
+    term = operations.Vectors(every, group, place, 4 * width)
     term.add(out, x, np.zeros(0), 1.0, None)
     expected = np.array([np.asarray(every(*pair, [])).ravel() for pair in zip(x, data.ravel())])
     sums = 1 + expected[::2] + expected[1::2]
