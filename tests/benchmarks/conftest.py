@@ -13,7 +13,7 @@ from soup_nlp.pipeline.case import prepare
 EPIGRAPH = "unit-translation/epigraph"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def record() -> Frozen:
     """Thirty superpixels of a small room with the true flow; its best point is the proposal."""
     scene = {"kind": "scene", "scene": "room", "seed": 1, "width": 256, "height": 128}
@@ -24,12 +24,10 @@ def record() -> Frozen:
 @pytest.fixture(scope="module")
 def folder(record, tmp_path_factory):
     """The set of that record, under the names of a published size."""
-    out = tmp_path_factory.mktemp("set")
-    patch = pytest.MonkeyPatch()
-    patch.setattr(write, "load_frozen", lambda scene, size: record)
+    out, lines = tmp_path_factory.mktemp("set"), []
     chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [EPIGRAPH], ["hard"])
-    lines: list[str] = []
-    write_family(out, chosen, lines.append)
-    assert len(lines) == len(chosen) == 4
-    yield out
-    patch.undo()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(write, "load_frozen", lambda scene, size: record)
+        write_family(out, chosen, lines.append)
+        assert len(lines) == len(chosen) == 4
+        yield out

@@ -152,7 +152,6 @@ def test_the_package_has_a_record_of_every_size():
             assert f"SOUP-{scene}-unit-offset-smooth-N{size}-easy" in known["sha256"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["orbit", "street"])
 def test_an_instance_has_the_published_bytes(scene, tmp_path):
     instance = Instance(scene, STANDARD, 100, "hard")
