@@ -346,12 +346,20 @@ def test_weights_are_shares_across_components_and_factors_where_surfaces_bend():
     np.testing.assert_allclose(found.orient_weight, steep * data.orient_weight)
 
 
-def test_what_a_prior_decides_keeps_its_slopes():
+def test_what_a_prior_decides_keeps_its_slopes_and_has_its_depths():
     data, soup = tiny("pixels").data, tiny().soup
+    part = np.arange(len(soup)) % 2
     opened = np.where(np.arange(len(soup)) < 7, 1.0, 0.0)
-    prior = np.log(soup.depth_at(data.anchor_ray)), opened, np.full(len(soup), 0.12)
-    known = of_scene(len(soup), prior=prior)
-    found = weighted(replace(data, orient_turn=0 * data.orient_turn), soup, known, EnergyOptions())
+    log_depth = np.log(soup.depth_at(data.anchor_ray))
+    known = of_scene(len(soup), component=part, prior=(log_depth, opened, np.full(len(soup), 0.12)))
+    plain = replace(data, orient_turn=0 * data.orient_turn)
+    found = weighted(plain, soup, known, EnergyOptions(across=1.0, arap_scene=0.0))
+    i, k = data.edges.T
+    # between components the flow says nothing
+    by_prior = np.where(part[i] == part[k], np.maximum(opened[i], opened[k]), 1.0)
+    np.testing.assert_allclose(found.depth_weight, by_prior * data.prior_weight / 0.12)
+    np.testing.assert_allclose(found.depth_change, log_depth[i] - log_depth[k])
+    np.testing.assert_allclose(found.prior_weight, (1 - by_prior) * data.prior_weight)
     held = opened[data.pairs].all(axis=1)
     assert 0 < held.sum() < len(held)
     cost = oracle.values("orient", soup, found, Weights())

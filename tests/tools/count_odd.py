@@ -22,14 +22,8 @@ from soup_nlp.storage.each import each
 SECONDS = 120
 
 
-def found_in(case: Case, world: World, folder: Path) -> str | None:
-    """The fault of a case, found in a child process."""
-    work = partial(_fault, case, world, folder)
-    ((_, row),) = each({case.name: work}, fresh=True, seconds=SECONDS)
-    return row.get("fault", row["error"])
-
-
-def _fault(case: Case, world: World, folder: Path) -> dict[str, str | None]:
+def row_of(case: Case, world: World, folder: Path) -> dict[str, str | None]:
+    """The row of a case."""
     return {"fault": fault(case, world, folder, SECONDS)}
 
 
@@ -44,14 +38,13 @@ def main() -> None:
             folder = Path(scratch) / f"case_{k}"
             folder.mkdir()
             begin = time.perf_counter()
-            found = found_in(case, world, folder)
+            work = partial(row_of, case, world, folder)
+            ((_, row),) = each({case.name: work}, fresh=True, seconds=SECONDS)
             total[case.group] += 1
-            if found:
+            if found := row.get("fault", row["error"]):
                 bad[case.group] += 1
-                print(
-                    f"{case.group}  {case.name}  {time.perf_counter() - begin:.1f} s  {found}",
-                    flush=True,
-                )
+                seconds = time.perf_counter() - begin
+                print(f"{case.group}  {case.name}  {seconds:.1f} s  {found}", flush=True)
     print("\nclass                    cases   not as promised")
     for group in sorted(total):
         print(f"{group:<24} {total[group]:>5} {bad[group]:>8}")

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.context import ForkProcess
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -222,9 +223,8 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         (root / "tmp").mkdir()
-        os.environ["TMPDIR"] = str(root / "tmp")
-        every = commands(root, names)
-        try:
+        with patch.dict(os.environ, TMPDIR=str(root / "tmp")):
+            every = commands(root, names)
             for command in every:
                 name, folder = command.name, command.folder
                 _, seconds = run(command.words)
@@ -247,8 +247,6 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
                         shutil.rmtree(path)
                 ended, bad = f"exit {run(command.words)[0]}", broken(folder)
                 told(rows, command=name, signal="none", ended=ended, broken=bad)
-        finally:
-            del os.environ["TMPDIR"]
     return rows
 
 

@@ -17,8 +17,8 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cosmic_ray.plugins
 from constraint_mutants import copied, killer
@@ -30,16 +30,9 @@ SKIPPED += ("_LShift", "_RShift")
 """Operators that are left out: bits of floats are a TypeError, which any test sees."""
 
 
-@dataclass(frozen=True)
-class Mutant:
-    """One changed place.
-
-    Attributes:
-        path: Of the module, from the root.
-        line: First line of the change.
-        operator: Name of cosmic-ray's operator.
-        occurrence: Which of its places.
-    """
+class Mutant(NamedTuple):
+    """One changed place: a module from the root, its line, cosmic-ray's operator, which of its
+    places."""
 
     path: str
     line: int
