@@ -1,12 +1,12 @@
 """Camera files of common tools: the right value, or a refusal that says expected and try."""
 
-import io
 import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers_files import npy, npz
 
 from soup_nlp.data.formats.camera_files import read_camera
 from soup_nlp.errors import DataError
@@ -19,18 +19,6 @@ FOUR = "fx: 256\nfy: 257\ncx: 159.5\ncy: 119.5\n"
 GROUP = {"fx": 256, "fy": 257, "cx": 159.5, "cy": 119.5}
 KALIBR = "  camera_model: {}\n  distortion_model: {}\n  distortion_coeffs: {}\n  intrinsics: {}\n"
 LIST = "[256, 257, 159.5, 119.5]"
-
-
-def npy(values: object) -> bytes:
-    stream = io.BytesIO()
-    np.save(stream, np.asarray(values))
-    return stream.getvalue()
-
-
-def npz(**arrays: object) -> bytes:
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)
-    return stream.getvalue()
 
 
 def opencv(name: str, values: str, rows: int) -> str:

@@ -1,6 +1,5 @@
 """Files of flow, depth, cameras and images: golden bytes, real and malformed files."""
 
-import io
 import struct
 from functools import partial
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import put, raises, write_cam, write_dpt, write_kitti_flow
+from helpers_files import npy, npz, put, raises, write_cam, write_dpt, write_kitti_flow
 from PIL import Image
 
 from soup_nlp.data.datasets import benchmarks
@@ -29,20 +28,6 @@ def stored(path: Path, content: bytes | str | np.ndarray) -> Path:
         cv2.imwrite(str(path), content)
         return path
     return put(path, content if isinstance(content, bytes) else content.encode())
-
-
-def npy(values: object) -> bytes:
-    """Content of a .npy file."""
-    stream = io.BytesIO()
-    np.save(stream, np.asarray(values))
-    return stream.getvalue()
-
-
-def npz(**arrays: np.ndarray) -> bytes:
-    """Content of a .npz file."""
-    stream = io.BytesIO()
-    np.savez(stream, **arrays)
-    return stream.getvalue()
 
 
 def sized(width: int, height: int, count: int) -> bytes:

@@ -71,22 +71,6 @@ def test_malformed_exif_is_a_warning(data: bytes, folder: Path) -> None:
     assert pair.K_ref[0, 0] == pytest.approx(1.2 * 96)
 
 
-@pytest.mark.parametrize("kind", [b"MPF\0nonsense", b"ICC_PROFILE\0\x01\x01nonsense"])
-def test_other_malformed_metadata_is_ignored(kind: bytes, folder: Path) -> None:
-    Image.fromarray(texture()).save(folder / "a.jpg")
-    content = (folder / "a.jpg").read_bytes()
-    segment = b"\xff\xe2" + struct.pack(">H", len(kind) + 2) + kind
-    (folder / "a.jpg").write_bytes(content[:2] + segment + content[2:])
-    pair, text = said(folder, "a.jpg")
-    assert text.count("\n") == 0
-    assert pair.image_ref.shape == (64, 96, 3)
-
-
-def test_exif_of_other_types_is_ignored(folder: Path) -> None:
-    photo(folder / "a.tif", FocalLength=(1, 0), FocalPlaneXResolution=(0, 0))
-    assert said(folder, "a.tif")[0].K_ref[0, 0] == pytest.approx(1.2 * 96)
-
-
 SENSOR = {"FocalPlaneXResolution": 4438.36, "FocalPlaneResolutionUnit": 2}
 LENS_18 = {"FocalLength": 18.0, **SENSOR}
 PER_CM = {"FocalPlaneXResolution": 1200.0, "FocalPlaneResolutionUnit": 3}

@@ -18,12 +18,20 @@ pytestmark = pytest.mark.slow
 K = intrinsics(90.0, 80.0, 47.3, 30.1)
 
 
+N, T = np.array([0.1, 0.2, -1.0]), np.array([0.3, -0.1, 0.2])
+"""Normal of a plane, translation of the camera."""
+
+
+def plane(camera: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and flow of the plane in an image."""
+    ray = rays(camera, pixel_grid(height, width))
+    depth = 5.0 / -(ray @ N)
+    return depth, project(camera, depth[..., None] * ray + T) - pixel_grid(height, width)
+
+
 def plane_pair(height=60, width=96) -> Pair:
-    """A plane seen by two cameras: flow and depth follow from it exactly."""
-    n, t = np.array([0.1, 0.2, -1.0]), np.array([0.3, -0.1, 0.2])
-    ray = rays(K, pixel_grid(height, width))
-    depth = 5.0 / -(ray @ n)
-    flow = project(K, depth[..., None] * ray + t) - pixel_grid(height, width)
+    """The plane seen by two cameras: flow and depth follow from it exactly."""
+    depth, flow = plane(K, height, width)
     confidence = np.ones((height, width), np.float32)
     # unusable displacements must not be averaged into usable ones
     flow[20:23, 20:23], confidence[20:23, 20:23] = 1e4, 0.0
@@ -38,10 +46,8 @@ def test_a_smaller_pair_sees_the_same_plane():
     small = working_size(pair, 0.0026)
     height, width = small.size
     assert height * width <= 2600 * 1.02
-    n, t = np.array([0.1, 0.2, -1.0]), np.array([0.3, -0.1, 0.2])
-    ray = rays(small.K_ref, pixel_grid(height, width))
-    depth = 5.0 / -(ray @ n)
-    flow = project(small.K_next, depth[..., None] * ray + t) - pixel_grid(height, width)
+    depth, flow = plane(small.K_ref, height, width)
+    np.testing.assert_array_equal(small.K_next, small.K_ref)
     # the average over a pixel differs from its centre by the second order of the flow
     good = small.flow.confidence == 1
     assert good.mean() > 0.95
@@ -49,7 +55,7 @@ def test_a_smaller_pair_sees_the_same_plane():
     # the truth is that of the nearest pixel, half a pixel away at most
     np.testing.assert_allclose(small.truth.depth_ref, depth, rtol=0.02)
     at = small.truth.points[0]
-    assert 5.0 / -(rays(small.K_ref, at[:2]) @ n) == pytest.approx(at[2], rel=1e-12)
+    assert 5.0 / -(rays(small.K_ref, at[:2]) @ N) == pytest.approx(at[2], rel=1e-12)
 
 
 def test_what_is_small_enough_is_not_touched():
@@ -79,8 +85,7 @@ def test_planes_are_exact_at_every_pixel():
     pair = plane_pair()
     labels = np.zeros(pair.size, np.int32)
     labels[:5] = -1
-    plane = np.array([[0.1, 0.2, -1.0]]), np.array([5.0])
-    z = full_depth(labels, pair.image_ref, pair.image_ref, *plane, K)
+    z = full_depth(labels, pair.image_ref, pair.image_ref, N[None], np.array([5.0]), K)
     assert np.isnan(z[:5]).all()
     np.testing.assert_allclose(z[5:], pair.truth.depth_ref[5:], rtol=1e-6)
 

@@ -1,5 +1,6 @@
 """Files that readers are tested with, written by hand; overrides."""
 
+import io
 import struct
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,6 +41,20 @@ def write_kitti_flow(path: Path, flow: np.ndarray) -> None:
     code = np.rint(np.where(valid[..., None], flow, 0.0) * 64.0 + 2.0**15) * valid[..., None]
     bgr = np.dstack([valid, code[..., 1], code[..., 0]]).astype(np.uint16)
     put(path, cv2.imencode(".png", bgr)[1].tobytes())
+
+
+def npy(values: object) -> bytes:
+    """Content of a .npy file."""
+    stream = io.BytesIO()
+    np.save(stream, np.asarray(values))
+    return stream.getvalue()
+
+
+def npz(**arrays: object) -> bytes:
+    """Content of a .npz file."""
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
 
 
 def sets(text: str) -> list[str]:
