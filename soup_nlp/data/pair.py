@@ -39,10 +39,7 @@ def check_size(
     where: object,
     hint: str | None = None,
 ) -> None:
-    """Raise DataError unless two shapes, which may have more axes, have equal (height, width).
-
-    `what` names both arrays, e.g. "flow and reference image".
-    """
+    """Raise DataError unless two shapes, which may have more axes, have equal (height, width)."""
     if shape[:2] != expected[:2]:
         raise DataError(
             f"{what} differ in size",
@@ -303,12 +300,7 @@ class Pair:
         return replace(self, flow=flow)
 
     def with_focal(self, factor: float, sigma: float) -> Self:
-        """The same pair with focal lengths times a factor.
-
-        Args:
-            factor: Ratio of the new focal lengths to the present ones.
-            sigma: Standard deviation of the log of the new ones.
-        """
+        """The same pair with focal lengths times a factor; `sigma` is that of their logarithm."""
         longer = np.array([[factor, factor, 1.0]] * 2 + [[1.0] * 3])
         K_ref, K_next = longer * self.K_ref, longer * self.K_next
         return replace(self, K_ref=K_ref, K_next=K_next, focal_sigma=sigma)

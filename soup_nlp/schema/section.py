@@ -176,10 +176,7 @@ Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
 
 
 def check_image_size(width: int, height: int, what: str, where: object) -> None:
-    """Raise DataError unless an image of `width` x `height` pixels is within the limits.
-
-    `what` and `where` name the image and its file or array in the message.
-    """
+    """Raise DataError unless an image of `width` x `height` pixels is within the limits."""
     size = f"{width} x {height} (width x height)"
     if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and width * height <= MAX_PIXELS):
         raise DataError(

@@ -42,11 +42,7 @@ def failed(row: Mapping[str, Any]) -> bool:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Rows of a JSON-lines file in order, without lines that a crash cut off.
-
-    Raises:
-        DataError: the file cannot be read or is not a regular file.
-    """
+    """Rows of a JSON-lines file in order, without lines that a crash cut off."""
     if not os.path.lexists(path) or (is_file(path) and not path.stat().st_size):
         return []
     out = []
@@ -61,11 +57,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Append a row and wait until it is on disk; terminate a line that a crash cut off first.
-
-    Raises:
-        DataError: the file cannot be written.
-    """
+    """Append a row and wait until it is on disk; terminate a line that a crash cut off first."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab+") as file:
@@ -102,9 +94,6 @@ def measure_all(
         after: Called with all rows so far, in the order of the jobs, after every new row and at the
             end.
         options: Further options of `each`.
-
-    Raises:
-        DataError: the file cannot be written.
     """
     code = code_version()
     names = [_identity(job.name) for job in jobs]
