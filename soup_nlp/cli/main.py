@@ -1,6 +1,6 @@
-"""The command line: exit code 0 good, 1 not converged or a claim fails, 2 bad input, 3 (check) a
-point of another solver is feasible but not stationary, 70 a bug, 130 Ctrl-C. An unexpected
-exception becomes a bug report in a file.
+"""The command line: exit code 0 good, 1 not converged (interrupted too) or a claim fails, 2 bad
+input, 3 (check) a point of another solver is feasible but not stationary, 70 a bug, 130 Ctrl-C
+before there was anything to keep, 141 a closed pipe. A bug is reported in a file.
 """
 
 import ast
@@ -84,26 +84,20 @@ COMMANDS: Mapping[str, str] = {
     "view": "results:view",
     "check": "results:check",
     "chain": "solve:chain",
-    "batch": "batch:batch",
+    "batch": "solve:batch",
     "convert": "results:convert",
     "evaluate": "results:evaluate",
     "show": "problems:show",
     "list": "problems:list_",
-    "export": "exports:export",
+    "export": "problems:export",
     "import": "results:import_",
-    "compare": "compare:compare",
+    "compare": "problems:compare",
 }
 """Module and function under `soup_nlp.cli`, by command; in this order the help lists them."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Returns:
-        0 good, 1 not converged (interrupted too) or a claim fails, 2 bad input, 3 a point of
-        another solver is feasible but not stationary, 70 a bug, 130 interrupted before there was
-        anything to keep, or twice: no result is written.
-    """
+    """Run the command line; returns the exit code."""
     prepare_streams()
     if argv is None:
         # pictures go to files, so that the backend of the user does not matter

@@ -1,16 +1,43 @@
-"""Commands show and list: problems as text."""
+"""Commands show, list, export and compare: problems as text, as files, and for other solvers."""
 
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from soup_nlp.cli import options
-from soup_nlp.cli.options import option
-from soup_nlp.config.problem import description, dump_problem, load_problem, shipped_problems
+from soup_nlp.cli.options import Words, option, out_option
+from soup_nlp.config.problem import (
+    description,
+    dump_problem,
+    load_problem,
+    shipped_problems,
+    title,
+)
 from soup_nlp.config.trees import PRESET_FILES
+from soup_nlp.data.scenes.catalogue import LAYOUTS
 from soup_nlp.errors import ConfigError, printable
-from soup_nlp.storage.files import is_folder
+from soup_nlp.export.artefact import (
+    EXPORT_FILES,
+    FORMATS,
+    export_case,
+    form_label,
+    parse_formulation,
+)
+from soup_nlp.export.compare import compare as run_all
+from soup_nlp.export.compare import conclusion, page, problem_task
+from soup_nlp.export.solvers import available, find_solver
+from soup_nlp.export.verify import Limits
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.report.formats import FORMATS as RESULT_FORMATS
+from soup_nlp.storage.each import Row
+from soup_nlp.storage.files import is_folder, write_text
+from soup_nlp.storage.folders import claim, default_folder, staged
+
+PAGE, ROWS = "README.md", "runs.jsonl"
+"""Files of a comparison."""
 
 
 def show(
@@ -42,9 +69,6 @@ def list_(
     folder: Annotated[Path | None, typer.Argument(help="Folder of other problem files.")] = None,
 ) -> None:
     """Print the problems, scenes and formats of the package, or the problems of a folder."""
-    from soup_nlp.data.scenes.catalogue import LAYOUTS
-    from soup_nlp.report.formats import FORMATS
-
     if folder is not None and not is_folder(folder):
         raise ConfigError("no such folder", where=folder, hint="soup-nlp list without a folder")
     files = {str(p): p for p in sorted(folder.glob("*.yaml"))} if folder else shipped_problems()
@@ -53,6 +77,115 @@ def list_(
     if folder is None:
         print("\nsoup-nlp solve NAME; templates take --set input.root=DIR, folder input.path=DIR")
         print(f"soup-nlp chain scene:NAME, of {', '.join(LAYOUTS)}")
-        print(f"soup-nlp convert RESULT --to {','.join(FORMATS)}")
+        print(f"soup-nlp convert RESULT --to {','.join(RESULT_FORMATS)}")
     elif not files:
         print(f"no problem files (*.yaml) in {printable(str(folder))}")
+
+
+def export(
+    problem: options.Problem,
+    out: Annotated[Path | None, out_option("out/export-NAME")] = None,
+    formulation: options.Formulations = None,
+    coordinates: options.Coordinates = "matrix",
+    superpixels: options.Superpixels = None,
+    format_: Annotated[Words, option(f"{', '.join(FORMATS)}; may be repeated.", "--format")] = None,
+    presolve: Annotated[
+        bool, option("Start at the presolve's answer, with its multipliers.", "--presolve")
+    ] = False,
+    suffixes: Annotated[bool, option("Write suffixes; CasADi reads none.", "--suffixes")] = False,
+    lift: Annotated[
+        bool, option("Shared expressions as variables with rows, as SCIP needs them.", "--lift")
+    ] = False,
+    overrides: options.Set = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Write the NLP for other solvers, started at the initialisation.
+
+    Several sizes or formulations make a folder each.
+    """
+    forms = [parse_formulation(text, coordinates) for text in formulation or [""]]
+    # without repetitions
+    sizes: list[int | None] = [*dict.fromkeys(superpixels or ())] or [None]
+    several = len(sizes) * len(forms) > 1
+    written = set()
+    for size, form in product(sizes, forms):
+        changes = [] if size is None else [f"segmentation.superpixels={size}"]
+        changes += [f"formulation.{k}={v}" for k, v in form.items() if k != "coordinates"]
+        chosen = load_problem(problem, [*(overrides or []), *changes])
+        out = out or default_folder(f"export-{chosen.name}", chosen.subject)
+        if not several:
+            # check the folder before the work
+            claim(out, EXPORT_FILES, overwrite, chosen.subject)
+        if form is forms[0]:
+            case = prepare(chosen, presolve)
+        # the same soup in another formulation
+        here = replace(case, problem=chosen)
+        style = here.formulation(coordinates=form.get("coordinates", "matrix"))
+        # the name has the wanted size, since two sizes may give the same number of superpixels
+        asked = chosen.segmentation.superpixels
+        name = f"{chosen.name}-{asked}-{form_label(style).replace('/', '-')}"
+        if name in written:
+            continue
+        written.add(name)
+        folder = out / name if several else out
+        manifest = export_case(
+            here, style, folder, format_ or ["nl"], presolve, overwrite, suffixes, lift
+        )
+        s = manifest["sizes"]
+        if not quiet:
+            print(
+                f"{folder}/soup.nl  {form_label(style)}  {s['superpixels']} superpixels,"
+                f" {s['variables']} variables, {s['constraints']} constraints,"
+                f" {s['jacobian_nonzeros']} Jacobian nonzeros,"
+                f" {manifest['nl']['bytes'] / 1e6:.1f} MB"
+            )
+
+
+def compare(
+    problems: Annotated[list[Path], typer.Argument(help="Problem files, or names of problems.")],
+    solvers: Annotated[
+        str, option("Comma-separated, or all; a program that reads .nl may be named.")
+    ] = "all",
+    coordinates: options.Coordinates = "matrix",
+    seconds: Annotated[float, option("CPU time limit of a run.")] = 60.0,
+    iterations: Annotated[int, option("Iteration limit of a run.")] = 300,
+    out: Annotated[Path | None, out_option("out/solvers-NAMES")] = None,
+    overrides: options.Set = None,
+    overwrite: options.Overwrite = False,
+) -> int:
+    """Run real solvers on problems and verify their claims; goes on where it was stopped."""
+    if not (seconds > 0 and iterations > 0):
+        raise ConfigError(
+            "limits must be positive",
+            where="compare",
+            found=f"{seconds:g} s, {iterations} iterations",
+        )
+    names = [*available()] if solvers == "all" else options.listed(solvers)
+    if not names:
+        raise ConfigError("no solver is named", where="--solvers", found=solvers)
+    for name in names:
+        find_solver(name)
+    limits = Limits(seconds, iterations)
+    # read all problems first: a wrong file must not stop after hours of runs
+    chosen = [load_problem(path, overrides or []) for path in problems]
+    subject = ", ".join(dict.fromkeys(p.subject for p in chosen))
+    name = title(f"solvers-{'-'.join(dict.fromkeys(p.name for p in chosen))}")
+    out = out or default_folder(name, subject)
+    folder = claim(out, [PAGE], overwrite, subject, ROWS)
+    tasks = [problem_task(prepare(problem), coordinates) for problem in chosen]
+
+    def keep(rows: list[Row]) -> None:
+        """Write the page after every run: a run may take minutes, a command may be killed."""
+        with staged(folder, overwrite=overwrite, subject=subject) as new:
+            write_text(new / PAGE, page(rows, limits))
+
+    with staged(folder, overwrite=overwrite, subject=subject):
+        # from here on, the folder is this command's
+        pass
+    with options.resumable("the runs that were finished are kept, with a page of them", folder):
+        rows = run_all(tasks, names, limits, folder / ROWS, print, keep)
+    print(conclusion(rows))
+    print(f"files       {out}/: {PAGE}, {ROWS}")
+    verified = sum(bool(row.get("verified")) for row in rows)
+    return options.finish(bool(verified), f"{verified} of {len(rows)} runs are verified")

@@ -184,7 +184,7 @@ def convert(
     out: Annotated[Path | None, out_option("the result's own")] = None,
     overwrite: options.Overwrite = False,
 ) -> None:
-    """Write a result for other programs: ply, glb, colmap, npy, pfm, png, rrd, motions."""
+    """Write a result for other programs."""
     target = folder if out is None else out
     for name in folders.convert(folder, options.listed(to), out, overwrite):
         print(target / name)

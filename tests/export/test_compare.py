@@ -12,7 +12,7 @@ import pytest
 from helpers_files import sets
 from helpers_model import PAPER, Tiny
 
-from soup_nlp.cli import compare as command
+from soup_nlp.cli import problems as command
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
