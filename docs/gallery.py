@@ -19,8 +19,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.evaluation.metrics import depth_metrics
 from soup_nlp.geometry.camera import project
 from soup_nlp.report.chain import Chain
-from soup_nlp.report.colour import colourise_depth, depth_range
-from soup_nlp.report.figures import strip
+from soup_nlp.report.figures import colourise_depth, depth_range, strip
 from soup_nlp.report.findings import certainty_lines, found_words, hints
 from soup_nlp.report.pictures import Picture, pictures
 from soup_nlp.report.result import result_of

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -16,8 +17,15 @@ from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.motion import RigidMotion
-from soup_nlp.report.colour import colourise_depth, colourise_shares, depth_range
-from soup_nlp.report.figures import Legend, Picture, shown, strip
+from soup_nlp.report.figures import (
+    Legend,
+    Picture,
+    colourise_depth,
+    colourise_shares,
+    depth_range,
+    shown,
+    strip,
+)
 
 if TYPE_CHECKING:
     from soup_nlp.report.result import Result
@@ -30,8 +38,6 @@ AXES = "x right, y down, z ahead"
 """Axes of a camera, in words."""
 STILL = RigidMotion(np.eye(3), np.zeros(3))
 """The identity."""
-
-
 NEAR = 5
 """Number of pairs of a chain that are in memory at once: clouds compare a frame with two on either
 side."""
@@ -45,7 +51,7 @@ class Lazy(Sequence[Item]):
     """Items that are made when they are needed; the last few stay in memory."""
 
     def __init__(self, make: Callable[[int], Item], count: int) -> None:
-        self._make, self._count, self._near = make, count, dict[int, Item]()
+        self._make, self._count = lru_cache(NEAR)(make), count
 
     def __len__(self) -> int:
         return self._count
@@ -53,12 +59,7 @@ class Lazy(Sequence[Item]):
     def __getitem__(self, number: Any) -> Any:
         if isinstance(number, slice):
             return [self[k] for k in range(self._count)[number]]
-        k = range(self._count)[number]
-        if k not in self._near:
-            if len(self._near) == NEAR:
-                del self._near[next(iter(self._near))]
-            self._near[k] = self._make(k)
-        return self._near[k]
+        return self._make(range(self._count)[number])
 
 
 class Brief(NamedTuple):
@@ -312,7 +313,7 @@ class Chain:
         return int(frame) - last, last
 
     def __getitem__(self, number: int) -> Frame:
-        """A frame by its number: image, camera, depth, sigma, components and pose."""
+        """A frame by its number."""
         k, last = self.seen(number)
         pair = self.pairs[k]
         components, sigma = self.of_track(k)[pair.components.of_pixel], pair.sigma
@@ -350,11 +351,11 @@ class Chain:
 
     @cached_property
     def _members(self) -> dict[int, dict[int, Component]]:
-        out: dict[int, dict[int, Component]] = {}
+        out = defaultdict[int, dict[int, Component]](dict)
         for k, (brief, numbers) in enumerate(zip(self.briefs, self.tracks, strict=True)):
             for label, track in numbers.items():
-                out.setdefault(track, {})[k] = brief.parts[label]
-        return out
+                out[track][k] = brief.parts[label]
+        return dict(out)
 
     @property
     def track_numbers(self) -> list[int]:
@@ -367,9 +368,11 @@ class Chain:
 
     def share(self, track: int) -> float:
         """Mean share of the images of a track where it is seen."""
-        members = self.members(track)
-        sizes = {k: sum(part.pixels for part in self.briefs[k].parts) for k in members}
-        return float(np.mean([part.pixels / sizes[k] for k, part in members.items()]))
+        shares = [
+            part.pixels / sum(one.pixels for one in self.briefs[k].parts)
+            for k, part in self.members(track).items()
+        ]
+        return float(np.mean(shares))
 
     def path(self, track: int) -> dict[int, Float]:
         """Centre (3,) of a track in the world, by frame."""

@@ -55,11 +55,8 @@ def prepare_folder(
 ) -> Path:
     """Check that a result can be written into a folder, before anything is computed.
 
-    Args:
-        folder: The folder.
-        inputs: Input files and folders of the problem, which are never overwritten.
-        overwrite: Overwrite files that the program did not make, and the result of another subject.
-        subject: `Problem.subject`.
+    `inputs` are files and folders of the problem, which are never overwritten; for `overwrite` and
+    `subject` see `storage.folders.claim`.
 
     Raises:
         DataError: the folder cannot be written, or holds a file that must not be overwritten.
@@ -108,9 +105,6 @@ def write_folder(
 
     Returns:
         Names of the files.
-
-    Raises:
-        DataError: a file cannot be written.
     """
     config = dump_problem(run.problem)
     with staged(folder, True, overwrite, run.problem.subject) as new:
@@ -157,17 +151,7 @@ def _attributes(run: Run, config: str) -> dict[str, Any]:
 
 
 def write_failure(folder: Path, log: str, ipopt_log: Path, overwrite: bool = False) -> None:
-    """Write the log of a failed solve, followed by that of Ipopt; an earlier result is kept.
-
-    Args:
-        folder: Prepared folder.
-        log: The log.
-        ipopt_log: Log file of Ipopt; may be missing.
-        overwrite: Overwrite a log that the program did not make.
-
-    Raises:
-        DataError: the log cannot be written, or would overwrite one of the user.
-    """
+    """Write the log of a failed solve, followed by that of Ipopt; an earlier result is kept."""
     with suppress(OSError):
         log += ipopt_log.read_text(encoding="utf-8", errors="replace")
     with staged(folder, overwrite=overwrite) as new:

@@ -13,9 +13,8 @@ from soup_nlp.errors import ConfigError, optional, printable, repr_of
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.rotation import log
 from soup_nlp.report.chain import AXES, Chain
-from soup_nlp.report.clouds import write_cloud, write_fused
 from soup_nlp.report.figures import depth_png_scale, encode_png, write_depth_png16
-from soup_nlp.report.models import write_colmap, write_glb, write_views
+from soup_nlp.report.models import write_cloud, write_colmap, write_fused, write_glb, write_views
 from soup_nlp.report.result import Result
 from soup_nlp.storage.files import write_bytes, write_json, write_text
 

@@ -4,6 +4,7 @@ import base64
 import json
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from importlib.resources import files
 from io import BytesIO
@@ -20,8 +21,7 @@ from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, whole_cells
 from soup_nlp.report.chain import STILL, Chain
-from soup_nlp.report.colour import component_colours
-from soup_nlp.report.figures import Legend, Picture
+from soup_nlp.report.figures import Legend, Picture, component_colours
 from soup_nlp.report.findings import ORIGINS, guess_line
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import Result
@@ -109,11 +109,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     cells = [[c if isinstance(c, Markup) else escape(c) for c in row] for row in rows]
     body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in cells)
     return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def swatch(colour: str) -> str:
-    """A field of a colour in HTML."""
-    return f'<i style="background:{colour}"></i>'
 
 
 def _css(colour: Any) -> str:
@@ -219,7 +214,7 @@ def path_table(chain: Chain) -> str:
         length = float(np.linalg.norm(np.diff(path.points, axis=0), axis=1).sum())
         share = "" if path.share is None else f"{path.share:.1%}"
         frames = f"{path.first} to {path.first + len(path.points) - 1}"
-        name = Markup(swatch(path.colour) + escape(path.name))
+        name = Markup(f'<i style="background:{path.colour}"></i>{escape(path.name)}')
         rows.append([name, share, frames, f"{length:.3g}"])
     rest = f"<p>Smaller ones: {len(known) - LISTED - 1}.</p>" if len(known) > LISTED + 1 else ""
     return (
@@ -247,9 +242,12 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
     for k in range(len(chain.pairs)):
         shown = drawn or pictures(chain, k)
         kept = {n: p for n, p in shown.items() if chain.single or n in IN_CHAIN}
-        pair = make_pair(chain, k, most)
         figures = {name: _figure(picture, len(chain.pairs)) for name, picture in kept.items()}
-        pairs.append({**{n: _stored(v) for n, v in pair.items()}, "pictures": figures})
+        packed = {
+            name: _packed(value) if isinstance(value, np.ndarray) else value
+            for name, value in make_pair(chain, k, most).items()
+        }
+        pairs.append({**packed, "pictures": figures})
         depths.append(chain.pairs[k].depths[0].ravel())
     z = metre * np.concatenate(depths)
     z = z[np.isfinite(z)]
@@ -261,7 +259,7 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "pairs": pairs,
         "names": names or ["reference frame", "next frame"],
         "modes": [[n, word] for n, word in MODES.items() if n in pairs[0]["pictures"]],
-        "cameras": [_pose(pose.matrix, metre) for pose in poses],
+        "cameras": [replace(pose, t=metre * pose.t).matrix for pose in poses],
         "paths": [{"colour": p.colour, "points": p.points} for p in paths(chain)],
         "middle": float(np.median(z)) if z.size else 1.0,
         "far": far,
@@ -269,17 +267,6 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "unit": chain.length,
         "origins": [ORIGINS[name][1] for name in TIES],
     }
-
-
-def _pose(matrix: Float, metre: float) -> list[list[float]]:
-    """A pose in the shown unit."""
-    out = matrix.copy()
-    out[:3, 3] *= metre
-    return out.tolist()
-
-
-def _stored(value: Any) -> Any:
-    return _packed(value) if isinstance(value, np.ndarray) else value
 
 
 def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
@@ -308,7 +295,8 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
     camera = STILL if result.bending else result.components.camera.inverse
     home = T @ camera.R.T + scale * camera.t
     pivot = _pivots(result, scale)
-    labels = rec.labels[every]
+    labels, sigma = rec.labels[every], result.sigma[every]
+    byte = np.where(np.isfinite(sigma), 254 * np.clip(sigma / 0.5, 0, 1), 255)
     return {
         "labels": labels.astype(np.uint16),
         "planes": _single(inverse_depth(soup.n, scale * soup.distance)),
@@ -316,7 +304,7 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
         "motionCamera": _single(_motion(R, T, pivot)),
         "borrowed": (np.asarray(start["borrowed"], bool) & ~result.bends).astype(np.uint8),
         "seen": (~hidden(rec)[every]).astype(np.uint8),
-        "sigma": _sigma(result)[every],
+        "sigma": byte.round().astype(np.uint8),
         "component": chain.of_track(k)[result.components.of_superpixel].astype(np.uint16),
         "tie": np.asarray(start["tie"], np.uint8),
         "surface": np.packbits(surface_cells(result, step), bitorder="little"),
@@ -340,12 +328,6 @@ def _single(values: Float) -> NDArray[np.float32]:
 def surface_cells(result: Result, step: int) -> Mask:
     """(h - 1, w - 1) cells of four shown pixels without a jump of the depth."""
     return whole_cells(*result.surface, np.isfinite(result.reconstruction.depth_ref), step)
-
-
-def _sigma(result: Result) -> NDArray[np.uint8]:
-    """(H, W) sigma as a byte, see `make_pair`."""
-    byte = np.rint(np.clip(result.sigma / 0.5, 0, 1) * 254)
-    return np.where(np.isfinite(result.sigma), byte, 255).astype(np.uint8)
 
 
 def _far(z: Float) -> tuple[float, float]:

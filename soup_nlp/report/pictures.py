@@ -11,7 +11,9 @@ from scipy.ndimage import distance_transform_edt
 from soup_nlp.arrays import AnyFloat, Image, Mask
 from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.report.chain import Chain, depth_legend
-from soup_nlp.report.colour import (
+from soup_nlp.report.figures import (
+    Legend,
+    Picture,
     colourise_depth,
     colourise_flow,
     colourise_normals,
@@ -19,8 +21,8 @@ from soup_nlp.report.colour import (
     component_colours,
     draw_superpixels,
     flow_limit,
+    strip,
 )
-from soup_nlp.report.figures import Legend, Picture, strip
 from soup_nlp.report.findings import LEAST
 
 if TYPE_CHECKING:

@@ -5,8 +5,10 @@ import pytest
 
 from soup_nlp.errors import DataError
 from soup_nlp.report import pictures
-from soup_nlp.report.colour import (
+from soup_nlp.report.figures import (
     UNKNOWN,
+    Legend,
+    Picture,
     colourise_depth,
     colourise_flow,
     colourise_normals,
@@ -15,10 +17,6 @@ from soup_nlp.report.colour import (
     depth_range,
     draw_superpixels,
     flow_limit,
-)
-from soup_nlp.report.figures import (
-    Legend,
-    Picture,
     strip,
     write_depth_png16,
     write_picture,

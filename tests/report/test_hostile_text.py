@@ -14,9 +14,9 @@ from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.motion import RigidMotion
-from soup_nlp.report.clouds import write_ply
 from soup_nlp.report.figures import strip
 from soup_nlp.report.formats import write_tum
+from soup_nlp.report.models import write_ply
 from soup_nlp.report.page import Markup, table
 from soup_nlp.report.pictures import Picture
 from soup_nlp.storage.files import read_json

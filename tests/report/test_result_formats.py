@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 from soup_nlp.data.formats.map_files import read_pfm
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.chain import Chain
-from soup_nlp.report.clouds import fuse, write_ply
 from soup_nlp.report.formats import FORMATS, write_formats
-from soup_nlp.report.models import surface_mesh
+from soup_nlp.report.models import fuse, surface_mesh, write_ply
 from soup_nlp.report.result import Result
 from soup_nlp.sequence.links import make_chain
 

@@ -9,8 +9,8 @@ from helpers_result import CAMERA, K, small_result, toy_pairs
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.chain import Link
-from soup_nlp.report.clouds import fuse
 from soup_nlp.report.formats import write_formats
+from soup_nlp.report.models import fuse
 from soup_nlp.sequence.links import chained_scales, follow, link, make_chain, number
 from soup_nlp.sequence.score import path_errors, read_path, similarity
 
