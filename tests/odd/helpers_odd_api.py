@@ -11,30 +11,19 @@ from helpers_odd_run import Case, cases
 from helpers_odd_world import SIZE, World
 
 import soup_nlp
-from soup_nlp.cli.main import main
-from soup_nlp.data.formats import camera_files, images, map_files
-from soup_nlp.export.foreign import import_sol
-from soup_nlp.export.sol import read_sol
-from soup_nlp.report.check import check_folder
-from soup_nlp.sequence.folder import load
-from soup_nlp.sequence.frames import find_images, video_frames
-from soup_nlp.sequence.links import make_chain
 
 API = "5 Python API"
 THINGS: dict[str, Any] = {
     "None": None,
     "list": [],
     "dict": {},
-    "nested list": [[1, [2]]],
     "int": 3,
     "float": math.nan,
     "huge int": 10**400,
     "text": "word",
     "bytes": b"\xff\0",
     "object": object(),
-    "type": dict,
     "function": len,
-    "scalar array": np.zeros(()),
     "vector": np.zeros(3),
     "objects": np.array([None, {}], object),
     "texts": np.array(["a", "b"]),
@@ -46,16 +35,12 @@ TRUTH = (
     "depth_ref", "depth_next", "flow", "occluded", "components", "motions", "points", "scene_flow",
 )  # fmt: skip
 CALLBACKS = ("listener", "stop", "log", "on_stage", "ipopt_log")
-READERS = (
-    images.read_image, map_files.read_flow, map_files.read_depth, camera_files.read_intrinsics,
-)  # fmt: skip
 
 
 def pair(w: World, **changes: Any) -> Any:
     """A pair with other arguments."""
-    a, b = (images.read_image(w.good(name)) for name in ("a.png", "b.png"))
-    K = camera_files.intrinsics(60.0, 60.0, 32.0, 24.0)
-    return soup_nlp.Pair(**({"image_ref": a, "image_next": b, "K_ref": K, "K_next": K} | changes))
+    known = {"image_ref": w.good("a.png"), "image_next": w.good("b.png")}
+    return soup_nlp.Pair(**({**known, "K_ref": (60, 60, 32, 24)} | changes))
 
 
 def flow(**changes: Any) -> Any:
@@ -103,23 +88,12 @@ CALLS: dict[str, Call] = {
         f"Truth {key}": lambda w, o, x, key=key: pair(w, truth=soup_nlp.Truth(**{key: x}))
         for key in TRUTH
     },
-    **{f"read {f.__name__}": lambda w, o, x, f=f: f(x) for f in READERS},
     "save folder": lambda w, o, x: w.run.save(x),
     "save formats": lambda w, o, x: w.run.save(o / "out", formats=x),
     "save format": lambda w, o, x: w.run.save(o / "out", formats=[x]),
-    "check_folder": lambda w, o, x: check_folder(x),
-    "load": lambda w, o, x: load(x),
-    "make_chain": lambda w, o, x: make_chain(x),
-    "make_chain pair": lambda w, o, x: make_chain([x]),
-    "find_images": lambda w, o, x: find_images(x),
-    "video_frames": lambda w, o, x: video_frames(x, o / "frames"),
-    "read_sol": lambda w, o, x: read_sol(x, np.arange(2), np.arange(2)),
-    "import_sol folder": lambda w, o, x: import_sol(x, w.exported / "soup.sol"),
-    "import_sol file": lambda w, o, x: import_sol(w.exported, x),
+    "load": lambda w, o, x: soup_nlp.load(x),
     "with_flow": lambda w, o, x: w.run.pair.with_flow(x),
     "components": lambda w, o, x: w.run.components[x],
-    "own_motion": lambda w, o, x: w.run.components.own_motion(x),
-    "camera": lambda w, o, x: w.run.camera(x),
 }
 FINE = {
     "run pair": "None",
@@ -143,7 +117,6 @@ FINE = {
     "make_problem where": "text",
     "save formats": "None, list, dict",
     "with_flow": "None",
-    "camera": "vector, image",
 }
 """Arguments that are valid, or useless but harmless."""
 LEFT_OUT = {
@@ -157,7 +130,7 @@ LEFT_OUT = {
     "run ipopt_log": "None, text",
     "save folder": "text",
     # an exception of the caller's function is not an error of the package
-    **{f"run {name}": "None, type, function" for name in ("listener", "log", "on_stage")},
+    **{f"run {name}": "None, function" for name in ("listener", "log", "on_stage")},
 }
 
 
@@ -166,30 +139,13 @@ def _called(do: Call) -> Any:
     return lambda w, o, x: (do(w, o, x), None)[1]
 
 
-def _again(w: World, o: Path) -> None:
-    w.run.save(o / "out", formats=["npy"])
-    assert main(["check", str(o / "out")]) in (0, 1)
-
-
-def _strided(w: World, o: Path) -> None:
+def _strided(w: World, o: Path, _: object) -> None:
     """Views that are not contiguous, read-only arrays and other byte orders are arrays."""
     a, b = (np.asarray(x) for x in (w.run.pair.image_ref, w.run.pair.image_next))
     K = np.asarray(w.run.pair.K_ref, ">f8")
     made = soup_nlp.Pair(a[:, ::-1], np.asfortranarray(b), K)
     a.flags.writeable = False
     made.with_flow(soup_nlp.Flow(np.zeros((*SIZE, 2), ">f4"), np.ones(SIZE, np.float16)))
-
-
-USES: dict[str, Callable[[World, Path], object]] = {
-    "plot": lambda w, o: w.run.plot().save(o / "a.png"),
-    "repr": lambda w, o: [repr(x) for x in (w.run, w.run.components, w.run.camera)],
-    "save twice": lambda w, o: [w.run.save(o / "out") for _ in range(2)],
-    "save and check": _again,
-    "arrays of other layouts": _strided,
-    "compare records": lambda w, o: w.run.pair == w.run.pair.with_flow(w.run.pair.flow),
-    "hash of records": lambda w, o: {w.run, w.run.pair, w.run.soup, w.run.reconstruction},
-}
-"""Valid but unusual uses of a run."""
 
 
 def api_cases() -> Iterator[Case]:
@@ -199,7 +155,6 @@ def api_cases() -> Iterator[Case]:
         for quiet in (False, True):
             things = {k: v for k, v in THINGS.items() if k not in left and (k in fine) is quiet}
             yield from cases(API, f"api {name} {{}}", _called(call), things, quiet=quiet)
-    used = _called(lambda w, o, use: use(w, o))
-    yield from cases(API, "use {}", used, USES, quiet=True)
+    yield from cases(API, "arrays of {}", _strided, ["other layouts"], quiet=True)
     huge = {"truth that overflows": np.full(SIZE, 1e300)}
     yield from cases(API, "{}", _called(lambda w, o, x: soup_nlp.Truth(depth_ref=x)), huge)

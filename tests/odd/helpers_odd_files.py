@@ -1,4 +1,4 @@
-"""Arrays, images and networks whose contents contradict their headers."""
+"""Arrays and images whose contents contradict their headers."""
 
 import struct
 from collections.abc import Callable, Iterator
@@ -57,51 +57,12 @@ LIES: dict[str, bytes] = {
 }  # fmt: skip
 """Contents of .npy files with wrong headers."""
 
-half = np.full(SIZE, 0.5, np.float32)
-MAPS: dict[str, Any] = {
-    "of another size": half[:20],
-    "of one number": half[0, 0],
-    "above 1": half * 4,
-    "below 0": -half,
-    "of NaN": half * np.nan,
-    "of infinity": half * np.inf,
-    "of whole numbers": (half * 510).astype(np.uint8),
-    "of truth values": half > 0,
-    "complex": half.astype(complex),
-    "of objects": np.full(SIZE, None),
-    "of text": np.full(SIZE, "a"),
-    "of colours": np.dstack([half] * 3),
-    "zero": 0 * half,
-    "turned": half.T,
-}
-"""Maps of confidence, or channels of a flow."""
-
-
-def _saved(channels: int) -> Any:
-    def make(w: World, o: Path, value: Any) -> str:
-        twice = channels == 2 and np.ndim(value) == 2
-        np.save(o / "x.npy", np.dstack([value, value]) if twice else value)
-        return str(o / "x.npy")
-
-    return make
-
 
 def array_cases() -> Iterator[Case]:
     for door in ("flow", "depth"):
         line = f"{{solve}} --{door} {{x}}"
         yield from cases(DOORS, f"npy {door} {{}}", line, LIES, make=written("x.npy"))
-    for option, channels, good in (
-        ("confidence", 1, ("of truth values", "zero")),
-        (
-            "backward", 2,
-            ("above 1", "below 0", "of whole numbers", "of truth values", "zero", "of NaN",
-             "of infinity"),
-        ),
-    ):  # fmt: skip
-        other, make = dict.fromkeys(good, ANY), _saved(channels)
-        line = f"{{solve}} --flow-{option} {{x}}"
-        title = f"{option} {{}}"
-        yield from cases(DOORS, title, line, MAPS, make=make, other=other, solves=good)
+    for option in ("confidence", "backward"):
         line = f"{{solve}} --flow dis --flow-{option} {{d}}"
         yield from cases(DOORS, f"flow_{option} {{}}", line, ["without a flow"])
     yield from cases(DOORS, "json of {}", "solve no.png {b} --json -o {out}", ["an error"])
@@ -185,54 +146,3 @@ def image_cases() -> Iterator[Case]:
     # the pictures are read first, then the missing flow ends the command
     line = "solve {o}/a.jpg {o}/b.jpg --flow nothing.flo -q -o {out}"
     yield from cases(DOORS, "exif {}", line, EXIF, make=_photos)
-
-
-# --- networks ------------------------------------------------------------------------------------
-
-
-def network(
-    image: str = "6, h, w",
-    out: str = "float[1, 2, h, w]",
-    last: str = "o = Identity (two)",
-    end: str = "{2}",
-    axis: int = 1,
-    about: str = "",
-) -> str:
-    """A network in ONNX's text format: a slice of the stack of images, and a last step."""
-    return f"""<ir_version: 8, opset_import: ["" : 17]{about}>
-    g (float[1, {image}] in) => ({out} o)
-    <int64[1] s = {{0}}, int64[1] e = {end}, int64[1] x = {{{axis}}},
-     float[1] minus = {{-1}}, float[1] null = {{0}}>
-    {{ two = Slice (in, s, e, x) {last} }}"""
-
-
-RED = "\x1b[31m" * 2000
-NETWORKS = {
-    "five channels": network("5, h, w"),
-    "three axes": network("6, n"),
-    "NaN": network(last="neg = Mul (two, minus) o = Log (neg)"),
-    "infinite": network(last="o = Div (two, null)"),
-    "one channel": network(out="float[1, 1, h, w]", end="{1}"),
-    "no pixel": network(out="float", end="{0}", axis=2),
-    "whole numbers": network(out="int32[1, 2, h, w]", last="o = Cast <to = 6> (two)"),
-    "unknown range": network(about=f', metadata_props: ["input_range" : "{RED}"]'),
-    "elsewhere": network(end='["location" : "../../../../etc/passwd"]'),
-}
-"""Networks whose answer is no flow, or that read another file."""
-
-
-def _network(w: World, o: Path, text: str) -> str:
-    try:
-        from onnx import parser, save
-    except ImportError:
-        return "no.onnx"
-    save(parser.parse_model(text), o / "n.onnx")
-    return str(o / "n.onnx")
-
-
-def network_cases() -> Iterator[Case]:
-    free = ("NaN", "infinite", "whole numbers")
-    yield from cases(
-        DOORS, "network {}", "{solve} --flow {x}", NETWORKS, make=_network, solves=free,
-        other=dict.fromkeys(free, ANY),
-    )  # fmt: skip

@@ -1,14 +1,14 @@
-"""Useless numbers, solves at the limits of options, and odd values of every option."""
+"""Useless numbers, and odd values of every option."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
-from helpers_odd_run import ANY, DOORS, Case, cases, words, write
+from helpers_odd_run import ANY, DOORS, Case, cases, words
 from helpers_odd_world import SIZE, World
 
-from soup_nlp.cli.main import COMMANDS, _load, main
+from soup_nlp.cli.main import COMMANDS, _load
 from soup_nlp.config.problem import Problem
 from soup_nlp.schema.section import Section
 
@@ -35,23 +35,10 @@ WITH = {
 """Settings without which an option has no effect, by the beginning of its name."""
 LARGE = "1" + "0" * 30
 NUMBERS = {
-    "intrinsics 0 {}": "{solve} --intrinsics={x},60,32,24",
-    "intrinsics 1 {}": "{solve} --intrinsics=60,{x},32,24",
-    "intrinsics 2 {}": "{solve} --intrinsics=60,60,{x},24",
-    "intrinsics 3 {}": "{solve} --intrinsics=60,60,32,{x}",
+    f"intrinsics {k} {{}}": "{solve} --intrinsics="
+    + ",".join(["60"] * k + ["{x}"] + ["24"] * (3 - k))
+    for k in range(4)
 }
-SCENE = (
-    "solve {x} -q -o {out} --set flow.source=truth --set segmentation.superpixels=12"
-    " --set segmentation.neighbours=4 --set refine.enabled=false --set solver.presolve=false"
-    " --set solver.max_iter=1"
-)
-
-
-def _scene(w: World, o: Path, text: str) -> str:
-    options = {"width": "64", "height": "48", "seed": "0"} | dict([text.split("=")])
-    inside = ", ".join(f"{k}: {v}" for k, v in options.items())
-    write(o / "p.yaml", f"input: {{kind: scene, scene: street, {inside}}}\n")
-    return str(o / "p.yaml")
 
 
 def number_cases() -> Iterator[Case]:
@@ -65,12 +52,6 @@ def number_cases() -> Iterator[Case]:
         solves = texts if "sigma" in name or name == "solver.ipopt" else free
         line = f"{{solve}} {settings} --set {name}={{x}}"
         yield from cases("2 numbers", f"number {name}={{}}", line, texts, ANY, solves=solves)
-    scenes = [
-        *(f"width={v}" for v in ("63", LARGE, "1000000", "-5")),
-        *(f"height={v}" for v in ("47", LARGE, "1000000")),
-        *(f"seed={v}" for v in (LARGE, "-1", "5000000000")),
-    ]
-    yield from cases(DOORS, "scene {}", SCENE, scenes, ANY, make=_scene)
     free = ("1e9", "1e5", "0", "-60", "1e-300")
     for title, line in NUMBERS.items():
         numbers = ("nan", "inf", "1e300", *free)
@@ -93,70 +74,6 @@ def depth_png(o: Path) -> Path:
     """A depth map of 16 bits."""
     cv2.imwrite(str(o / "d.png"), np.full(SIZE, 2000, np.uint16))
     return o / "d.png"
-
-
-NO_WEIGHT = " ".join(f"energy.weights.{k}=0" for k in ("arap", "proj", "cont", "orient", "prior"))
-SOLVES = {
-    "min_facing 0.5": "formulation.min_facing=0.5",
-    "min_facing 0.3": "formulation.min_facing=0.3 solver.presolve=true",
-    "min_facing 0.5 presolved": "formulation.min_facing=0.5 solver.presolve=true",
-    **{
-        f"unit-translation {norm}": f"formulation.gauge=unit-translation formulation.norm={norm}"
-        " solver.presolve=true solver.max_iter=10"
-        for norm in ("smooth", "epigraph")
-    },
-    "depth_ratio 1": "formulation.depth_ratio=1",
-    "depth_ratio 1 presolved": "formulation.depth_ratio=1 solver.presolve=true",
-    "no weight": NO_WEIGHT,
-    "no weight presolved": f"{NO_WEIGHT} solver.presolve=true",
-    "no weight refined": f"{NO_WEIGHT} refine.enabled=true refine.from_start=true refine.rounds=1",
-    **{f"seed 2^{k}": f"seed={2**k}" for k in (31, 32, 63)},
-    "one superpixel": "segmentation.superpixels=1",
-    "two superpixels": "segmentation.superpixels=2 segmentation.neighbours=1",
-    "more neighbours than superpixels": "segmentation.neighbours=12",
-    "all boundary samples": "segmentation.boundary_samples=all",
-    "all pixels": "energy.pixel_samples=all",
-    "no iterations": "solver.max_iter=0",
-    "unknown ipopt option": "solver.ipopt={no_such:1}",
-    "wrong ipopt value": "solver.ipopt={max_iter:word}",
-    "paper units": "energy.units=paper solver.presolve=true",
-}
-"""Settings of solves; a result with exit code 0 or 1 is checked afterwards."""
-
-
-def _checked(w: World, o: Path, argv: list[str]) -> list[str]:
-    """Solve, and return the check of the result; where the solve is refused, the solve."""
-    code = main(argv)
-    if code == 2:
-        return argv
-    assert code in (0, 1), code
-    if code == 0:
-        return ["check", str(o / "out")]
-    # a result that did not converge may fail the check, but the check must end without error
-    assert main(["check", str(o / "out")]) in (0, 1)
-    return words("show {p}", w, o)
-
-
-def _scaled(w: World, o: Path, scale: str) -> list[str]:
-    text = w.problem(depth=str(depth_png(o)), depth_scale=float(scale))
-    write(o / "p.yaml", text)
-    return _checked(w, o, words("solve {o}/p.yaml -q -o {out}", w, o))
-
-
-def solve_cases() -> Iterator[Case]:
-    def settings(w: World, o: Path, text: str) -> list[str]:
-        line = " ".join(f"--set {item}" for item in text.replace(":", ":\t").split(" "))
-        return _checked(w, o, [x.replace(":\t", ": ") for x in words(f"{{solve}} {line}", w, o)])
-
-    def focal(w: World, o: Path, x: str) -> list[str]:
-        return _checked(w, o, words(f"{{solve}} --intrinsics={x},{x},32,24", w, o))
-
-    for title, do, values in (
-        ("solve {}", settings, SOLVES),
-        ("solve focal {}", focal, ("1e5", "1e7", "1e9")),
-        ("solve depth_scale {}", _scaled, ("1e-300", "1e300", "1e-30")),
-    ):
-        yield from cases("2 results", title, do, values, (0, 2), solves=True)
 
 
 # --- options -------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 from helpers_odd_run import ANY, DOORS, Case, cases, changed, h5_damage, words
@@ -190,42 +189,7 @@ def beside(name: str, make: Callable[[Path], object]) -> Any:
     return do
 
 
-def video(frames: int, size: tuple[int, int] = SIZE, options: str = "", user_file: str = "") -> Any:
-    """`chain` of a video of noise, into a folder that holds a file of the user."""
-
-    def do(w: World, o: Path, _: object) -> list[str]:
-        coder = cv2.VideoWriter(str(o / "c.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, size[::-1])
-        for _ in range(frames):
-            coder.write(cv2.imdecode(np.frombuffer(encoded_noise(size), np.uint8), 1))
-        coder.release()
-        if user_file:
-            (o / user_file).parent.mkdir(parents=True)
-            (o / user_file).write_text("mine")
-        return words(f"chain {{o}}/c.avi {options} -q -o {{out}}", w, o)
-
-    return do
-
-
 CHAIN = "chain {a} {b} {tiny} -q -o {out}"
-
-
-def into(name: str, data: bytes | None = None) -> Any:
-    """`chain` into a folder that holds a file, or a folder of this name."""
-
-    def do(w: World, o: Path, _: object) -> list[str]:
-        (o / "out" / name).parent.mkdir(parents=True, exist_ok=True)
-        (o / "out" / name).mkdir() if data is None else (o / "out" / name).write_bytes(data)
-        return words(CHAIN if data in (None, b"mine") else f"{CHAIN} --fov=400", w, o)
-
-    return do
-
-
-def _no_result(w: World, o: Path, _: object) -> list[str]:
-    """Rows of a pair whose result is no HDF5 file."""
-    into("pairs/000_001/result.h5", b"no HDF5")(w, o, None)
-    return into("pairs.jsonl", b'{"key": "000_001", "ok": true}\n')(w, o, None)
-
-
 CHAINS: dict[str, Any] = {
     "stride of 5001 digits": f"{CHAIN} --stride=1{'0' * 5000}",
     "auto of two frames alike": clip("1.png", "2.png", options="--stride=auto"),
@@ -241,7 +205,6 @@ CHAINS: dict[str, Any] = {
     "images of two sizes": clip(sizes=(SIZE, (48, 80))),
     "images too small": clip(sizes=((8, 8),)),
     "superscripts": clip("1²3.png", "1²4.png", options="--fov=400"),
-    "digits of other scripts": clip("\u0661.png", "\u0662.png", options="--fov=400"),
     "images that are folders": beside("frame_1.png", lambda p: (p.unlink(), p.mkdir())),
     "camera is a folder": beside("K.txt", Path.mkdir),
     "camera is a pipe": beside("K.txt", os.mkfifo),
@@ -251,17 +214,6 @@ CHAINS: dict[str, Any] = {
     "dangling frame": beside("frame_2.png", lambda p: p.symlink_to("nowhere")),
     "pipe among frames": beside("frame_2.png", os.mkfifo),
     "text among frames": beside("frame_2.png", lambda p: p.write_text("no picture")),
-    "video of one frame": video(1),
-    "video of tiny frames": video(3, (16, 16)),
-    "video over frames of the user": video(3, user_file="out/frames/0000.png"),
-    "video with a stride beyond": video(3, options="--stride=9"),
-    "page of the user": into("report.html", b"mine"),
-    "depth of the user": into("depth/0000.png", b"mine"),
-    "pairs is a file": into("pairs", b"mine"),
-    "rows are a folder": into("pairs.jsonl"),
-    "rows are binary": into("pairs.jsonl", bytes(range(256)) * 9),
-    "rows of lists": into("pairs.jsonl", b'[1]\n{"key": [1]}\n{"key": {}}\n'),
-    "rows and no result": _no_result,
 }
 """Sequences that cannot be solved."""
 SOURCES = (
@@ -272,8 +224,8 @@ SOURCES = (
 
 
 def chain_cases() -> Iterator[Case]:
-    # two sizes of images are allowed; the other two chains may end in either way
-    fine = ("digits of other scripts", "auto of two frames alike", "images of two sizes")
+    # two sizes of images are allowed
+    fine = ("auto of two frames alike", "images of two sizes")
     yield from cases(DOORS, "chain {}", None, CHAINS, other=dict.fromkeys(fine, ANY))
     yield from cases(DOORS, "chain source {}", "chain {x} -q -o {out}", SOURCES)
     empty = lambda w, o, _: (o / "clip").mkdir()  # noqa: E731
