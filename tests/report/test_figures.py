@@ -3,7 +3,6 @@ import matplotlib
 import numpy as np
 import pytest
 
-from soup_nlp.errors import DataError
 from soup_nlp.report import pictures
 from soup_nlp.report.figures import (
     UNKNOWN,
@@ -20,7 +19,6 @@ from soup_nlp.report.figures import (
     strip,
     write_depth_png16,
     write_picture,
-    write_png,
 )
 
 
@@ -204,26 +202,6 @@ def test_an_overview_has_no_gaps(monkeypatch):
     assert names("depth_start", "normals") == {*always, "normals"}
     assert len(names("depth_start", "normals", "a", "b")) == 12
     assert names("depth_start", "normals", "a") == {*always, "a"}
-
-
-def test_a_white_panel_has_a_frame():
-    white = np.full((60, 100, 3), 255, np.uint8)
-    picture = strip([Picture("", "", white)], "")
-    dark = (picture < 230).all(2)
-    rows, columns = np.flatnonzero(dark.any(1)), np.flatnonzero(dark.any(0))
-    # as wide and high as the panel, and nothing within
-    assert abs(np.ptp(columns) - 420) < 4
-    assert abs(np.ptp(rows) - 252) < 4
-    assert not dark[rows[0] + 3 : rows[-1] - 2, columns[0] + 3 : columns[-1] - 2].any()
-
-
-def test_png_round_trip(tmp_path):
-    rgb = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
-    write_png(tmp_path / "a.png", rgb)
-    back = cv2.cvtColor(cv2.imread(str(tmp_path / "a.png")), cv2.COLOR_BGR2RGB)
-    np.testing.assert_array_equal(back, rgb)
-    with pytest.raises(DataError, match="cannot be written"):
-        write_png(tmp_path / "no" / "a.png", rgb)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e5])

@@ -14,7 +14,6 @@ import pytest
 from soup_nlp.cli.main import main
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
-from soup_nlp.report import page as page_module
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import SHARES
 from soup_nlp.report.folder import write_folder
@@ -142,8 +141,6 @@ def test_large_images_are_thinned(shown):
 def test_a_far_sky_is_left_out_at_first(shown):
     scene = make_scene(Chain.of(shown))
     assert scene["middle"] < scene["far"] <= 1.001 * scene["deepest"]
-    z = np.concatenate([np.full(900, 2.0), np.full(100, 1e6)])
-    assert page_module._far(z) == (8.008, 1e6)
 
 
 def test_a_folder_makes_the_same_page_again(folder, capsys):
