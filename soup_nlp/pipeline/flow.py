@@ -10,7 +10,7 @@ from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.working_size import resized_flow
 from soup_nlp.geometry.camera import rays
-from soup_nlp.start.epipolar import Matches, repeated
+from soup_nlp.start.epipolar import Matches, estimate
 
 LEAST_SHARE = 0.003
 """Least share of pixels that stand still for the search for a layer."""
@@ -68,9 +68,8 @@ def see_through(pair: Pair, seed: int = 0) -> Flow | None:
         flow.confidence[v, u][pick].astype(float),
         float(pair.K_next[0, 0]),
     )
-    motions = repeated(matches, 1, seed=seed)
-    if not motions:
+    motion = estimate(matches, seed=seed)
+    if motion is None:
         return None
     ref, nxt = without_still_layer(pair.image_ref, pair.image_next)
-    R, t = motions[0].R, motions[0].t
-    return corrected(ref, nxt, flow, R, t, pair.K_ref, pair.K_next)
+    return corrected(ref, nxt, flow, motion.R, motion.t, pair.K_ref, pair.K_next)

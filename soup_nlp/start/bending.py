@@ -248,13 +248,12 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     their own: where the flow jumps little, a bending surface is joined to its surroundings.
 
     Returns:
-        The motions that many pixels share and those of the surfaces, and (N,) True where the
+        The motion that most of the image shares and those of the surfaces, and (N,) True where the
         surface bends.
     """
     seg, views, usable = flow.seg, flow.views, flow.views.usable
     noise = reference_noise(flow.residual)
-    motions = dominant(flow)
-    label = np.argmin(views.fit(motions).penalised(), axis=1)
+    motions = [dominant(flow)]
     whole = ~seg.across(surface)
     surface = joined(flow, surface)
     bends = np.zeros(len(seg), bool)
@@ -262,8 +261,7 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     while left:
         members = left.pop()
         at = np.flatnonzero(members & usable)
-        present = [motions[c] for c in np.unique(label[at])]
-        tried = candidates(flow, at, motions[0], present, max(noise, LEAST_SCALE))
+        tried = candidates(flow, at, motions[0], motions[:1], max(noise, LEAST_SCALE))
         excess = views.subset(at).fit(tried).cost - flow.residual[at, None]
         middle = np.median(excess, axis=0)
         gain = np.median(fit_turn(views.subset(at), ANY_TURN)[1] - flow.residual[at])

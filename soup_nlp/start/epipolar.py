@@ -1,4 +1,4 @@
-"""Rigid two-view motion from flow: robust estimation, refinement, repeated fits."""
+"""Rigid two-view motion from flow: robust estimation and refinement."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ REFINEMENTS, STEPS = 5, 30
 evaluations of a fit."""
 LEAST_NOISE = 0.01
 """Smallest scale of the robust loss, pixels."""
-LEAST_SHARE = 0.03
-"""Least share of all correspondences that a dominant motion explains."""
 NEAR = np.array([0.02] * 3 + [0.3] * 2)
 """Standard deviations of the change of a motion by `refine_near`: rotation in radians, direction of
 the translation."""
@@ -283,29 +281,3 @@ def _facing(motion: Motion, matches: Matches) -> Motion:
     """The motion with the sign of its translation that puts most points in front of the camera."""
     vote = matches.weight @ np.sign(triangulate(motion, matches.ray, matches.target)[0])
     return motion if vote >= 0 else Motion(motion.R, -motion.t)
-
-
-def repeated(matches: Matches, count: int, threshold: float = 1.0, seed: int = 0) -> list[Motion]:
-    """Dominant motions by repeated robust fits, each to the outliers of the earlier ones.
-
-    Args:
-        matches: Correspondences.
-        count: Largest number of motions.
-        threshold: Inlier distance, pixels.
-        seed: Of RANSAC.
-    """
-    least = LEAST_SHARE * len(matches.ray)
-    left = np.ones(len(matches.ray), bool)
-    out: list[Motion] = []
-    for k in range(count):
-        if left.sum() < max(8, least):
-            break
-        motion = estimate(matches.at(left), threshold, seed + k)
-        if motion is None:
-            break
-        inlier = np.abs(matches.distance(motion)) < threshold
-        if np.sum(inlier & left) < least:
-            break
-        out.append(motion)
-        left &= ~inlier
-    return out

@@ -32,7 +32,6 @@ from soup_nlp.start.epipolar import (
     estimate,
     fit_translation,
     refine_near,
-    repeated,
 )
 from soup_nlp.start.views import FlowFit
 
@@ -47,15 +46,15 @@ MOST, CHANGE, PRICE = 8.0, 6.0, 0.04
 """Largest cost of a superpixel, half the cost of one that differs from all its neighbours, and
 price of a motion by the number of superpixels: half a percent of them, if no other motion explains
 them, and at least one, pay for it."""
-DOMINANT, SURFACES, PIECES, ROUNDS = 5, 12, 6, 3
-"""Largest numbers of motions from the whole image, and of surfaces and of pieces that no motion
-explains for which motions are proposed, and of rounds of proposals."""
+SURFACES, PIECES, ROUNDS = 12, 6, 3
+"""Largest numbers of surfaces and of pieces that no motion explains for which motions are proposed,
+and of rounds of proposals."""
 PIECE_SIZE = 4
 """Least number of superpixels that determine a motion."""
 UNEXPLAINED = 0.25
 """Share of `MOST` from which on a motion does not explain a superpixel."""
-PIXELS = 1500
-"""Largest number of pixels to which a motion is fitted."""
+PIXELS, MOST_PIXELS = 1500, 6000
+"""Largest number of pixels to which a motion is fitted, and that of the whole image."""
 
 
 def limited_noise(error: Float) -> float:
@@ -137,15 +136,10 @@ def _price(excess: Float, shared: float) -> Float:
     return np.clip(excess / shared - 1.0, 0.0, MOST)
 
 
-def dominant(flow: FlowFit) -> list[Motion]:
-    """Motions that many pixels share, the most frequent first; at least one."""
-    seed = flow.options.seed
-    matches = flow.views.matches()
-    good = np.flatnonzero(matches.weight > 0.3 * matches.weight.max())
-    rng = np.random.default_rng(seed)
-    pick = good if len(good) <= 6000 else rng.choice(good, 6000, replace=False)
-    motions = repeated(matches.at(pick), DOMINANT, flow.options.threshold_px, seed)
-    return motions or [SIDEWAYS]
+def dominant(flow: FlowFit) -> Motion:
+    """The motion that most of the image shares."""
+    matches = flow.views.matches().confident(MOST_PIXELS)
+    return estimate(matches, flow.options.threshold_px, flow.options.seed) or SIDEWAYS
 
 
 def _of_surfaces(flow: FlowFit, seen: Mask, surface: Int, motions: list[Motion]) -> list[Motion]:

@@ -36,7 +36,7 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     may = usable & (shift < STILL_PX)
     if may.sum() < PIECE_SIZE or not np.array_equal(flow.K_ref, flow.K_next):
         return none, shift
-    camera = dominant(flow.without(may | ~usable))[0]
+    camera = dominant(flow.without(may | ~usable))
     error = views.fit([camera]).penalised()[:, 0]
     if (error[usable] < CONTRADICTED_PX).sum() < LEAST_SCENE * usable.sum():
         return none, shift

@@ -230,7 +230,7 @@ def test_depth_that_explains_the_flow_is_no_turn():
     # without jumps, with a noise of 0.02 px
     residual = np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c)))
     flow = fit(c)._replace(jump=np.zeros(len(c.segmentation.pairs)), residual=residual)
-    choice = labelled(flow, dominant(flow), connected_labels(flow.jump < 1, flow.seg))
+    choice = labelled(flow, [dominant(flow)], connected_labels(flow.jump < 1, flow.seg))
     assert flow.views.usable.all()
     assert turn_alone(flow, choice) is None
     # the same flow with the depths taken out of it
@@ -242,7 +242,7 @@ def test_depth_that_explains_the_flow_is_no_turn():
 def test_depth_within_three_noises_of_the_flow_is_not_seen():
     c = case("orbit")
     flow = fit(c)
-    choice = labelled(flow, dominant(flow), connected_labels(flow.jump < 1, flow.seg))
+    choice = labelled(flow, [dominant(flow)], connected_labels(flow.jump < 1, flow.seg))
     choice = replace(choice, label=np.zeros(len(c), int), excess=0)
     error = float(np.quantile(fit_turn(flow.views, ANY_TURN)[1], AT_REST))
     assert error > 320 / 512  # 1 px at 512 columns
@@ -257,7 +257,7 @@ def test_a_stabilised_turn_is_a_turn():
     """The next image is moved back by stabilisation; the rotation is that of the plain turn."""
     c = case("orbit")
     flow = fit(c)._replace(residual=np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c))))
-    choice = labelled(flow, dominant(flow), connected_labels(flow.jump < 1, flow.seg))
+    choice = labelled(flow, [dominant(flow)], connected_labels(flow.jump < 1, flow.seg))
     target = flow.views.ray @ rotation.exp(np.array([0.02, -0.2, 0.05])).T
     target = 1.03 * target / target[..., 2:] + np.array([0.2, 0.02, 0.0])
     target[..., 2] = 1.0
