@@ -10,10 +10,9 @@ flow, and w the price of a change of motion where the flow is continuous. Large 
 flow share an error s. It is no evidence of another motion, however many superpixels have it, so
 that errors up to s cost nothing.
 
-Motions are proposed from the whole image, for surfaces, for what two motions explain and for pieces
-that no motion explains. Those that do not pay are removed, and the others are fitted to their
-superpixels, as in PEARL (H. Isack, Y. Boykov, IJCV 97, 2012) and Progressive-X (D. Barath,
-J. Matas, ICCV 2019).
+Motions are proposed from the whole image, for surfaces and for pieces that no motion explains.
+Those that do not pay are removed, and the others are fitted to their superpixels, as in PEARL
+(H. Isack, Y. Boykov, IJCV 97, 2012) and Progressive-X (D. Barath, J. Matas, ICCV 2019).
 """
 
 from dataclasses import dataclass
@@ -170,24 +169,14 @@ def candidates(
 def _refitted(
     flow: FlowFit, motions: list[Motion], label: Int, seen: Mask, bad: Mask, scale: float
 ) -> list[Motion]:
-    """Motions with candidates for the superpixels of each, for those of the main one and another
-    together, and for pieces that none explains."""
-    first = int(np.argmax(np.bincount(label[seen], minlength=len(motions))))
-    main = motions[first]
+    """Motions with candidates for the superpixels of each and for pieces that none explains."""
+    main = motions[int(np.argmax(np.bincount(label[seen], minlength=len(motions))))]
     piece = connected_pieces(bad, flow.seg)
-    sizes = np.bincount(piece[bad], minlength=1)
-    groups = [np.flatnonzero((label == c) & seen) for c in range(len(motions))]
-    present: list[list[Motion]] = [[m] for m in motions]
-    # one motion may explain the superpixels of two, of which each was fitted to a part of them
-    for c in range(len(motions)):
-        if c != first:
-            groups.append(np.flatnonzero(((label == first) | (label == c)) & seen))
-            present.append([main, motions[c]])
-    for c in np.argsort(-sizes)[:PIECES]:
-        groups.append(np.flatnonzero(piece == c))
-        present.append([])
+    large = np.argsort(-np.bincount(piece[bad], minlength=1))[:PIECES]
+    groups = [((label == c) & seen, [m]) for c, m in enumerate(motions)]
     out = list(motions)
-    for at, own in zip(groups, present):
+    for mask, own in groups + [(piece == c, []) for c in large]:
+        at = np.flatnonzero(mask)
         if len(at) >= PIECE_SIZE:
             out += candidates(flow, at, main, own, scale)
     return out
