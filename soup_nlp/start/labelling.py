@@ -15,6 +15,7 @@ Those that do not pay are removed, and the others are fitted to their superpixel
 (H. Isack, Y. Boykov, IJCV 97, 2012) and Progressive-X (D. Barath, J. Matas, ICCV 2019).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -29,7 +30,6 @@ from soup_nlp.start.epipolar import (
     SIDEWAYS,
     Motion,
     estimate,
-    fit_translation,
     refine_near,
 )
 from soup_nlp.start.views import FlowFit
@@ -110,7 +110,7 @@ def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
     views, seen = flow.views, flow.views.usable & ~flow.poor
     if not seen.any():
         return Labelling.of(flow, motions[:1], np.zeros(len(flow.seg), np.int64), LEAST_SHARED)
-    motions = motions + _of_surfaces(flow, seen, surface, motions)
+    motions = motions + _of_surfaces(flow, seen, surface)
     for left in reversed(range(ROUNDS + 1)):
         error = views.fit(motions).penalised() - flow.residual[:, None]
         excess = np.maximum(error, 0.0)
@@ -141,36 +141,32 @@ def dominant(flow: FlowFit) -> Motion:
     return estimate(matches, flow.options.threshold_px, flow.options.seed) or SIDEWAYS
 
 
-def _of_surfaces(flow: FlowFit, seen: Mask, surface: Int, motions: list[Motion]) -> list[Motion]:
+def _of_surfaces(flow: FlowFit, seen: Mask, surface: Int) -> list[Motion]:
     """Motions of the surfaces (N,) with the most superpixels that are seen."""
-    scale = limited_noise(flow.residual[seen])
-    count = np.bincount(surface[seen])
-    groups = (np.flatnonzero((surface == c) & seen) for c in np.argsort(-count)[:SURFACES])
-    found = (candidates(flow, at, motions[0], [], scale) for at in groups if len(at) >= PIECE_SIZE)
-    return [motion for several in found for motion in several]
+    largest = np.argsort(-np.bincount(surface[seen]))[:SURFACES]
+    groups = [np.flatnonzero((surface == c) & seen) for c in largest]
+    return [m for at in groups if len(at) >= PIECE_SIZE for m in candidates(flow, at)]
 
 
 def candidates(
-    flow: FlowFit, at: Int, main: Motion, present: list[Motion], scale: float
+    flow: FlowFit, at: Int, present: Sequence[Motion] = (), scale: float = LEAST_NOISE
 ) -> list[Motion]:
-    """Candidate motions for superpixels `at`: the present ones refined, a translation with the
-    rotation of the main motion, also refined, and the motion of their own essential matrix.
+    """Candidate motions for superpixels `at`: the present ones refined, and that of their own
+    essential matrix.
 
     `scale` is the error of the flow across epipolar lines, pixels.
     """
     noise = limited_noise(flow.residual[at])
     matches = flow.views.subset(at).matches(PIXELS)
-    shift = fit_translation(main.R, matches, max(noise, 0.1))
     own = estimate(matches, max(3 * noise, 0.3), flow.options.seed)
-    refined = [refine_near(m, matches, scale) for m in (*present, shift)]
-    return [*refined, shift, *([] if own is None else [own])]
+    refined = [refine_near(m, matches, scale) for m in present]
+    return refined if own is None else [*refined, own]
 
 
 def _refitted(
     flow: FlowFit, motions: list[Motion], label: Int, seen: Mask, bad: Mask, scale: float
 ) -> list[Motion]:
     """Motions with candidates for the superpixels of each and for pieces that none explains."""
-    main = motions[int(np.argmax(np.bincount(label[seen], minlength=len(motions))))]
     piece = connected_pieces(bad, flow.seg)
     large = np.argsort(-np.bincount(piece[bad], minlength=1))[:PIECES]
     groups = [((label == c) & seen, [m]) for c, m in enumerate(motions)]
@@ -178,7 +174,7 @@ def _refitted(
     for mask, own in groups + [(piece == c, []) for c in large]:
         at = np.flatnonzero(mask)
         if len(at) >= PIECE_SIZE:
-            out += candidates(flow, at, main, own, scale)
+            out += candidates(flow, at, own, scale)
     return out
 
 
