@@ -299,8 +299,7 @@ def tiny(units: str = "paper", at_anchors: bool = False) -> Tiny:
     return Tiny(units, at_anchors)
 
 
-def form(**options) -> Formulation:
-    return Formulation(**{**options})
+form = Formulation
 
 
 def assert_same_soup(a: Soup, b: Soup, tolerance: float = 1e-12) -> None:

@@ -24,8 +24,6 @@ from soup_nlp.model.kernel import HESSIANS
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_tangent_nlp
 
-pytestmark = pytest.mark.slow
-
 EXACT = {
     "arap": 1e-11,
     **dict.fromkeys(("proj", "cont", "orient", "prior", "depth", "order"), 1e-12),
@@ -58,8 +56,7 @@ def program(coordinates, norm, units, at_anchors, truncated=True, **options):
 # --- plain numpy and symbolic terms --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("truncated", [True, False])
-@pytest.mark.parametrize("at_anchors", [True, False])
+@pytest.mark.parametrize(("at_anchors", "truncated"), [(True, True), (False, False)])
 @pytest.mark.parametrize("units", UNITS)
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_symbolic_terms_equal_plain_numpy(gauge, units, at_anchors, truncated):
@@ -127,6 +124,7 @@ def assert_derivatives(nlp: NLP, x: np.ndarray, seed: int) -> None:
     np.testing.assert_allclose(found / scale, H @ v / scale, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("coordinates", "norm", "units", "at_anchors", "truncated"),
     # with truncations and without in turn, which changes with every norm
@@ -137,6 +135,7 @@ def test_derivatives_equal_finite_differences(coordinates, norm, units, at_ancho
     assert_derivatives(nlp, wiggle(nlp, layout.size, 3, 0.05), 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_columns_of_jacobian_and_hessian(gauge):
     """Small entries of long rows, which rounding along dense directions hides."""
@@ -159,6 +158,7 @@ def test_columns_of_jacobian_and_hessian(gauge):
 # --- kinds of Hessian ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("coordinates", "norm", "units", "at_anchors"), EVERY)
 def test_gauss_newton_is_positive_semidefinite_whatever_the_multipliers(
     coordinates, norm, units, at_anchors
@@ -177,6 +177,7 @@ def test_gauss_newton_is_positive_semidefinite_whatever_the_multipliers(
     np.testing.assert_array_equal(H, nlp.hessian(x, np.zeros(nlp.ng)).toarray())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gauge", GAUGES)
 def test_kinds_of_hessian_share_the_curvature_of_the_constraints(gauge):
     H = {}

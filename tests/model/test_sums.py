@@ -17,8 +17,6 @@ from soup_nlp.model.symbolic import Graph
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def case(small_room: Case) -> Case:
@@ -59,6 +57,7 @@ def test_sums_of_every_size_have_the_values_of_their_formula(elements, monkeypat
     np.testing.assert_allclose(hessian.diagonal()[1:], diagonal, rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gauge", "norm"), [("unit-offset", "smooth"), ("unit-translation", "epigraph")]
 )
