@@ -13,8 +13,6 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.report.verdict import facts
 
-pytestmark = pytest.mark.slow
-
 K = intrinsics(90.0, 80.0, 47.3, 30.1)
 
 
@@ -90,6 +88,7 @@ def test_planes_are_exact_at_every_pixel():
     np.testing.assert_allclose(z[5:], pair.truth.depth_ref[5:], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_large_pair_comes_back_at_its_size():
     pair = render_scene("orbit", 0, 256, 128)
     settings = {

@@ -95,14 +95,6 @@ def test_a_file_system_without_locks(tmp_path):
     assert subprocess.run(words, env=environment).returncode == 0
 
 
-def test_h5_compresses_only_large_arrays(tmp_path):
-    write_h5(tmp_path / "r.h5", tree(), {})
-    with h5py.File(tmp_path / "r.h5") as file:
-        large, small = file["depth"], file["soup/R"]
-        assert (large.compression, large.compression_opts, large.shuffle) == ("gzip", 1, True)
-        assert small.compression is None
-
-
 def full_disk(*args, **options):
     raise OSError("disk is full")
 
@@ -275,13 +267,6 @@ def test_json_that_is_none_is_an_error_of_the_file(text, tmp_path):
     path.write_bytes(b"\xff\xfe{}")
     with pytest.raises(DataError, match="not text"):
         read_json(path, "summary.json", dict[str, Any])
-
-
-def test_versions():
-    out = versions()
-    assert " ".join(out) == "soup_nlp python casadi numpy scipy opencv skimage h5py"
-    assert out["numpy"] == np.__version__
-    assert "unknown" not in out.values()
 
 
 def test_the_code_version_is_that_of_every_source(tmp_path, monkeypatch):
