@@ -28,7 +28,6 @@ from soup_nlp.storage.folders import SUMS, read_sums
 T = TypeVar("T")
 Resolve = Callable[[str], Path]
 """Full path of a name in the problem file."""
-White = Annotated[int, Field(ge=1, le=65535)]
 
 
 class PairInput(Section, ABC):
@@ -50,7 +49,7 @@ class FramesInput(PairInput):
     """Values per unit of length of a 16-bit .png depth; null for 1000, with a warning."""
     unit: str = "m"
     """Unit of the true depth."""
-    white: White | None = None
+    white: Annotated[int, Field(ge=1, le=65535)] | None = None
     """Value of 16-bit images that is white, 4095 where they hold 12 bits; null for the values that
     occur."""
     cropped: bool = False

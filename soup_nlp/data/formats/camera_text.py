@@ -112,12 +112,12 @@ def _flat(tree: Any, path: tuple[str, ...] = ()) -> Iterator[Leaf]:
             if not matrix:
                 yield from _flat(value, (*path, *name.split(".")))
             elif name == "data":
-                yield path, list(_words(value))
+                yield path, list(_split(str(value)))
     elif isinstance(tree, list) and _has_names(tree):
         for number, value in enumerate(tree):
             yield from _flat(value, (*path, str(number)))
     else:
-        yield path, list(_words(tree))
+        yield path, list(_split(str(tree)))
 
 
 def _has_names(tree: list[Any]) -> bool:
@@ -126,16 +126,8 @@ def _has_names(tree: list[Any]) -> bool:
     )
 
 
-def _words(tree: Any) -> Iterator[str]:
-    if isinstance(tree, list):
-        for item in tree:
-            yield from _words(item)
-    else:
-        yield from _split(str(tree))
-
-
 def _split(text: str) -> Iterator[str]:
-    """Words between blanks, brackets and commas; a comma within a number may be a decimal one."""
+    """Words between blanks, brackets, quotes and commas, which may also be decimal ones."""
     for chunk in re.split(r"[\s;\[\](){}\"']+", text):
         decimal = re.fullmatch(r"[-+]?\d+,\d+,?", chunk)
         yield from (word for word in ([chunk] if decimal else chunk.split(",")) if word)
