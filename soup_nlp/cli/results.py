@@ -168,7 +168,7 @@ def view(
             print("stopped")
 
 
-_NAMES = "; ".join(f"{name}: {text}" for name, (_, text) in FORMATS.items())
+_NAMES = "; ".join(f"{name}: {one.text}" for name, one in FORMATS.items())
 
 
 def convert(

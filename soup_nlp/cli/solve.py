@@ -154,11 +154,7 @@ def solve_problem(
     as_json: bool = False,
     overwrite: bool = False,
 ) -> int:
-    """Solve a problem, write its folder and print the verdict, or summary.json.
-
-    Returns:
-        0 for a good result that meets the expectation, else 1.
-    """
+    """Solve a problem, write its folder, print the verdict or summary.json; the exit code."""
     folder = prepare_folder(out, chosen.input_paths(), overwrite, chosen.subject)
     interrupt = interruptible(log.interrupted, at_once=True)
 

@@ -43,13 +43,8 @@ Bending papers have a relief of 7 to 27 %, guesses without parallax mostly one o
 def depth_range(depth: AnyFloat) -> tuple[float, float]:
     """(near, far) of the colour scale of a depth map: its 2nd and 98th percentile.
 
-    They are at least a tenth apart, so that a nearly constant depth has nearly one colour.
-
-    Args:
-        depth: (H, W) z; values that are not finite or not positive are left out.
-
-    Returns:
-        near < far, in the unit of the depth; (1, 2) if no depth is known.
+    They are at least a tenth apart, so that a nearly constant depth has nearly one colour; (1, 2)
+    if no depth is known.
     """
     z = np.asarray(depth, np.float64)
     z = z[np.isfinite(z) & (z > 0)]
@@ -63,13 +58,9 @@ def depth_range(depth: AnyFloat) -> tuple[float, float]:
 
 
 def colourise_depth(depth: AnyFloat, near: float, far: float, guess: Mask | bool = False) -> Image:
-    """Depth in colour by even steps of 1/z: near is red, far is blue; pale where it is a guess.
+    """Depth (H, W) in colour by even steps of 1/z: near is red, far is blue, a guess is pale.
 
-    Args:
-        depth: (H, W) z; grey where not finite or not positive.
-        near: Depth of the near end.
-        far: Depth of the far end.
-        guess: (H, W) True where the depth is a guess.
+    It is grey where not finite or not positive.
     """
     z = np.asarray(depth, np.float64)
     known = np.isfinite(z) & (z > 0)
@@ -187,11 +178,7 @@ class Picture:
 
 
 def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: int = 420) -> Image:
-    """(H, W, 3) uint8: titled pictures with their legends in a grid, under a title.
-
-    Panels keep their aspect ratio.
-    `columns` is the largest number of panels in a row, `panel_width` is in pixels.
-    """
+    """(H, W, 3) uint8: titled pictures with their legends in a grid, under a title."""
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     heights = [
@@ -291,18 +278,11 @@ def depth_png_scale(depth: AnyFloat) -> float:
 
 
 def write_depth_png16(path: PathLike, depth: AnyFloat, scale: float | None = None) -> float:
-    """Write a depth map as 16-bit PNG: value = round(depth * scale), at least 1.
+    """Write a depth map (H, W) as 16-bit PNG: value = round(depth * scale), at least 1.
 
-    0 stands for what is unknown, or farther than 65535 can say: no depth is clipped.
-
-    Args:
-        path: File to write; its folder must exist.
-        depth: (H, W) z; unknown where not finite or not positive.
-        scale: Values per unit of depth, such as 256 (KITTI) or 1000 (millimetres of metres); None
-            for `depth_png_scale`.
-
-    Returns:
-        The scale, which a reader needs: depth = value / scale.
+    0 stands for what is unknown (not finite or not positive), or farther than 65535 can say: no
+    depth is clipped. Without a `scale`, in values per unit of depth, it is `depth_png_scale`.
+    Returns the scale, which a reader needs: depth = value / scale.
     """
     z = np.asarray(depth, np.float64)
     scale = depth_png_scale(z) if scale is None else float(scale)

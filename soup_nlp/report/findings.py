@@ -65,14 +65,12 @@ WAYS = (("to the right", "to the left"), ("down", "up"), ("ahead", "back"))
 
 def certainty_lines(shares: Mapping[str, float]) -> list[str]:
     """The shares of `certainty` as sentences on the determined part and on the guess."""
-    lines = []
-    if shares["determined"] >= LEAST:
-        lines.append(
-            f"{shares['determined']:.0%} of the image is determined, half of it to"
-            f" {shares['median_sigma']:.1%} (1 sigma):"
-            f" {_parts(shares, DETERMINED)}"
-        )
-    return lines + ([guess_words(shares)] if shares["guess"] >= LEAST else [])
+    determined = (
+        f"{shares['determined']:.0%} of the image is determined, half of it to"
+        f" {shares['median_sigma']:.1%} (1 sigma): {_parts(shares, DETERMINED)}"
+    )
+    lines = {"determined": determined, "guess": guess_words(shares)}
+    return [line for name, line in lines.items() if shares[name] >= LEAST]
 
 
 def guess_line(shares: Mapping[str, float], of: str = "the image") -> str:
@@ -146,12 +144,7 @@ def found_words(run: Run) -> list[str]:
 
 
 def _unmatched(usable: float, guess: float) -> bool:
-    """True if hardly any flow is usable, so that neither motion nor its causes can be told.
-
-    Args:
-        usable: Share of the pixels with a usable flow.
-        guess: Share of the pixels whose depth is a guess.
-    """
+    """True if hardly any flow is usable, so that neither motion nor its causes can be told."""
     return usable < MATCHED and guess > 0.5
 
 

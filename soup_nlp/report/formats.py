@@ -4,7 +4,7 @@ import io
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,44 +32,49 @@ CONVENTIONS = {
 }
 """Meaning of the entries of motions.json."""
 
-Writer = Callable[[Path, Chain], list[str]]
-"""Writes files of a chain, or of a pair as one, into a folder and returns their names."""
+Number: TypeAlias = Callable[[Path, Chain, int], object]
+"""Writes the file of a frame, or of a pair, by its number."""
+Whole: TypeAlias = Callable[[Path, Chain], object]
+"""Writes one file or folder of a chain, or of a pair as one."""
 
 
-def file_of(chain: Chain, stem: str, frame: str, suffix: str) -> str:
-    """Name of the file of a frame: stem_ref.png of a pair, stem/0000.png of a chain."""
-    return f"{stem}{'_' if chain.single else '/'}{frame}{suffix}"
+class Format(NamedTuple):
+    """Writers of the files of a format, by name.
+
+    Attributes:
+        text: Description.
+        frames: Of each frame: points.ply is points_ref.ply of a pair, points/0000.ply of a chain.
+        pairs: Of each pair: flow.flo of a pair, flow/0000.flo of a chain.
+        whole: Once.
+        chain: Once, of more than one pair.
+    """
+
+    text: str
+    frames: Mapping[str, Number] = {}
+    pairs: Mapping[str, Number] = {}
+    whole: Mapping[str, Whole] = {}
+    chain: Mapping[str, Whole] = {}
+
+    def write(self, folder: Path, chain: Chain) -> list[str]:
+        """Write the files into an existing folder and return their names."""
+        files = list[str]()
+        for writers, of_pairs in (self.frames, False), (self.pairs, True):
+            for file, write in writers.items():
+                for k, name in enumerate(_numbered(file, chain, of_pairs)):
+                    (folder / name).parent.mkdir(exist_ok=True)
+                    write(folder / name, chain, k)
+                    files.append(name)
+        for file, write_all in {**self.whole, **({} if chain.single else self.chain)}.items():
+            write_all(folder / file, chain)
+            files.append(file)
+        return files
 
 
-def _each(
-    stem: str, suffix: str, write: Callable[[Path, Chain, int], object], pairs: bool = False
-) -> Writer:
-    """Writer of one file for each frame, or for each pair."""
-
-    def writer(folder: Path, chain: Chain) -> list[str]:
-        names = [file_of(chain, stem, frame, suffix) for frame in chain.names]
-        if pairs:
-            names = [stem + suffix] if chain.single else names[:-1]
-        for k, name in enumerate(names):
-            (folder / name).parent.mkdir(exist_ok=True)
-            write(folder / name, chain, k)
-        return names
-
-    return writer
-
-
-def _all(*writers: Writer) -> Writer:
-    return lambda folder, chain: [name for write in writers for name in write(folder, chain)]
-
-
-def _one(name: str, write: Callable[[Path, Chain], object]) -> Writer:
-    """Writer of one file or folder."""
-
-    def writer(folder: Path, chain: Chain) -> list[str]:
-        write(folder / name, chain)
-        return [name]
-
-    return writer
+def _numbered(file: str, chain: Chain, of_pairs: bool) -> list[str]:
+    stem, suffix = file.split(".")
+    if chain.single:
+        return [file] if of_pairs else [f"{stem}_{frame}.{suffix}" for frame in chain.names]
+    return [f"{stem}/{frame}.{suffix}" for frame in chain.names[: -1 if of_pairs else None]]
 
 
 def _write_npy(path: Path, values: NDArray[np.floating]) -> None:
@@ -106,9 +111,8 @@ def _write_moving(path: Path, chain: Chain, k: int) -> None:
 def write_depths(folder: Path, chain: Chain) -> float:
     """Write depth maps as 16-bit PNG; returns the values per unit, the same for all."""
     scale = depth_png_scale(chain.depths)
-    _each("depth", ".png", lambda path, _, k: write_depth_png16(path, chain[k].depth, scale))(
-        folder, chain
-    )
+    frames = {"depth.png": lambda path, _, k: write_depth_png16(path, chain[k].depth, scale)}
+    Format("", frames).write(folder, chain)
     return scale
 
 
@@ -192,10 +196,6 @@ def _write_recording(path: Path, chain: Chain) -> None:
     out.disconnect()
 
 
-def _write_motions(path: Path, chain: Chain, k: int) -> None:
-    write_json(path, motions(chain.pairs[k]))
-
-
 def motions(result: Result) -> dict[str, Any]:
     """Contents of motions.json."""
     parts = result.components
@@ -236,41 +236,44 @@ def _turn(motion: RigidMotion) -> dict[str, Any]:
     return {"rotation_deg": np.degrees(log(motion.R)), "quaternion_xyzw": motion.quaternion}
 
 
-FORMATS: Mapping[str, tuple[Writer, str]] = {
-    "ply": (
-        _all(
-            _each("points", ".ply", write_cloud),
-            lambda folder, chain: (
-                [] if chain.single else _one("scene.ply", write_fused)(folder, chain)
-            ),
-        ),
+FORMATS = {
+    "ply": Format(
         "point clouds with normals, confidence, component; of a chain also its static scene as one",
+        frames={"points.ply": write_cloud},
+        chain={"scene.ply": write_fused},
     ),
-    "glb": (_each("mesh", ".glb", write_glb), "textured meshes, glTF 2.0"),
-    "colmap": (_one("colmap", write_colmap), "COLMAP's text model, images, masks of what moves"),
-    "transforms": (_one("transforms", _write_transforms), "transforms.json with images and masks"),
-    "npy": (
-        _all(
-            _each("depth", ".npy", lambda path, chain, k: _write_npy(path, chain[k].depth)),
-            _each("sigma", ".npy", lambda path, chain, k: _write_npy(path, chain[k].sigma)),
-            _one("K.txt", _write_cameras),
-        ),
+    "glb": Format("textured meshes, glTF 2.0", frames={"mesh.glb": write_glb}),
+    "colmap": Format(
+        "COLMAP's text model, images, masks of what moves", whole={"colmap": write_colmap}
+    ),
+    "transforms": Format(
+        "transforms.json with images and masks", whole={"transforms": _write_transforms}
+    ),
+    "npy": Format(
         "depth and sigma as float32 arrays, K.txt",
+        frames={
+            "depth.npy": lambda path, chain, k: _write_npy(path, chain[k].depth),
+            "sigma.npy": lambda path, chain, k: _write_npy(path, chain[k].sigma),
+        },
+        whole={"K.txt": _write_cameras},
     ),
-    "pfm": (_each("depth", ".pfm", _write_pfm), "depth as portable float maps"),
-    "masks": (
-        _all(_each("components", ".png", _write_labels), _each("moving", ".png", _write_moving)),
+    "pfm": Format("depth as portable float maps", frames={"depth.pfm": _write_pfm}),
+    "masks": Format(
         "labels of the components, and 255 where something moves by itself",
+        frames={"components.png": _write_labels, "moving.png": _write_moving},
     ),
-    "flow": (_each("flow", ".flo", _write_flo, pairs=True), "the flow that was used, .flo"),
-    "kitti": (_one("poses.txt", _write_kitti), "camera poses as in KITTI odometry"),
-    "rrd": (_one("scene.rrd", _write_recording), "a recording for the Rerun viewer (extra: rerun)"),
-    "motions": (
-        _all(_each("motions", ".json", _write_motions, True), _one("trajectory.tum", write_tum)),
+    "flow": Format("the flow that was used, .flo", pairs={"flow.flo": _write_flo}),
+    "kitti": Format("camera poses as in KITTI odometry", whole={"poses.txt": _write_kitti}),
+    "rrd": Format(
+        "a recording for the Rerun viewer (extra: rerun)", whole={"scene.rrd": _write_recording}
+    ),
+    "motions": Format(
         "motions of the components (.json) and the camera's trajectory (TUM)",
+        pairs={"motions.json": lambda path, chain, k: write_json(path, motions(chain.pairs[k]))},
+        whole={"trajectory.tum": write_tum},
     ),
 }
-"""Writer and description of every format."""
+"""Every format by its name."""
 
 
 def check_formats(names: Sequence[str]) -> list[str]:
@@ -305,4 +308,4 @@ def write_formats(folder: Path, chain: Chain, names: Sequence[str]) -> list[str]
         ConfigError: a format is not known.
         DataError: a file cannot be written, or a package is missing.
     """
-    return [file for name in check_formats(names) for file in FORMATS[name][0](folder, chain)]
+    return [file for name in check_formats(names) for file in FORMATS[name].write(folder, chain)]

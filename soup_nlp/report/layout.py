@@ -142,8 +142,8 @@ FREE = ("depth/next", "depth/sigma_next", "input/image_next", "truth/depth_next"
 
 def rows_in_file(truth_unit: str = "") -> dict[str, Row]:
     """The rows of `TABLE` as a file has them, with the unit of length of the truth."""
-    own = {k: row for k, row in LAYOUT.items() if row.unit == "truth"}
-    return LAYOUT | {k: row._replace(unit=truth_unit) for k, row in own.items()}
+    unit = {"truth": truth_unit}
+    return {k: row._replace(unit=unit.get(row.unit, row.unit)) for k, row in LAYOUT.items()}
 
 
 def _listed(values: Mapping[str, Any], prefix: str = "") -> ReadTree:

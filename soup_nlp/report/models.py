@@ -160,11 +160,7 @@ def fuse(chain: Chain, most: int = MOST) -> Cloud:
 
 
 def projected(frame: Frame, points: Float) -> tuple[Mask, Int, Int, Float]:
-    """Points (M, 3) of the world in a frame.
-
-    Returns:
-        Mask of the points in the image, their rows and columns, and their depths.
-    """
+    """Points (M, 3) of the world in a frame: mask of those in the image, rows, columns, depths."""
     local = frame.pose.inverse(points)
     height, width = frame.depth.shape
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -196,11 +192,9 @@ GLTF = np.diag([1.0, -1.0, -1.0])
 def surface_mesh(result: Result, frame: int) -> tuple[Float, Int, Float]:
     """The surface of the reference image in frame 0 (reference) or 1 (next).
 
-    It is cut at jumps of the depth, between components, and where depth is unknown.
-
-    Returns:
-        (V, 3) vertices in camera coordinates, (M, 3) triangles, counter-clockwise from the
-        camera, and (V, 2) pixels (u, v) of the reference image.
+    It is cut at jumps of the depth, between components, and where depth is unknown. Returns (V, 3)
+    vertices in camera coordinates, (M, 3) triangles, counter-clockwise from the camera, and (V, 2)
+    pixels (u, v) of the reference image.
     """
     points = result.points[frame]
     known = np.isfinite(points).all(axis=2) & (points[..., 2] > 0)
@@ -280,9 +274,6 @@ def write_colmap(folder: Path, chain: Chain) -> None:
 
     The world is the first camera (x right, y down, z ahead); images have poses cam_from_world.
     COLMAP models are static: the points are those of the static scene.
-
-    Raises:
-        DataError: a camera has skew, which none of COLMAP's models has.
     """
     write_views(folder, chain)
     model, cloud = folder / "sparse" / "0", fuse(chain, POINTS)

@@ -56,10 +56,8 @@ PIXELS = 600_000, 4_000_000
 def page(chain: Chain, parts: Mapping[str, str], drawn: Mapping[str, Picture] | None = None) -> str:
     """The page as HTML that holds everything it shows.
 
-    Args:
-        chain: A chain, or a pair as one.
-        parts: HTML of "summary", the line below the title, and of sections by their titles.
-        drawn: Pictures of a pair, where they are drawn already.
+    `parts` are HTML of "summary", the line below the title, and of sections by their titles;
+    `drawn` are pictures of a pair, where they are drawn already.
     """
     sections = "".join(
         f"<div{' class=wide' * (title == 'Verdict')}><h2>{title}</h2>{text}</div>\n"
@@ -79,7 +77,7 @@ def page(chain: Chain, parts: Mapping[str, str], drawn: Mapping[str, Picture] | 
 
 
 def pair_page(result: Result, drawn: Mapping[str, Picture] | None = None) -> str:
-    """The page of a result; `drawn` are its pictures, where they are drawn already."""
+    """The page of a result."""
     chain = Chain.of(result)
     parts = {
         "summary": _summary(result),
@@ -116,7 +114,7 @@ def _css(colour: Any) -> str:
 
 
 def _packed(array: NDArray[Any]) -> str:
-    """An array's numbers, deflated, as base64."""
+    """Numbers, deflated, as base64."""
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
     return base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
 
@@ -146,7 +144,6 @@ def _figure(picture: Picture, pairs: int) -> dict[str, str]:
 
 
 def _legend(legend: Legend | None) -> str:
-    """A legend in HTML."""
     if legend is None:
         return ""
     count, colours = legend.colours.shape[1], [*map(_css, legend.colours[0])]

@@ -248,9 +248,6 @@ def load(folder: str | Path) -> Result:
 
     Its `reconstruction`, `components`, `camera` and `metrics` are those of the `Run`.
 
-    Args:
-        folder: Result folder.
-
     Raises:
         DataError: the folder holds no result, or a damaged one.
     """
@@ -281,8 +278,6 @@ def load(folder: str | Path) -> Result:
 
 def _metrics(row: Mapping[str, Any]) -> DepthMetrics:
     """Scores of summary.json, in which null stands for NaN."""
-    scores: dict[str, Any] = {
-        f.name: row[f.name] for f in fields(DepthMetrics) if f.name != "shift"
-    }
-    scores |= {k: np.nan for k, v in scores.items() if v is None and k != "cap"}
-    return DepthMetrics(**scores)
+    names = [f.name for f in fields(DepthMetrics) if f.name != "shift"]
+    scores: dict[str, Any] = {k: np.nan if row[k] is None else row[k] for k in names}
+    return DepthMetrics(**(scores | {"cap": row["cap"]}))

@@ -9,13 +9,7 @@ import numpy as np
 from soup_nlp.evaluation.metrics import DepthMetrics, skill
 from soup_nlp.evaluation.scoring import SURE
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import (
-    certainty_lines,
-    flow_words,
-    found_words,
-    guess_line,
-    hints,
-)
+from soup_nlp.report.findings import certainty_lines, flow_words, found_words, guess_line, hints
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.summary import certainty
 from soup_nlp.solve.stages import Solution
@@ -85,10 +79,8 @@ def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
 def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
     """What was found, how sure it is, what to try, accuracy and times.
 
-    Args:
-        run: The run.
-        limit: Largest MRE that the problem file expects.
-        details: Add what concerns the flow and the solver: iterations, energies, residuals.
+    `limit` is the largest MRE that the problem file expects; `details` adds what concerns the flow
+    and the solver: iterations, energies, residuals.
     """
     shares = certainty(run)
     whole = {k: v for k, v in run.seconds.items() if not k.startswith("nlp_")}
@@ -160,7 +152,6 @@ def _numbers(values: Mapping[str, float], form: str) -> str:
 
 
 def _status(run: Run) -> list[str]:
-    """Status in words."""
     s = run.solution
     words = STATUS.get(s.status, f"not converged: {s.status}, best iterate kept")
     far = "the presolve ended before a minimum: solver.far_iterations limits Ipopt there"
