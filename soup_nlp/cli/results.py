@@ -74,15 +74,13 @@ def evaluate(
 ) -> None:
     """Score a result against a truth: MRE (Abs Rel), RMSE, delta < 1.25; of a chain its path."""
     chain = is_chain(folder)
-    of_pair, found = ["--moving"] * (moving is not None), f"--scale {scale}"
-    of_pair += [f"--cap {cap:g}"] if cap is not None else []
-    of_pair += [found] if scale != "median" else []
-    wrong = of_pair if chain else ["--path"] * (path is not None)
-    if wrong:
+    of_pair = {"--moving": moving, "--cap": cap, "--scale": None if scale == "median" else scale}
+    wrong = of_pair if chain else {"--path": path}
+    if any(value is not None for value in wrong.values()):
         raise ConfigError(
             f"{'a chain' if chain else 'a pair'} is scored without this option",
             where=folder,
-            found=wrong[0],
+            found=", ".join(f"{name} {x}" for name, x in wrong.items() if x is not None),
             hint="soup-nlp evaluate DIR/pairs/000_001 scores one pair" if chain else None,
         )
     if chain:
