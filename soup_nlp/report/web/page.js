@@ -514,10 +514,9 @@ function glb() {
     }
   const xyz = Float32Array.from(places.flatMap((q) => [q.x, -q.y, -q.z]));
   const tint = Uint8Array.from(colours.flatMap((c) => [...c, 255])), faces = Uint32Array.from(index);
-  const least = [0, 1, 2].map((j) => places.reduce((m, q) => Math.min(m, [q.x, -q.y, -q.z][j]), Infinity));
-  const most = [0, 1, 2].map((j) => places.reduce((m, q) => Math.max(m, [q.x, -q.y, -q.z][j]), -Infinity));
+  const { min, max } = new THREE.Box3().setFromArray(xyz);
   const accessors = [
-    { bufferView: 0, componentType: 5126, count, type: "VEC3", min: least, max: most },
+    { bufferView: 0, componentType: 5126, count, type: "VEC3", min: min.toArray(), max: max.toArray() },
     { bufferView: 1, componentType: 5121, count, type: "VEC4", normalized: true }];
   const bufferViews = [{ buffer: 0, byteLength: xyz.byteLength },
     { buffer: 0, byteOffset: xyz.byteLength, byteLength: tint.byteLength }];
