@@ -18,8 +18,7 @@ from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
 from soup_nlp.report.result import load
 from soup_nlp.report.summary import Summary
-from soup_nlp.sequence.contents import Contents
-from soup_nlp.sequence.folder import renew_page, write_chain
+from soup_nlp.sequence.folder import Contents, renew_page, write_chain
 from soup_nlp.sequence.links import make_chain
 from soup_nlp.sequence.score import chain_lines, chain_page
 from soup_nlp.storage.files import read_json
