@@ -69,7 +69,7 @@ results: $(VENV)/.optional
 	$(BENCH) family out/tangent --sizes 100,250 --starts hard --formulation tangent
 	$(BENCH) family out/matrix --sizes 100 --starts hard
 	$(BENCH) solvers out/tangent out/matrix -o results/solvers --seconds 10 --iterations 500 \
-		--solvers ipopt,ipopt-lbfgs,sqpmethod,uno,fatrop,pounce,soup-nlp
+		--solvers ipopt,ipopt-lbfgs,sqpmethod,uno,pounce,soup-nlp
 
 clean:
 	rm -rf $(VENV) out site

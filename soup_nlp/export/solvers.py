@@ -120,7 +120,7 @@ class Plugin(NamedTuple):
 
 
 CLAIMS = ("Solve_Succeeded", "Solved_To_Acceptable_Level", "SUCCESS", "success", "Converged")
-NESTED = ("ipopt", "uno", "bonmin", "fatrop")
+NESTED = ("ipopt", "uno", "bonmin")
 TOLERANCES = {
     **dict.fromkeys(("tol", "dual_inf_tol", "compl_inf_tol"), "tol"),
     "constr_viol_tol": "feasibility",
@@ -128,14 +128,12 @@ TOLERANCES = {
     "max_cpu_time": "seconds",
 }
 """Attribute of `Limits` by name of Ipopt's option."""
-TWO_LIMITS = {"max_iter": "iterations", "tol": "tol"}
 SQP_LIMITS = {"max_iter": "iterations", "tol_du": "tol", "tol_pr": "feasibility"}
 UNO_LIMITS = {
     "max_iterations": "iterations",
     "dual_tolerance": "tol",
     "primal_tolerance": "feasibility",
 }
-QUIET = {"print_level": 0}
 COMMON = {"acceptable_iter": 0, "print_level": 0, "sb": "yes"}
 NEAR_START = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
 """Options for a start near the minimum, for solvers with the options of Ipopt."""
@@ -156,15 +154,14 @@ PLUGINS: Mapping[str, Plugin] = {
     ),
     "sqpmethod": Plugin("sqpmethod", SQP_LIMITS, SQP, "gauss-newton"),
     "uno": Plugin("uno", UNO_LIMITS, {"logger": "SILENT"}),
-    "fatrop": Plugin("fatrop", TWO_LIMITS, QUIET),
-    "fatrop-tuned": Plugin("fatrop", TWO_LIMITS, {**QUIET, "mu_init": NEAR_START["mu_init"]}),
-    "bonmin-tuned": Plugin("bonmin", TWO_LIMITS, {**QUIET, **NEAR_START}),
+    "bonmin-tuned": Plugin(
+        "bonmin", {"max_iter": "iterations", "tol": "tol"}, {"print_level": 0, **NEAR_START}
+    ),
 }
 """"ipopt" has the default options of Ipopt, "ipopt-adaptive" one other: the strategy of the
-barrier. "ipopt-soup" has the options of `solve` for a start
-that is no KKT point, and "ipopt-tuned" the same with the exact Hessian. Other names with "-tuned"
-have the options for a start near the minimum. blocksqp is left out, since it needs a linear solver
-(ma27) that the wheel of CasADi lacks."""
+barrier. "ipopt-soup" has the options of `solve` for a start that is no KKT point, and "ipopt-tuned"
+the same with the exact Hessian. Other names with "-tuned" have the options for a start near the
+minimum. blocksqp is left out: it needs a linear solver (ma27) that the wheel of CasADi lacks."""
 
 UPPER = ("triu_hess_gamma_x_x",)
 IPOPT = {"nlp_grad_f": ("f", "grad_f_x"), "nlp_jac_g": ("g", "jac_g_x"), "nlp_hess_l": UPPER}
@@ -172,12 +169,6 @@ CACHED: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "ipopt": IPOPT,
     "bonmin": IPOPT,
     "uno": {"nlp_grad_f": ("grad_f_x",), "nlp_jac_g": ("jac_g_x",), "nlp_hess_l": UPPER},
-    "fatrop": {
-        "nlp_grad_f": ("grad_f_x",),
-        "nlp_jac_g": ("g", "jac_g_x"),
-        "nlp_hess_l": ("grad_gamma_x", "hess_gamma_x_x"),
-        "nlp_grad": ("f", "g", "grad_gamma_x", "grad_gamma_p"),
-    },
     "sqpmethod": {
         "nlp_jac_fg": ("f", "grad_f_x", "g", "jac_g_x"),
         "nlp_hess_l": ("hess_gamma_x_x",),
@@ -237,8 +228,6 @@ def _derivatives(
         "jac_g_x": jac,
         "triu_hess_gamma_x_x": upper,
         "hess_gamma_x_x": ca.triu2symm(upper),
-        "grad_gamma_p": ca.MX(0, 1),
-        "grad_gamma_x": lam_f * grad + ca.mtimes(jac.T, lam_g),
     }
     inputs = {"x": x, "p": q, "lam_f": lam_f, "lam_g": lam_g}
     out = {}

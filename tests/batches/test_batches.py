@@ -134,11 +134,14 @@ def test_the_same_input_has_the_same_contents(pairs, tmp_path):
         return make_problem(raw).identity()
 
     np.save(place / "flow.npy", np.zeros((64, 96, 2)))
-    flow = {"flow": {"source": "flow.npy"}}
-    first, with_flow = files(), files(**flow)
-    assert first != with_flow
-    np.save(place / "flow.npy", np.ones((64, 96, 2)))
-    assert files(**flow) != with_flow
+    more = {"flow": {"source": "flow.npy"}, "depth_prior": {"source": "depth.npy"}}
+    first = files()
+    for (section, keys), name in zip(more.items(), ("flow", "depth"), strict=True):
+        path = place / f"{name}.npy"
+        given = files(**{section: keys})
+        assert given != first
+        np.save(path, np.load(path) + 1)
+        assert files(**{section: keys}) != given
     assert files() == first
     np.savetxt(place / "K.txt", 1.1 * np.loadtxt(place / "K.txt"))
     assert files() != first
