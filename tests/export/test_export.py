@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 from functools import cache
 from pathlib import Path
 
@@ -22,13 +21,11 @@ from soup_nlp.export.artefact import parse_formulation
 from soup_nlp.export.foreign import import_sol, sol_table
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import write_sol
-from soup_nlp.export.solvers import find_program
 from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.geometry.constraints import kind, table
 from soup_nlp.model import oracle
 from soup_nlp.model.symbolic import Graph
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.solve.kkt import WARM
 from soup_nlp.solve.stages import solve_soup
 
 ENDS = {"variables": ".col", "rows": ".row"}
@@ -315,19 +312,3 @@ def test_suffixes_say_kind_and_superpixel(tmp_path):
     factors = [float(line.split()[1]) for line in lines[at : at + count]]
     assert count == len(names["variables"])
     assert min(factors) > 0
-
-
-@pytest.mark.slow
-def test_pounce_takes_the_multipliers(tmp_path):
-    command = find_program("pounce")
-    if command is None:
-        pytest.skip("pounce is not installed")
-    words = ["-o", str(tmp_path), *TINY, "--superpixels", "16", "--suffixes"]
-    assert main(["export", "orbit", "--presolve", *words]) == 0
-    options = {**WARM, "nlp_scaling_method": "none", "tol": 1e-6}
-    words = [f"{k}={v}" for k, v in options.items()]
-    run = subprocess.run(
-        [command, "soup", "-AMPL", *words], cwd=tmp_path, check=True, capture_output=True, text=True
-    )
-    assert "SolveSucceeded" in (tmp_path / "soup.sol").read_text(), run.stdout[-2000:]
-    assert main(["check", str(tmp_path / "soup.sol")]) == 0

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from helpers_nl import ReadBack, close, defined_variables, write_sx_nl
+from helpers_nl import ReadBack, close, write_sx_nl
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -63,10 +63,6 @@ def test_textbook_problems_read_back_and_keep_their_bytes(make, digest, tmp_path
         if name in given:
             assert np.array_equal(getattr(back, name), given[name][file.rows])
     assert np.array_equal(back.x0, given["x0"][file.variables])
-
-
-def test_defined_variables_are_classified_by_use(tmp_path):
-    assert defined_variables(write_sx_nl(tmp_path / "p.nl", **shared())) == [1, 1, 0, 1, 1]
 
 
 def same_as_sx(problem: dict, file: NLFile, at: np.ndarray) -> None:

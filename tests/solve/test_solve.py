@@ -18,7 +18,6 @@ from helpers_model import (
 )
 
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.errors import SolverError
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
@@ -273,22 +272,6 @@ def test_a_stop_before_the_start_gives_the_start(room):
     assert solution.energy["total"] == pytest.approx(solution.energy_start["total"], rel=1e-3)
 
 
-@pytest.mark.parametrize("stage", ["majorant 0.1", "constrained NLP"])
-def test_a_stop_in_any_stage_keeps_what_was_reached(room, stage):
-    stop, seen = threading.Event(), []
-
-    def listen(p: Progress) -> None:
-        seen.append(p.stage)
-        if p.stage == stage:
-            stop.set()
-
-    solution = room.solve(OPTIONS.replace(tol=1e-10), watch=Watch(listen, stop))
-    assert solution.status == "Interrupted"
-    assert_whole(solution, room)
-    assert seen.count(stage) == 1
-    assert solution.energy["total"] < solution.energy_start["total"]
-
-
 def test_progress_and_sentences_are_delivered(room, solved, tmp_path):
     seen: list[Progress] = []
     said: list[str] = []
@@ -307,11 +290,6 @@ def test_progress_and_sentences_are_delivered(room, solved, tmp_path):
     for name in ("lam", "n", "R", "t"):
         own = getattr(solution.soup, name)
         np.testing.assert_array_equal(own, getattr(solved["unit-offset"].soup, name))
-
-
-def test_a_wrong_option_of_the_soup_is_a_solver_error(room):
-    with pytest.raises(SolverError, match="no_such_option"):
-        room.solve(OPTIONS.replace(presolve=False, ipopt={"no_such_option": 1}))
 
 
 # --- a world whose truth is the optimum ----------------------------------------------------------
