@@ -91,14 +91,14 @@ def test_a_dataset_is_a_section_that_loads_itself(tmp_path):
 
 @pytest.fixture
 def run_example(tmp_path, monkeypatch):
-    """Runs the first program of a page, which writes a network, in an empty folder."""
+    """Runs the programs of a page, which write networks, in an empty folder."""
     pytest.importorskip("onnx", reason="no onnx")
     pytest.importorskip("onnxruntime", reason="no onnxruntime")
     monkeypatch.chdir(tmp_path)
 
     def run(page: str) -> None:
         text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-        exec(re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0], {})
+        exec("".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})
 
     return run
 
@@ -116,7 +116,7 @@ def test_a_network_is_any_onnx_file(run_example):
 
 
 def test_a_depth_prior_may_be_an_onnx_file(run_example):
-    run_example("depth_prior.md")
+    run_example("networks.md")
     image = np.zeros((50, 60, 3), np.uint8)
     pair = Pair(image, image, *[intrinsics(90, 90, 50, 40)] * 2)
     found = PriorOptions(source="ramp.onnx").load(pair, Path).depth_prior

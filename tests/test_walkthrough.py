@@ -27,8 +27,6 @@ PAGES = [
     "README.md",
     *(f"docs/{name}.md" for name in ("using", "python", "networks", "depth_prior", "family")),
 ]
-NETWORKS = {"docs/networks.md", "docs/depth_prior.md"}
-"""Pages that write a network in an ONNX file."""
 INSTALLATION = {"pip", "make"}
 """Programs of an installation, which `.ci/run` uses."""
 SOLVES = {"solve", "demo", "chain"}
@@ -80,7 +78,7 @@ def test_a_page_runs_as_printed(page, monkeypatch):
     if page != "docs/family.md":
         validate = Problem.model_validate
         monkeypatch.setattr(Problem, "model_validate", lambda tree: validate(small(tree)))
-    if page in NETWORKS:
+    if page == "docs/networks.md":
         for package in ("onnx", "onnxruntime"):
             pytest.importorskip(package, reason=f"no {package}")
     names = {}
