@@ -99,15 +99,17 @@ def finish(good: bool, reason_text: str, bad: int = 1) -> int:
     return code
 
 
-def changed(
-    preset: str | None, overrides: Sequence[str] | None, short: Mapping[str, object] | None = None
-) -> list[str]:
-    """Overrides of a preset, of `--set`, and of the options that stand for keys.
+def given(**values: object) -> dict[str, Any]:
+    """The values that are not None."""
+    return {name: value for name, value in values.items() if value is not None}
 
-    The preset is first, so that `--set preset=null` can undo it.
-    """
-    from_options = [f"{key}={value}" for key, value in (short or {}).items() if value is not None]
-    return [*([] if preset is None else [f"preset={preset}"]), *(overrides or []), *from_options]
+
+def changed(
+    preset: str | None, overrides: Sequence[str] | None, short: Mapping[str, object]
+) -> list[str]:
+    """Overrides of a preset, of `--set`, which can undo it, and of options that stand for keys."""
+    first, last = ([f"{k}={v}" for k, v in given(**x).items()] for x in ({"preset": preset}, short))
+    return [*first, *(overrides or []), *last]
 
 
 def located(name: str | None, what: str) -> str | None:
@@ -124,8 +126,11 @@ def sizes(
     superpixels: int | None, neighbours: int | None, max_size: float | None
 ) -> dict[str, object]:
     """Keys of the options that `solve` and `chain` share."""
-    segmentation = {"superpixels": superpixels, "neighbours": neighbours}
-    return {f"segmentation.{k}": v for k, v in segmentation.items()} | {"max_size": max_size}
+    return {
+        "segmentation.superpixels": superpixels,
+        "segmentation.neighbours": neighbours,
+        "max_size": max_size,
+    }
 
 
 def camera(text: str | None) -> list[float] | str | None:
@@ -163,14 +168,10 @@ def resumable(kept: str, where: object) -> Iterator[None]:
 
 
 class RowProgress:
-    """Prints finished rows and time left: one updated line on a terminal, else a line per row.
-
-    Args:
-        quiet: Print nothing.
-        result_of: Makes a short text from a row that did not fail.
-    """
+    """Prints finished rows and time left: one updated line on a terminal, else a line per row."""
 
     def __init__(self, quiet: bool, result_of: Callable[[Row], str] = lambda row: "done") -> None:
+        """Make it; `result_of` makes a short text from a row that did not fail."""
         self.quiet, self.result_of = quiet, result_of
         self.live = sys.stderr.isatty()
         self.spent: list[float] = []

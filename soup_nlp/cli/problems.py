@@ -60,7 +60,7 @@ def show(
             )
         print(PRESET_FILES[preset].read_text("utf-8"), end="")
         return
-    chosen = load_problem(problem, options.changed(preset, overrides))
+    chosen = load_problem(problem, options.changed(preset, overrides, {}))
     footer = "" if all_options else "# all other options have their defaults: soup-nlp show --all\n"
     print(f"{dump_problem(chosen, all_options)}{footer}# hash {chosen.digest()}")
 

@@ -91,13 +91,8 @@ def solve(
         "depth_prior.kind": depth_prior_kind,
     }
     changes = options.changed(preset, overrides, keys)
-    pair_options = {
-        "intrinsics": options.camera(intrinsics),
-        "fov": fov,
-        "depth": depth,
-        "undistort": undistort or None,
-    }
-    pair = {key: value for key, value in pair_options.items() if value is not None}
+    camera = options.camera(intrinsics)
+    pair = options.given(intrinsics=camera, fov=fov, depth=depth, undistort=undistort or None)
     words = source or []
     if len(words) == 1 and words[0].suffix.lower() not in (*IMAGES, *VIDEOS):
         chosen = _from_file(words[0], pair, changes)
@@ -261,13 +256,9 @@ def chain(
             print(f"{len(sequence)} frames{spacing}; pairs to solve: {pairs}", file=sys.stderr)
 
     short = options.sizes(superpixels, neighbours, max_size)
-    flows = {"source": flow, "backward": flow_backward}
-    prior = {"source": depth_prior, "kind": depth_prior_kind}
-    sections: dict[str, Any] = {
-        name: {key: value for key, value in section.items() if value is not None}
-        for name, section in (("flow", flows), ("depth_prior", prior))
-        if any(section.values())
-    }
+    flows = options.given(source=flow, backward=flow_backward)
+    prior = options.given(source=depth_prior, kind=depth_prior_kind)
+    sections: dict[str, Any] = options.given(flow=flows or None, depth_prior=prior or None)
     progress, solved = options.RowProgress(quiet), list[Row]()
 
     def say(done: int, total: int, row: Row) -> None:
@@ -297,8 +288,7 @@ def chain(
     print("\n".join(chain_lines(done)))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "pairs/"]))
     code, why = chain_exit_code(done)
-    print(f"exit code   {code}: {why}")
-    return code
+    return options.finish(not code, why, code)
 
 
 SOURCES = f"pairs.csv, a folder of pairs, a pattern, or {':DIR, '.join(DATASETS)}:DIR."
