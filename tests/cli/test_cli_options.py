@@ -144,7 +144,6 @@ def test_a_picture_of_12_bits_names_its_key(tmp_path, capsys):
     [
         ("--help >&-", 0),
         ("list <&- >&- 2>&-", 0),
-        ("show nothing.yaml", 2),
         # no space for the output
         ("list >/dev/full", 2),
     ],
