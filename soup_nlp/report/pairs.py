@@ -43,11 +43,7 @@ class Stored(TypedDict, total=False):
 
 
 def head(problem: Problem) -> Row:
-    """What a row says of a pair before it is solved: if all of it is the same, so is the result.
-
-    Raises:
-        SoupError: a file of the pair cannot be read.
-    """
+    """What a row says of a pair before it is solved: if all of it is the same, so is the result."""
     own = {"key": problem.name, "pair": problem.name, "seed": problem.seed}
     return {**own, "identity": problem.identity(), "code": code_version()}
 
@@ -58,7 +54,7 @@ def kept_rows(folder: Path, heads: Mapping[str, Row]) -> dict[str, Row]:
     same = {
         name: last[name]
         for name, own in heads.items()
-        if name in last and all(last[name].get(k) == v for k, v in own.items())
+        if name in last and own.items() <= last[name].items()
     }
     # a command that was killed may have replaced a result before it wrote the row
     stored = {name: _result(folder / PAIRS / name) for name in same}
@@ -73,11 +69,7 @@ def _result(place: Path) -> str | None:
 
 
 def needed_bytes(problem: Problem) -> float:
-    """Estimate of the memory of a solve.
-
-    Raises:
-        SoupError: the pair cannot be loaded.
-    """
+    """Estimate of the memory of a solve."""
     return sum(size for size, _ in solve_bytes(problem, problem.load_pair()).values())
 
 

@@ -12,7 +12,6 @@ from helpers_odd_world import SIZE, World
 
 import soup_nlp
 
-API = "5 Python API"
 THINGS: dict[str, Any] = {
     "None": None,
     "list": [],
@@ -154,7 +153,7 @@ def api_cases() -> Iterator[Case]:
         fine, left = (table.get(name, "").split(", ") for table in (FINE, LEFT_OUT))
         for quiet in (False, True):
             things = {k: v for k, v in THINGS.items() if k not in left and (k in fine) is quiet}
-            yield from cases(API, f"api {name} {{}}", _called(call), things, quiet=quiet)
-    yield from cases(API, "arrays of {}", _strided, ["other layouts"], quiet=True)
+            yield from cases(f"api {name} {{}}", _called(call), things, quiet=quiet)
+    yield from cases("arrays of {}", _strided, ["other layouts"], quiet=True)
     huge = {"truth that overflows": np.full(SIZE, 1e300)}
-    yield from cases(API, "{}", _called(lambda w, o, x: soup_nlp.Truth(depth_ref=x)), huge)
+    yield from cases("{}", _called(lambda w, o, x: soup_nlp.Truth(depth_ref=x)), huge)

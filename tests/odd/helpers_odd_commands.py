@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from helpers_odd_run import ANY, DOORS, Case, cases, changed, write, written
+from helpers_odd_run import ANY, Case, cases, changed, write, written
 from helpers_odd_world import CAMERA, NO_FOLDER, ODD, World
 
 # --- files ---------------------------------------------------------------------------------------
@@ -117,22 +117,22 @@ def path_cases() -> Iterator[Case]:
     for door, line in READ.items():
         # an empty folder lists no problem, which is no mistake
         other = {"folder": (0,)} if door == "list" else None
-        yield from cases(DOORS, f"{door} {{}}", line, KINDS, other=other)
+        yield from cases(f"{door} {{}}", line, KINDS, other=other)
     for name, text in DATASETS.items():
         make = _dataset(name, text)
-        yield from cases(DOORS, f"dataset {name} {{}}", "solve {x} -o {out}", KINDS, make=make)
+        yield from cases(f"dataset {name} {{}}", "solve {x} -o {out}", KINDS, make=make)
     for name in (f"{stem}.{suffix}" for stem, kinds in PARTS.items() for suffix in kinds.split()):
         line = "solve {x} -q -o {out}"
-        yield from cases(DOORS, f"part {name} {{}}", line, MALFORMED, make=_part(name))
+        yield from cases(f"part {name} {{}}", line, MALFORMED, make=_part(name))
     for door, line in WRITE.items():
-        yield from cases(DOORS, f"{door} -o {{}}", line, NO_FOLDER)
-    yield from cases(DOORS, "list of {}", "list {x}", KINDS, (0, 2), make=_listed)
+        yield from cases(f"{door} -o {{}}", line, NO_FOLDER)
+    yield from cases("list of {}", "list {x}", KINDS, (0, 2), make=_listed)
     for name in ("depth_ref.png", "points_next.ply", "overview.png", "result.h5", "summary.json"):
         codes = (2,) if name in ("result.h5", "summary.json") else (1,)
         make = changed("result", name, _instead)
-        yield from cases("3 check", f"check {name} {{}}", "check {x}", INSTEAD, codes, make=make)
+        yield from cases(f"check {name} {{}}", "check {x}", INSTEAD, codes, make=make)
     page = changed("result", "report.html", _instead)
-    yield from cases(DOORS, "view page {}", "view {x} --no-open", INSTEAD, (0, 2), make=page)
+    yield from cases("view page {}", "view {x} --no-open", INSTEAD, (0, 2), make=page)
 
 
 # --- texts ---------------------------------------------------------------------------------------
@@ -186,16 +186,16 @@ def text_cases() -> Iterator[Case]:
     for use, (line, make, codes) in USES.items():
         solves = TEXTS.keys() - FEW if use in ("config", "over manifest") else False
         title = f"text {use} {{}}"
-        yield from cases(DOORS, title, line, TEXTS, codes, make=make, solves=solves)
+        yield from cases(title, line, TEXTS, codes, make=make, solves=solves)
     spoken = {
         name: text if isinstance(text, str) else text.decode("utf-8", "surrogateescape")
         for name, text in TEXTS.items()
     }
     spoken = {k: v for k, v in spoken.items() if "\0" not in v and len(v) < 100_000}
-    yield from cases(DOORS, "text --set {}", "show {p} --set name={x}", spoken, (0, 2))
+    yield from cases("text --set {}", "show {p} --set name={x}", spoken, (0, 2))
     # the command ends with an error after it has read the rows
     line = "compare {p} --solvers no_such_solver -o {o}"
-    yield from cases(DOORS, "rows {}", line, TEXTS, ANY, make=written("runs.jsonl"))
+    yield from cases("rows {}", line, TEXTS, ANY, make=written("runs.jsonl"))
 
 
 UNTRUSTED = {
@@ -258,4 +258,4 @@ UNTRUSTING: dict[str, tuple[str, Any, tuple[int, ...]]] = {
 
 def untrusted_cases() -> Iterator[Case]:
     for use, (line, make, codes) in UNTRUSTING.items():
-        yield from cases("6 untrusted", f"{use} {{}}", line, UNTRUSTED, codes, make=make)
+        yield from cases(f"{use} {{}}", line, UNTRUSTED, codes, make=make)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from helpers_odd_run import ANY, DOORS, Case, cases, written
+from helpers_odd_run import ANY, Case, cases, written
 from helpers_odd_world import SIZE, World, encoded_noise, png
 from PIL import Image
 
@@ -60,11 +60,11 @@ LIES: dict[str, bytes] = {
 def array_cases() -> Iterator[Case]:
     for door in ("flow", "depth"):
         line = f"{{solve}} --{door} {{x}}"
-        yield from cases(DOORS, f"npy {door} {{}}", line, LIES, make=written("x.npy"))
+        yield from cases(f"npy {door} {{}}", line, LIES, make=written("x.npy"))
     for option in ("confidence", "backward"):
         line = f"{{solve}} --flow dis --flow-{option} {{d}}"
-        yield from cases(DOORS, f"flow_{option} {{}}", line, ["without a flow"])
-    yield from cases(DOORS, "json of {}", "solve no.png {b} --json -o {out}", ["an error"])
+        yield from cases(f"flow_{option} {{}}", line, ["without a flow"])
+    yield from cases("json of {}", "solve no.png {b} --json -o {out}", ["an error"])
 
 
 # --- images --------------------------------------------------------------------------------------
@@ -124,7 +124,7 @@ def image_cases() -> Iterator[Case]:
         "ref and next": "solve {x} {x} --intrinsics {camera} {tiny} -q -o {out}",
     }.items():
         title, make = f"image {{}} as {doors}", written("x.png")
-        yield from cases("4 endless", title, line, IMAGES, make=make, other=tiffs)
+        yield from cases(title, line, IMAGES, make=make, other=tiffs)
     # the pictures are read first, then the missing flow ends the command
     line = "solve {o}/a.jpg {o}/b.jpg --flow nothing.flo -q -o {out}"
-    yield from cases(DOORS, "exif {}", line, EXIF, make=_photos)
+    yield from cases("exif {}", line, EXIF, make=_photos)

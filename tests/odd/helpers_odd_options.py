@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from helpers_odd_run import ANY, DOORS, Case, cases, words
+from helpers_odd_run import ANY, Case, cases, words
 from helpers_odd_world import SIZE, World
 
 from soup_nlp.cli.main import COMMANDS, _load
@@ -51,23 +51,23 @@ def number_cases() -> Iterator[Case]:
         texts = [form.format(v) for v in values]
         solves = texts if "sigma" in name or name == "solver.ipopt" else free
         line = f"{{solve}} {settings} --set {name}={{x}}"
-        yield from cases("2 numbers", f"number {name}={{}}", line, texts, ANY, solves=solves)
+        yield from cases(f"number {name}={{}}", line, texts, ANY, solves=solves)
     free = ("1e9", "1e5", "0", "-60", "1e-300")
     for title, line in NUMBERS.items():
         numbers = ("nan", "inf", "1e300", *free)
-        yield from cases("2 numbers", title, line, numbers, ANY, solves=free)
+        yield from cases(title, line, numbers, ANY, solves=free)
     for option in ("--depth-scale", "--cap"):
         line = f"evaluate {{result}} --depth {{o}}/d.png {option}={{x}}"
         numbers = ("nan", "inf", "1e300", "1e-300", "-1", "0")
         make = lambda w, o, x: depth_png(o) and x  # noqa: E731
-        yield from cases("2 numbers", f"evaluate {option}={{}}", line, numbers, (0, 2), make=make)
+        yield from cases(f"evaluate {option}={{}}", line, numbers, (0, 2), make=make)
     for option in ("--seconds", "--iterations"):
         line = f"compare {{p}} --solvers no_such_solver {option}={{x}} -o {{out}}"
         numbers = ("nan", "inf", "1e300", "0", "-1", "x")
-        yield from cases("2 numbers", f"compare {option}={{}}", line, numbers)
+        yield from cases(f"compare {option}={{}}", line, numbers)
     shown = ("-0.1", "1.1", ".nan", "word", "[]", "null")
     line = "show {p} --set output.min_confidence={x}"
-    yield from cases("2 numbers", "min_confidence {}", line, shown)
+    yield from cases("min_confidence {}", line, shown)
 
 
 def depth_png(o: Path) -> Path:
@@ -133,13 +133,13 @@ def _option_case(command: str, word: str, name: str, value: str) -> Case:
 
     text = value if len(value) < 12 else f"{value[:6]}... of {len(value)}"
     title = f"option {command} {word or name.upper()} {text!r}"
-    return Case(DOORS, title, run, ANY, solves=command in SOLVING)
+    return Case(title, run, ANY, solves=command in SOLVING)
 
 
 PRESETS = ("", "Paper", "../paper", "paper,paper", "[paper]", "{a: 1}", "\x1b[31m", "3", "~")
 
 
 def preset_cases() -> Iterator[Case]:
-    yield from cases(DOORS, "preset {}", "show {p} --preset={x}", PRESETS, other={"~": (0,)})
+    yield from cases("preset {}", "show {p} --preset={x}", PRESETS, other={"~": (0,)})
     fine = {"~": (0,), "": (0,)}
-    yield from cases(DOORS, "preset of a file {}", "show {p} --set preset={x}", PRESETS, other=fine)
+    yield from cases("preset of a file {}", "show {p} --set preset={x}", PRESETS, other=fine)

@@ -7,7 +7,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from helpers_odd_run import ANY, DOORS, Case, cases, changed, h5_damage, words
+from helpers_odd_run import ANY, Case, cases, changed, h5_damage, words
 from helpers_odd_world import SIZE, World, encoded_noise
 
 
@@ -149,18 +149,18 @@ def result_cases() -> Iterator[Case]:
         ("evaluate", "evaluate {x} --depth {d}", ANY, certain),
     ):
         title = f"h5 {verb} {{}}"
-        yield from cases("4 endless", title, line, linked, codes, make=broken, other=other)
-        yield from cases(DOORS, title, line, unlinked, codes, make=broken, other=other)
+        yield from cases(title, line, linked, codes, make=broken, other=other)
+        yield from cases(title, line, unlinked, codes, make=broken, other=other)
         flip = changed("result", "result.h5", _flip)
         ends = ("start", "middle", "end")
-        yield from cases(DOORS, f"h5 {verb} flipped {{}}", line, ends, ANY, make=flip)
+        yield from cases(f"h5 {verb} flipped {{}}", line, ends, ANY, make=flip)
     formats = "ply,glb,colmap,npy,pfm,rrd,motions,masks,flow,transforms,kitti"
     for line in (f"convert {{x}} --to {formats}", "view {x} --renew --no-open"):
         title = f"{line.split()[0]} h5 {{}}"
-        yield from cases(DOORS, title, line, CONTENTS, (0, 2), make=broken)
-    yield from cases(DOORS, "convert {}", "convert {exported} --to npy -o {out}", ["an export"])
-    yield from cases(DOORS, "convert {}", "convert {result} --to npy,npy -o {o}", ["twice"], (0,))
-    yield from cases(DOORS, "view {}", "view {exported} --no-open", ["an export"])
+        yield from cases(title, line, CONTENTS, (0, 2), make=broken)
+    yield from cases("convert {}", "convert {exported} --to npy -o {out}", ["an export"])
+    yield from cases("convert {}", "convert {result} --to npy,npy -o {o}", ["twice"], (0,))
+    yield from cases("view {}", "view {exported} --no-open", ["an export"])
 
 
 # --- sequences -----------------------------------------------------------------------------------
@@ -226,8 +226,8 @@ SOURCES = (
 def chain_cases() -> Iterator[Case]:
     # two sizes of images are allowed
     fine = ("auto of two frames alike", "images of two sizes")
-    yield from cases(DOORS, "chain {}", None, CHAINS, other=dict.fromkeys(fine, ANY))
-    yield from cases(DOORS, "chain source {}", "chain {x} -q -o {out}", SOURCES)
+    yield from cases("chain {}", None, CHAINS, other=dict.fromkeys(fine, ANY))
+    yield from cases("chain source {}", "chain {x} -q -o {out}", SOURCES)
     empty = lambda w, o, _: (o / "clip").mkdir()  # noqa: E731
     line = "chain {o}/clip -q -o {out}"
-    yield from cases(DOORS, "chain {}", line, ["no images"], make=empty)
+    yield from cases("chain {}", line, ["no images"], make=empty)

@@ -20,8 +20,6 @@ from soup_nlp.errors import SoupError
 
 LONGEST = 6000
 """Characters that an error message may have."""
-DOORS = "5 doors"
-"""Class of most cases: an input is checked where it enters the program."""
 ANY = (0, 1, 2)
 """Exit codes of inputs that may be accepted or rejected."""
 
@@ -31,7 +29,6 @@ class Case:
     """An odd input.
 
     Attributes:
-        group: Class of failure that it is an example of.
         name: Unique name of the case.
         do: Prepares the input and returns the words of a command line, or calls the Python API
             and returns None.
@@ -40,7 +37,6 @@ class Case:
         solves: Whether it may get as far as a solve, which takes a second.
     """
 
-    group: str
     name: str
     do: Callable[[World, Path], list[str] | None]
     codes: tuple[int, ...] = (2,)
@@ -54,7 +50,6 @@ value in the command line."""
 
 
 def cases(
-    group: str,
     title: str,
     do: str | Callable[[World, Path, Any], list[str] | None] | None,
     values: Collection[Any] | Mapping[str, Any],
@@ -68,7 +63,6 @@ def cases(
     """A case for every value.
 
     Args:
-        group: Class of the cases.
         title: Name of a case; {} stands for the name of its value.
         do: Command line (see `words`) or function; None if the values are lines or functions.
         values: Values by name, or values whose names are their texts.
@@ -86,9 +80,7 @@ def cases(
             return words(do, w, o, str(x)) if isinstance(do, str) else do(w, o, x)
 
         right = (other or {}).get(name, codes)
-        yield Case(
-            group, title.format(name), run, right, quiet, solves is True or name in (solves or ())
-        )
+        yield Case(title.format(name), run, right, quiet, solves is True or name in (solves or ()))
 
 
 def words(line: str, w: World, o: Path, x: str = "") -> list[str]:

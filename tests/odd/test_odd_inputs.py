@@ -1,9 +1,10 @@
 """Bad and odd inputs: each ends in a helpful error or in a valid result.
 
-`tests/tools/count_odd.py` counts them by class, each in a process of its own with little memory;
-it has the cases that solve as well.
+`tests/tools/count_odd.py` counts them, each in a process of its own with little memory; it has the
+cases that solve as well.
 """
 
+from collections import defaultdict
 from itertools import chain
 
 import pytest
@@ -27,15 +28,11 @@ CASES: list[Case] = list(
 )
 
 
-def table_of(case: Case) -> str:
-    """The table that a case comes from: its class and the first words of its name."""
-    return f"{case.group} {' '.join(case.name.split()[:2])}"
-
-
-TABLES: dict[str, list[Case]] = {}
+TABLES = defaultdict[str, list[Case]](list)
+"""Cases of this suite by the first two words of their names."""
 # every fourth case: the others are similar, and the suite has a limit of time
 for _case in [case for case in CASES if not case.solves][::4]:
-    TABLES.setdefault(table_of(_case), []).append(_case)
+    TABLES[" ".join(_case.name.split()[:2])].append(_case)
 
 
 @pytest.fixture(scope="session")
@@ -45,7 +42,7 @@ def world(tmp_path_factory) -> World:
 
 def test_the_collection_is_large_and_its_names_are_unique():
     assert sum(map(len, TABLES.values())) > 600
-    assert len({(case.group, case.name) for case in CASES}) == len(CASES)
+    assert len({case.name for case in CASES}) == len(CASES)
 
 
 @pytest.mark.parametrize("table", TABLES)
