@@ -107,10 +107,8 @@ def sigma(
 ) -> int:
     """The factors of sigma, fitted with families left out in turn; a stopped run goes on."""
     wanted = Options(("dis",), width, (0,), tuple(only or ()))
-    suites = cells_of(suite, data, wanted, overrides).values()
-    frame = measure(
-        [cell for cells in suites for cell in cells], measure_terms, out / "sigma.jsonl", workers
-    )
+    cells = [c for own in cells_of(suite, data, wanted, overrides).values() for c in own]
+    frame = measure(cells, measure_terms, out / "sigma.jsonl", workers)
     return finish(out / "sigma.md", frame, sigma_page(frame))
 
 
