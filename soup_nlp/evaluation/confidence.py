@@ -22,8 +22,8 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.components import FIXED, SCENE
 from soup_nlp.start.given_depth import Given
-from soup_nlp.start.pace import displacement, log_pace
 from soup_nlp.start.propose import Start
+from soup_nlp.start.scales import displacement, log_pace
 
 log = logging.getLogger(__name__)
 

@@ -33,8 +33,7 @@ from soup_nlp.start.labelling import (
     limited_noise,
 )
 from soup_nlp.start.overlay import fixed_to_camera
-from soup_nlp.start.pace import order_in_front
-from soup_nlp.start.scales import scaled
+from soup_nlp.start.scales import order_in_front, scaled
 from soup_nlp.start.settle import settle
 from soup_nlp.start.views import LEAST_PARALLAX_PX, USABLE, FlowFit, Views
 

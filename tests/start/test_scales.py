@@ -6,8 +6,7 @@ from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry import camera
 from soup_nlp.start.components import TIES, TOO_FAST
-from soup_nlp.start.pace import order_in_front
-from soup_nlp.start.scales import FREE, Rows, minimum, rows, scaled
+from soup_nlp.start.scales import FREE, Rows, minimum, order_in_front, rows, scaled
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 HANGS = [[0] * 5, [0, 0, 1, 0, 0], [0] * 5, [0] * 5]
