@@ -42,7 +42,7 @@ OPEN = 0.5
 """Systematic error of the flow that leaves motions undetermined, in units of its noise."""
 CLIP_PX = 3.0
 """Limit of a superpixel's error where explanations are compared, pixels."""
-FEWEST = 3
+LEAST_MEMBERS = 3
 """Least number of superpixels with flow of a component whose depth can be known."""
 SMALL = 1e-4
 """Error of the camera by which derivatives are computed."""
@@ -136,7 +136,7 @@ def evidence(
     camera[0] = focal_sigma or camera[0]
     for c in range(count):
         at = np.flatnonzero((component == c) & valid)
-        if len(at) < FEWEST:
+        if len(at) < LEAST_MEMBERS:
             continue
         errors[:, c] = *_without_depth(data, at), trimmed_mean(misfit[at])
         members = np.flatnonzero(component == c)

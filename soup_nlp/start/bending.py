@@ -149,7 +149,7 @@ def moving_pieces(flow: FlowFit) -> Int:
     return np.where(still, 0, 1 + connected_labels(continuous, flow.seg))
 
 
-LEAST_SHARE = 0.06
+LEAST_SURFACE = 0.06
 """Least share of the superpixels that makes a surface: a smaller one joins a neighbour, because a
 few superpixels with a wrong flow look like a bending one."""
 
@@ -157,7 +157,7 @@ few superpixels with a wrong flow look like a bending one."""
 def joined(flow: FlowFit, surface: Int) -> Int:
     """(N,) surfaces; those with too few usable superpixels are joined to a neighbour.
 
-    The smallest joins the neighbour with the longest common outline, until each has `LEAST_SHARE`.
+    The smallest joins the neighbour with the longest common outline, until all are large enough.
     """
     seg, count = flow.seg, len(surface)
     while True:
@@ -167,7 +167,7 @@ def joined(flow: FlowFit, surface: Int) -> Int:
         length = np.bincount(outline, seg.boundary_length[across].astype(float), len(key))
         ends = np.stack(np.divmod(key, count), axis=1)
         size = np.bincount(surface, flow.views.usable)
-        small = np.unique(ends[size[ends] < LEAST_SHARE * count])
+        small = np.unique(ends[size[ends] < LEAST_SURFACE * count])
         if not len(small):
             return surface
         c = small[np.argmin(size[small])]
@@ -277,6 +277,6 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
             unexplained[at[excess[:, best] > most]] = True
             piece = connected_pieces(unexplained, seg, whole)
             size = np.bincount(piece[unexplained], minlength=1)
-            large = np.flatnonzero(size >= max(LEAST_SHARE * len(seg), LEAST_LEFT))
+            large = np.flatnonzero(size >= max(LEAST_SURFACE * len(seg), LEAST_LEFT))
             left += [piece == c for c in large]
     return motions, bends

@@ -31,7 +31,7 @@ SCENE = 0
 """Index of the component that is the static scene: depths and motions refer to it."""
 
 
-BELOW = 0.5
+STEEP = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 TIES = (
     "reference",
@@ -81,7 +81,7 @@ def outlines(label: Int, seg: Segmentation) -> Outlines:
     contact = np.tile(seg.boundary_length[across], 2).astype(float)
     way = np.diff(seg.anchors[seg.pairs[across]], axis=1)[:, 0]
     down = way[:, 1] / np.linalg.norm(way, axis=1)
-    below = np.concatenate([down, -down]) > BELOW
+    below = np.concatenate([down, -down]) > STEEP
     return Outlines(component, other, neighbour, contact, below)
 
 

@@ -16,7 +16,7 @@ from soup_nlp.geometry import rotation
 REFINEMENTS, STEPS = 5, 30
 """Largest number of robust fits of a motion, each with the noise estimated by the last, and of
 evaluations of a fit."""
-LEAST_NOISE = 0.01
+LEAST_WIDTH = 0.01
 """Smallest scale of the robust loss, pixels."""
 NEAR = np.array([0.02] * 3 + [0.3] * 2)
 """Standard deviations of the change of a motion by `refine_near`: rotation in radians, direction of
@@ -176,11 +176,11 @@ def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
         fit = least_squares(residual, x, jacobian, loss="cauchy", f_scale=scale, max_nfev=STEPS)
         x = fit.x
         error = np.abs(residual(x))
-        near = error[error < max(3 * scale, LEAST_NOISE)]
+        near = error[error < max(3 * scale, LEAST_WIDTH)]
         noise = 1.5 * float(np.median(near)) if len(near) else scale
         if noise > 0.8 * scale:
             break
-        scale = max(noise, LEAST_NOISE)
+        scale = max(noise, LEAST_WIDTH)
     return moved(x)
 
 

@@ -15,7 +15,13 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.components import FIXED, SCENE, TIES
-from soup_nlp.start.prior_evidence import FEWEST, LEAST_SIGMA, PriorEvidence, Seen, without_gaps
+from soup_nlp.start.prior_evidence import (
+    COMPARED,
+    LEAST_SIGMA,
+    PriorEvidence,
+    Seen,
+    without_gaps,
+)
 from soup_nlp.start.propose import Start
 from soup_nlp.start.views import FlowFit
 
@@ -124,7 +130,7 @@ def _shaped(
     start, use, views = seen.start, seen.members(c), seen.flow.views
     mask = start.component == c
     rigid = np.ptp(soup.R[mask], axis=0).max() < 1e-9 and np.any(soup.translation[mask][0])
-    if len(use) < FEWEST or not rigid:
+    if len(use) < COMPARED or not rigid:
         firm = mask & ~start.borrowed
         return soup, firm if firm.any() else mask
     if not determined:

@@ -20,7 +20,7 @@ from soup_nlp.start.views import FlowFit
 
 LEVEL = 0.92
 """Least cosine between the normal of the ground and the vertical of the image."""
-ON, BELOW = 0.05, 0.2
+ON, OFF = 0.05, 0.2
 """Relative differences of inverse depth: up to the first a superpixel lies on the ground, from the
 second on it lies below."""
 LEAST_ON, MOST_BELOW = 0.05, 0.05
@@ -55,14 +55,14 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
         plane_mu = planes @ ray[at].T
         return np.asarray((plane_mu > 0) & (np.abs(mu[at] - plane_mu) < ON * np.abs(plane_mu)))
 
-    under = (mu[at] < (1 - BELOW) * (planes @ ray[at].T)) @ weight[at]
+    under = (mu[at] < (1 - OFF) * (planes @ ray[at].T)) @ weight[at]
     best = planes[np.argmax(on(planes) @ weight[at] - under)]
     for _ in range(3):
         inliers = at[on(best)]
         root = np.sqrt(weight[inliers]) / mu[inliers]
         best = np.linalg.lstsq(ray[inliers] * root[:, None], mu[inliers] * root)[0]
     plane_mu = ray @ best
-    below = (plane_mu > 0) & (mu < (1 - BELOW) * plane_mu)
+    below = (plane_mu > 0) & (mu < (1 - OFF) * plane_mu)
     total, area_on, under = weight[at].sum(), weight[at][on(best)].sum(), reliable & below
     most = MOST_BELOW * total if _level(mu, plane_mu, under, weight) else area_on
     if area_on < LEAST_ON * total or weight[under].sum() > most:
@@ -78,7 +78,7 @@ def _level(mu: Float, floor: Float, under: Mask, weight: Float) -> bool:
     if not under.any():
         return False
     ratio = mu[under] / floor[under]
-    near = np.abs(ratio / quantile(ratio, weight[under], 0.5) - 1) < BELOW
+    near = np.abs(ratio / quantile(ratio, weight[under], 0.5) - 1) < OFF
     return bool(weight[under][near].sum() > 0.5 * weight[under].sum())
 
 
@@ -98,7 +98,7 @@ def on_ground(
         component: (N,) group that moves as one.
     """
     mu, scene = 1 / soup.depth_at(flow.views.anchor), component == SCENE
-    lifted = mu < (1 - BELOW) * floor
+    lifted = mu < (1 - OFF) * floor
     under = lifted & reliable & scene
     if _level(mu, floor, under, flow.seg.sizes.astype(float)):
         lifted &= ~under

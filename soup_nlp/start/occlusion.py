@@ -29,7 +29,7 @@ from soup_nlp.start.views import FlowFit
 
 WIDEST = 8
 """Largest width of a strip beside an outline, pixels."""
-FEWEST = 3
+LEAST_STRIP = 3
 """Least number of pixels of a strip."""
 CLOSING_PX = 1.0
 """Least speed at which two regions close in on each other or part, pixels per frame."""
@@ -37,7 +37,7 @@ CONTRAST = 8.0
 """Least difference between the mean costs of both strips that tells the order, grey levels."""
 MOST_GREY = 40.0
 """Limit of the cost of a pixel, grey levels."""
-SURE = 0.8
+LEAST_ORDER = 0.8
 """Probability from which the order along an outline counts."""
 IN_FRONT = 0.35
 """Median step of log depth along the outline of a region that is placed, a guess: true steps have
@@ -89,7 +89,7 @@ def covering(pair: Pair, flow: FlowFit) -> Float:
         strip = np.where(members.reshape(len(members), -1, 1), _colours(before, at), np.nan)
         covered[:, e] = _cost(np.abs(strip - _colours(after, target(ends[:, e], at))).mean(axis=-1))
         off = np.abs(gap[:, :, None] - strip[:, None]).mean(axis=-1)
-        enough = np.isfinite(strip[..., 0]).sum(axis=1) >= FEWEST
+        enough = np.isfinite(strip[..., 0]).sum(axis=1) >= LEAST_STRIP
         uncovered[enough, e] = _cost(np.fmin.reduce(off[enough], axis=2))
     contrast = np.where(closing > 0, covered @ [1.0, -1.0], uncovered @ [-1.0, 1.0])
     out[rows] = np.where(np.abs(closing) > CLOSING_PX, np.nan_to_num(contrast), 0.0)
@@ -120,7 +120,7 @@ def _cost(change: Float) -> Float:
     valid = np.isfinite(change)
     count = valid.sum(axis=1)
     total = np.where(valid, np.minimum(change, MOST_GREY), 0.0).sum(axis=1)
-    return np.where(count >= FEWEST, total / np.maximum(count, 1), np.nan)
+    return np.where(count >= LEAST_STRIP, total / np.maximum(count, 1), np.nan)
 
 
 def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
@@ -129,7 +129,7 @@ def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
     A pair along the outline between two regions votes if its contrast is above `CONTRAST`. All
     pairs of the outline take the order of the majority. With m of n votes for it, its probability
     is `(m + 1) / (n + 2)`. Pairs that voted against it, and outlines with a probability of at most
-    `SURE`, get 0.
+    `LEAST_ORDER`, get 0.
 
     Args:
         contrast: (P,) see `covering`.
@@ -144,7 +144,7 @@ def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
     total = np.bincount(outline, np.abs(votes))
     lead = np.bincount(outline, votes)
     sure = ((total + np.abs(lead)) / 2 + 1) / (total + 2)
-    holds = (a != b) & (votes * lead[outline] >= 0) & (sure[outline] > SURE)
+    holds = (a != b) & (votes * lead[outline] >= 0) & (sure[outline] > LEAST_ORDER)
     return np.where(holds, np.sign(lead[outline]) * turned * sure[outline], 0.0)
 
 

@@ -19,7 +19,7 @@ CONTRADICTED_PX = 0.5
 LEAST_SCENE = 0.6
 """Least share of the superpixels that the camera's motion explains; below it, the
 still part may be the scene."""
-LEAST_SHARE = 0.5
+LEAST_STILL = 0.5
 """Least share of still superpixels in a piece with continuous flow."""
 
 
@@ -45,5 +45,5 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     continuous = flow.jump < flow.options.discontinuity_px
     piece = connected_labels(moves[seg.pairs].all(axis=1) & continuous, seg)
     count, still_count = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
-    mostly = (still_count >= PIECE_SIZE) & (still_count >= LEAST_SHARE * count)
+    mostly = (still_count >= PIECE_SIZE) & (still_count >= LEAST_STILL * count)
     return may & mostly[piece], shift

@@ -39,9 +39,9 @@ TELLS_PX, TELLS = 0.5, 3.0
 flow better than one depth, so that it determines them; from a third on it may confirm a prior."""
 LEAST_SIGMA, UNCONFIRMED = 0.12, 0.35
 """Standard deviation of log depth of a prior: the least, and that of an unconfirmed one."""
-SURE = 0.1
+PRECISE = 0.1
 """Noise of the flow relative to the parallax up to which depth tells if values rise with it."""
-FEWEST = 8
+COMPARED = 8
 """Least number of superpixels whose flow is compared with a prior."""
 DEEPEST = 50.0
 """Largest depth relative to the median where an inverse depth has a shift."""
@@ -145,7 +145,7 @@ class Seen(NamedTuple):
     def relief(self, c: int) -> float:
         """Error of the flow of a component at one depth, above the noise, pixels."""
         at = self.members(c)
-        if len(at) < FEWEST or self.start.at_rest:
+        if len(at) < COMPARED or self.start.at_rest:
             return 0.0
         floor = min(self.start.noise, float(np.median(self.start.error[at])))
         return self.motion(at, np.ones(len(at)))[0] - floor
@@ -216,9 +216,12 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
     value, with_value, whole = without_gaps(pair, flow.seg)
     anchor, relief = flow.views.anchor, seen.relief(SCENE)
     known = with_value & seen.usable & (start.component == SCENE)
-    determined, tells = relief > seen.tells, relief > seen.tells / 3 and known.sum() >= FEWEST
-    sure = known & ~start.borrowed & (SURE * flow.views.parallax(start.soup) > start.noise)
-    if tells and sure.sum() >= FEWEST:
+    determined, tells = (
+        relief > seen.tells,
+        relief > seen.tells / 3 and known.sum() >= COMPARED,
+    )
+    sure = known & ~start.borrowed & (PRECISE * flow.views.parallax(start.soup) > start.noise)
+    if tells and sure.sum() >= COMPARED:
         far = ranks(start.soup.depth_at(anchor)[sure]), ranks(value[sure])
     else:
         # lower parts of an image are mostly nearer
@@ -231,7 +234,7 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
         shifted = as_log_depth(kind, value, shift)
         soup, strong = seen.settled(start.soup, SCENE, shifted(value), UNCONFIRMED)
         depth = np.log(soup.depth_at(anchor))
-        if (strong & known).sum() >= FEWEST:
+        if (strong & known).sum() >= COMPARED:
             by_flow, gap = (
                 float(np.ptp(np.quantile(log[strong & known], (0.16, 0.84)))) / 2
                 for log in (depth, depth - shifted(value))

@@ -16,7 +16,7 @@ from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.start.components import TIES
-from soup_nlp.start.occlusion import IN_FRONT, SURE, covering, in_order, vote
+from soup_nlp.start.occlusion import IN_FRONT, LEAST_ORDER, covering, in_order, vote
 from soup_nlp.start.propose import Start, propose
 
 HEIGHT, WIDTH, CELL = 96, 128, 16
@@ -84,7 +84,7 @@ def test_a_vote_needs_several_strips_and_agreement():
     says[across[:5]] = 20.0
     np.testing.assert_allclose(vote(says, region, seg)[across[:5]], 6 / 7)
     says[across[5]] = -20.0
-    assert SURE > 6 / 8
+    assert LEAST_ORDER > 6 / 8
     assert not vote(says, region, seg).any()
     # inside a region, parallax orders depth
     assert not vote(np.full(len(seg.pairs), 20.0), 0 * region, seg).any()
