@@ -18,10 +18,10 @@ from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.report.figures import (
-    Legend,
     Picture,
     colourise_depth,
     colourise_shares,
+    depth_legend,
     depth_range,
     shown,
     strip,
@@ -381,10 +381,3 @@ class Chain:
             out[k] = self.world_from_camera[k](part.centre)
             out[k + 1] = self.motion(k, part.label)(out[k])
         return out
-
-
-def depth_legend(near: float, far: float, unit: str = "") -> Legend:
-    """Legend of depths with five values; both ends name the unit."""
-    first, *middle, last = (f"{z:.3g}" for z in 1 / np.linspace(1 / far, 1 / near, 5))
-    colours = colourise_depth(1 / np.linspace(1 / far, 1 / near, 128)[None], near, far)
-    return Legend(colours, (first + unit, *middle, last + unit))

@@ -177,6 +177,13 @@ class Picture:
     legend: Legend | None = None
 
 
+def depth_legend(near: float, far: float, unit: str = "") -> Legend:
+    """Legend of depths with five values; both ends name the unit."""
+    first, *middle, last = (f"{z:.3g}" for z in 1 / np.linspace(1 / far, 1 / near, 5))
+    colours = colourise_depth(1 / np.linspace(1 / far, 1 / near, 128)[None], near, far)
+    return Legend(colours, (first + unit, *middle, last + unit))
+
+
 def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: int = 420) -> Image:
     """(H, W, 3) uint8: titled pictures with their legends in a grid, under a title."""
     columns = min(columns, len(panels))

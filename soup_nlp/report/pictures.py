@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.arrays import AnyFloat, Image, Mask
 from soup_nlp.evaluation.confidence import MOST_SIGMA
-from soup_nlp.report.chain import Chain, depth_legend
+from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import (
     Legend,
     Picture,
@@ -19,6 +19,7 @@ from soup_nlp.report.figures import (
     colourise_normals,
     colourise_shares,
     component_colours,
+    depth_legend,
     draw_superpixels,
     flow_limit,
     strip,
