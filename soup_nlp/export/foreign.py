@@ -136,10 +136,6 @@ def foreign_run(
         lam_x=r.lam_x,
         lam_g=r.lam_g,
         objective=nlp.value(answer.x),
-        iterations=0,
-        seconds=0.0,
-        history={},
-        evaluating=0.0,
     )
     rest = residuals(nlp, soup, stage, case.data, form.min_facing)
     # a run holds its last iterate in matrices
@@ -155,7 +151,6 @@ def foreign_run(
         multipliers=multipliers(nlp, stage),
         nlp=nlp.sizes(),
         description=str(nlp),
-        seconds={},
     )
     chosen = {k: getattr(form, k) for k in CHOICES}
     problem = case.problem.replace(formulation=case.problem.formulation.replace(**chosen))

@@ -197,10 +197,6 @@ def skipped(case: Case) -> Solution:
         energy_start=oracle.energy(start, data, case.weights),
         energy=oracle.energy(soup, data, case.weights),
         residuals=constraints(soup, data.rim_ray, form.min_facing).largest,
-        multipliers={},
-        nlp={},
-        description="",
-        seconds={},
         delivered="start",
     )
 

@@ -62,10 +62,10 @@ class Stage:
     lam_x: Float
     lam_g: Float
     objective: float
-    iterations: int
-    seconds: float
-    history: Mapping[str, Float] = field(repr=False)
-    evaluating: float
+    iterations: int = 0
+    seconds: float = 0.0
+    history: Mapping[str, Float] = field(default_factory=dict, repr=False)
+    evaluating: float = 0.0
 
     def __str__(self) -> str:
         return (

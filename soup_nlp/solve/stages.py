@@ -59,10 +59,10 @@ class Solution:
     energy_start: Mapping[str, float]
     energy: Mapping[str, float]
     residuals: Mapping[str, float]
-    multipliers: Mapping[str, Float] = field(repr=False)
-    nlp: Mapping[str, int]
-    description: str = field(repr=False)
-    seconds: Mapping[str, float]
+    multipliers: Mapping[str, Float] = field(default_factory=dict, repr=False)
+    nlp: Mapping[str, int] = field(default_factory=dict)
+    description: str = field(default="", repr=False)
+    seconds: Mapping[str, float] = field(default_factory=dict)
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
     delivered: str = "constrained NLP"
     far: bool = False

@@ -10,7 +10,7 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.layers import without_still_layer
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.pipeline.flow import see_through, with_flow
+from soup_nlp.pipeline.case import see_through, with_flow
 
 WIDTH, HEIGHT = 512, 218
 BEHIND = np.s_[130:205, 150:400]
