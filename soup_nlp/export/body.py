@@ -47,13 +47,8 @@ class _Part:
         return out
 
     def write(self, text: Text, elements: Int | slice, final: Int, shift: int) -> list[str]:
-        """Texts of elements.
-
-        Args:
-            text: With holes.
-            elements: Which.
-            final: Numbers of the defined variables in the file.
-            shift: Number of the first of the other variables.
+        """Texts of elements; `final` are the numbers of defined variables in the file, and `shift`
+        is that of the first of the other variables.
         """
         columns: list[list[object]] = []
         for (kind, _), column in zip(text.holes, self.columns(text, elements, final)):
@@ -79,13 +74,8 @@ class NlBody:
     """
 
     def __init__(self, program: Program, column: Int, row: Int, lift: bool = False) -> None:
-        """Number the defined variables.
-
-        Args:
-            program: The NLP in parts.
-            column: (nx,) index in the file of every variable.
-            row: (ng,) index in the file of every row.
-            lift: Write variables with rows instead of defined variables.
+        """Number the defined variables; `column` (nx,) and `row` (ng,) are indices in the file, and
+        with `lift` variables with rows are written instead.
         """
         # the objective is the last row
         last, goals = len(row), np.append(row, len(row))

@@ -153,11 +153,8 @@ def header(
 ) -> list[str]:
     """The ten lines of counts.
 
-    Args:
-        program: Parts of the NLP.
-        bounds: (ng,) lower and upper bounds of the rows.
-        longest: Length of the longest name of a row and of a variable.
-        defined: See `NlBody.classes`.
+    `bounds` (ng,) are those of the rows, `longest` has the length of the longest name of a row and
+    of a variable, and `defined` are `NlBody.classes`.
     """
     lower, upper = bounds
     equations = lower == upper

@@ -113,12 +113,6 @@ def objective(
     """Objective of the refinement by term: E; with images also E_photo.
 
     Where the images contradict the flow, E_proj is weaker (`Photometric.costs_of_flow`).
-
-    Args:
-        soup: State.
-        data: Numbers of the energy.
-        weights: Its constants.
-        photo: Photometric term, if there is one.
     """
     E = oracle.energy(soup, data, weights)
     if photo is None:

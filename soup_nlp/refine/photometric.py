@@ -141,14 +141,8 @@ def photometric_term(
 ) -> Photometric | None:
     """The photometric term of a pair; None where its factor is 0.
 
-    The samples are spread evenly over every superpixel, in the order of rows.
-
-    Args:
-        pair: Images and cameras.
-        labels: (H, W) superpixels.
-        soup: Where the refinement starts: it followed the flow.
-        data: Confidence of the flow.
-        o: Factor of E_photo.
+    The samples are spread evenly over every superpixel, in the order of rows. `soup` is where the
+    refinement starts: it followed the flow.
     """
     if not o.photo:
         return None
@@ -197,14 +191,8 @@ def swept(
 
     With y = R r a point at inverse depth mu comes to `(y + mu T)_xy / (y + mu T)_z`, which runs
     along its epipolar line in proportion to `s = mu / (y_z + mu T_z)`: equal steps of s are equal
-    steps in pixels, and nearly the same depths for all superpixels.
-
-    Args:
-        soup: Current belief; gives motions, orientations and the range of depths.
-        data: Anchors.
-        photo: Photometric term.
-        keep: Number of particles.
-        rng: Draws the sample of motions.
+    steps in pixels, and nearly the same depths for all superpixels. Motions, orientations and the
+    range of depths are those of `soup`.
     """
     n, ray = len(soup), data.anchor_ray
     most = NEAREST / np.quantile(soup.depth_at(ray), 0.02)

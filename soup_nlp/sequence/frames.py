@@ -137,11 +137,8 @@ def find_depths(images: list[Path]) -> list[Path]:
 def numbered_files(folder: Path, kinds: Sequence[str], what: str, first: str = "") -> list[Path]:
     """Files of a folder, or of a pattern such as `flow/*.flo`, in the order of their numbers.
 
-    Args:
-        folder: The folder or the pattern.
-        kinds: Suffixes of the files.
-        what: What they hold, for messages.
-        first: Pattern of those that are preferred.
+    `kinds` are their suffixes, `what` says in messages what they hold, and those that match the
+    pattern `first` are preferred.
 
     Raises:
         DataError: there is none.
@@ -156,11 +153,7 @@ def numbered_files(folder: Path, kinds: Sequence[str], what: str, first: str = "
 
 
 def check_sizes(images: Sequence[Path], turn: bool) -> None:
-    """Read all pictures of a sequence, which must have one size.
-
-    Args:
-        images: Their files.
-        turn: See `read_images`.
+    """Read all pictures of a sequence, which must have one size; `turn` as for `read_image`.
 
     Raises:
         DataError: one is damaged, or they differ in size.

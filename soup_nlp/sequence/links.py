@@ -142,14 +142,9 @@ def make_chain(pairs: Sequence[Result], summary: Mapping[str, Any] | None = None
 
 
 def follow(before: Labels, after: Labels) -> dict[int, int]:
-    """Matches of the components of consecutive pairs with the largest sum of overlaps.
+    """Components of the second of two pairs by those of the first that they overlap most.
 
-    Args:
-        before: (H, W) labels of the first pair in the common frame; -1 unknown, 0 background.
-        after: (H, W) labels of the second pair.
-
-    Returns:
-        Label after by label before.
+    `before` and `after` (H, W) are labels in the common frame; -1 is unknown, 0 the background.
     """
     visible = before >= 0
     share = overlap_shares(before[visible], after[visible])
@@ -163,9 +158,7 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
 def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:
     """Numbers of the tracks: for every pair, a dict from component to track; 0 is the background.
 
-    Args:
-        matches: Results of `follow` for consecutive pairs.
-        counts: Number of components of every pair, with the background.
+    `matches` come from `follow`; `counts` are the components of every pair with the background.
     """
     out: list[dict[int, int]] = []
     new_number = count(1)

@@ -19,13 +19,9 @@ UNMET = "Constraints_Violated"
 
 
 def optimality(nlp: NLP, x: Float, lam_x: Float, lam_g: Float) -> dict[str, float]:
-    """Dual infeasibility and complementarity of a point and its multipliers.
+    """Dual infeasibility and complementarity of a point (nx,) and its multipliers.
 
-    Args:
-        nlp: The problem.
-        x: (nx,) point.
-        lam_x: (nx,) multipliers of the bounds (positive at upper bounds).
-        lam_g: (ng,) multipliers of the constraints (positive at upper bounds).
+    Those of the bounds (nx,) and of the constraints (ng,) are positive at upper bounds.
     """
     g = nlp.constraints(x)
     dual = nlp.gradient(x) + nlp.jacobian(x).T @ lam_g + lam_x
@@ -67,17 +63,9 @@ WARM: Mapping[str, Any] = {
 
 
 def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, Float]:
-    """Start multipliers of the constrained NLP at the presolve's solution.
+    """Start multipliers lam_x0, lam_g0 of the constrained NLP at the presolve's soup.
 
-    Args:
-        nlp: The constrained NLP, started at `soup`.
-        data: Numbers of the energy.
-        soup: The presolve's answer.
-        rim: (N, V) multipliers of visibility of the rim pixels, rows divided by the anchor's facing
-            (`Presolve.rim`).
-
-    Returns:
-        lam_x0, lam_g0. The equalities' multipliers are the least squares of stationarity.
+    `rim` (N, V) is that of the presolve. The equalities' are the least squares of stationarity.
     """
     lam_g = np.zeros(nlp.ng)
     facing = -np.einsum("nc,nc->n", soup.n, data.anchor_ray)

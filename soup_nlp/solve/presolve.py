@@ -189,14 +189,10 @@ class Presolve:
         options: Mapping[str, Any] | None = None,
         max_iter: int | None = None,
     ) -> None:
-        """Run stages from where the program stands, until one is stopped; `soup` is the end.
+        """Run stages until one is stopped; `soup` and the program's numbers move along.
 
-        Args:
-            program: Its point and multipliers move along.
-            stages: In their order.
-            hessian: Default the program's.
-            options: Of Ipopt, besides `KEEP`.
-            max_iter: Iteration limit of each; default `presolve_iterations`.
+        `options` of Ipopt are added to `KEEP`; `max_iter`, of each, is `presolve_iterations` unless
+        it is given.
         """
         o, nlp = self.o, program.nlp
         nlp = nlp if hessian is None else replace(nlp, hessian_kind=hessian)
