@@ -134,23 +134,6 @@ def test_every_gauge_finds_the_same_world(room, solved, gauge):
     np.testing.assert_allclose(ratio, np.median(ratio), rtol=1e-3)
 
 
-def test_the_solution_carries_what_a_report_needs(room, solved):
-    solution = solved["unit-offset"]
-    n = len(room.start)
-    names = [f"majorant {eps:g}" for eps in OPTIONS.presolve_eps]
-    names += ["Gauss-Newton 0.5", "Gauss-Newton 0.9", "Gauss-Newton 0.98", "exact"]
-    names.append("constrained NLP")
-    assert [s.name for s in solution.stages] == names
-    assert solution.seconds.keys() >= {"presolve", "build", "solve"}
-    assert solution.nlp["variables"] == 16 * n
-    assert solution.multipliers["lam_x"].shape == (16 * n,)
-    assert solution.multipliers["lam_g_so3"].shape == (6 * n,)
-    assert solution.multipliers["lam_g_normal"].shape == (n,)
-    assert solution.multipliers["lam_g_simplex"].shape == (1,)
-    assert solution.description.startswith("NLP soup: ")
-    assert str(solution).startswith("Solution(Solve_Succeeded, E ")
-
-
 def test_the_claimed_multipliers_balance_the_gradient(room, solved):
     """Dual infeasibility from the NLP's own functions at the packed solution."""
     nlp, layout = build_matrix_nlp(room.start, room.data, WEIGHTS, form(eps=0.03, eps_pixel=0.03))
