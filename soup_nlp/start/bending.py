@@ -261,7 +261,7 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     while left:
         members = left.pop()
         at = np.flatnonzero(members & usable)
-        tried = candidates(flow, at, motions[:1], max(noise, LEAST_SCALE))
+        tried = candidates(flow, at, motions[0], motions[:1], max(noise, LEAST_SCALE))
         excess = views.subset(at).fit(tried).cost - flow.residual[at, None]
         middle = np.median(excess, axis=0)
         gain = np.median(fit_turn(views.subset(at), ANY_TURN)[1] - flow.residual[at])

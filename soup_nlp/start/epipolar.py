@@ -252,6 +252,31 @@ def essential_slope(motion: Motion, x: Float) -> Float:
     return np.concatenate([by_turn, by_shift]).reshape(5, 9)
 
 
+ROUNDS = 6
+"""Re-weighted fits of a translation."""
+
+
+def fit_translation(R: Float, matches: Matches, noise: float) -> Motion:
+    """Motion with a given rotation whose translation explains correspondences best.
+
+    The epipolar constraint `t . (R r x q) = 0` is linear in t, which is the eigenvector of the
+    re-weighted scatter matrix with the smallest eigenvalue.
+
+    Args:
+        R: (3, 3) rotation.
+        matches: Correspondences.
+        noise: Flow noise, pixels: errors beyond it are down-weighted.
+    """
+    r, q, weight, focal = matches
+    normal, w, t = np.cross(r @ R.T, q), weight, np.zeros(3)
+    for _ in range(ROUNDS):
+        t = np.linalg.eigh((normal * w[:, None]).T @ normal)[1][:, 0]
+        spread = np.maximum(np.linalg.norm(np.cross(t, q)[:, :2], axis=1), 1e-6)
+        # Sampson's weight: error in pixels, not the algebraic one
+        w = weight / (1 + (focal * (normal @ t) / spread / noise) ** 2) / spread**2
+    return _facing(Motion(R, t), matches)
+
+
 def _facing(motion: Motion, matches: Matches) -> Motion:
     """The motion with the sign of its translation that puts most points in front of the camera."""
     vote = matches.weight @ np.sign(triangulate(motion, matches.ray, matches.target)[0])

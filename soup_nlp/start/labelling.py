@@ -30,6 +30,7 @@ from soup_nlp.start.epipolar import (
     SIDEWAYS,
     Motion,
     estimate,
+    fit_translation,
     refine_near,
 )
 from soup_nlp.start.views import FlowFit
@@ -110,7 +111,7 @@ def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
     views, seen = flow.views, flow.views.usable & ~flow.poor
     if not seen.any():
         return Labelling.of(flow, motions[:1], np.zeros(len(flow.seg), np.int64), LEAST_SHARED)
-    motions = motions + _of_surfaces(flow, seen, surface)
+    motions = motions + _of_surfaces(flow, seen, surface, motions[0])
     for left in reversed(range(ROUNDS + 1)):
         error = views.fit(motions).penalised() - flow.residual[:, None]
         excess = np.maximum(error, 0.0)
@@ -141,25 +142,28 @@ def dominant(flow: FlowFit) -> Motion:
     return estimate(matches, flow.options.threshold_px, flow.options.seed) or SIDEWAYS
 
 
-def _of_surfaces(flow: FlowFit, seen: Mask, surface: Int) -> list[Motion]:
+def _of_surfaces(flow: FlowFit, seen: Mask, surface: Int, main: Motion) -> list[Motion]:
     """Motions of the surfaces (N,) with the most superpixels that are seen."""
     largest = np.argsort(-np.bincount(surface[seen]))[:SURFACES]
     groups = [np.flatnonzero((surface == c) & seen) for c in largest]
-    return [m for at in groups if len(at) >= PIECE_SIZE for m in candidates(flow, at)]
+    scale = limited_noise(flow.residual[seen])
+    large = [at for at in groups if len(at) >= PIECE_SIZE]
+    return [m for at in large for m in candidates(flow, at, main, [], scale)]
 
 
 def candidates(
-    flow: FlowFit, at: Int, present: Sequence[Motion] = (), scale: float = LEAST_NOISE
+    flow: FlowFit, at: Int, main: Motion, present: Sequence[Motion], scale: float
 ) -> list[Motion]:
-    """Candidate motions for superpixels `at`: the present ones refined, and that of their own
-    essential matrix.
+    """Candidate motions for superpixels `at`: the present ones and a translation with the rotation
+    of the main motion, refined, and the motion of their own essential matrix.
 
     `scale` is the error of the flow across epipolar lines, pixels.
     """
     noise = limited_noise(flow.residual[at])
     matches = flow.views.subset(at).matches(PIXELS)
+    shift = fit_translation(main.R, matches, max(noise, 0.1))
+    refined = [refine_near(m, matches, scale) for m in (*present, shift)]
     own = estimate(matches, max(3 * noise, 0.3), flow.options.seed)
-    refined = [refine_near(m, matches, scale) for m in present]
     return refined if own is None else [*refined, own]
 
 
@@ -167,6 +171,7 @@ def _refitted(
     flow: FlowFit, motions: list[Motion], label: Int, seen: Mask, bad: Mask, scale: float
 ) -> list[Motion]:
     """Motions with candidates for the superpixels of each and for pieces that none explains."""
+    main = motions[int(np.argmax(np.bincount(label[seen], minlength=len(motions))))]
     piece = connected_pieces(bad, flow.seg)
     large = np.argsort(-np.bincount(piece[bad], minlength=1))[:PIECES]
     groups = [((label == c) & seen, [m]) for c, m in enumerate(motions)]
@@ -174,7 +179,7 @@ def _refitted(
     for mask, own in groups + [(piece == c, []) for c in large]:
         at = np.flatnonzero(mask)
         if len(at) >= PIECE_SIZE:
-            out += candidates(flow, at, own, scale)
+            out += candidates(flow, at, main, own, scale)
     return out
 
 

@@ -12,6 +12,7 @@ from soup_nlp.start.epipolar import (
     Matches,
     Motion,
     estimate,
+    fit_translation,
     refine_near,
     sampson,
 )
@@ -71,6 +72,32 @@ def test_a_prior_holds_directions_that_pixels_hardly_determine(wrong, priors, we
     # the pull of the pixels is not zero, and does not add up over rounds
     assert 1e-4 < moved[1] < 0.2
     assert moved[1] == pytest.approx(moved[0], rel=0.1)
+
+
+def test_translations_are_weighed_in_pixels_not_in_algebraic_distances():
+    """Near a forward epipole a pixel of noise is a small algebraic distance, far from it a large.
+
+    Weighed by it, the few pixels far away would decide alone.
+    """
+    rng = np.random.default_rng(0)
+    m, r, _ = rigid(60, shift=np.array([0.05, 0.0, 1.0]))
+    r[:55, :2] *= 0.1
+    Y = 3.0 * r @ m.R.T + m.t
+    many = 300
+    noisy = np.tile(Y / Y[:, 2:], (many, 1, 1))
+    noisy[..., :2] += rng.normal(0, 0.1 / FOCAL, (many, 60, 2))
+    t = [fit_translation(m.R, Matches(r, q, np.ones(60), FOCAL), 0.1).t for q in noisy]
+    normal = np.cross(r @ m.R.T, noisy)
+    plain = np.linalg.eigh(normal.transpose(0, 2, 1) @ normal)[1][:, :, 0]
+    plain *= np.sign(plain @ m.t)[:, None]
+    error, algebraic = (np.median([off(m, Motion(m.R, v))[1] for v in ts]) for ts in (t, plain))
+    assert error < 0.7 * algebraic
+
+
+def test_a_translation_puts_points_in_front():
+    for sign in (1.0, -1.0):
+        m, r, q = rigid(40, shift=sign * SHIFT)
+        assert off(m, fit_translation(m.R, Matches(r, q, np.ones(40), FOCAL), 0.1))[1] < 1e-6
 
 
 # --- motions of the whole image ------------------------------------------------------------------
