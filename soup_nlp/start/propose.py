@@ -90,11 +90,15 @@ class Start:
     order: Float | None = None
 
     def __str__(self) -> str:
-        return (
-            f"Start({len(self.soup)} superpixels, {len(self.motions)} dominant motions, median"
-            f" error {np.median(self.error):.2f} px, {int(self.borrowed.sum())} borrowed"
-            + (f", {self.bends.mean():.0%} bending)" if self.bending else ")")
-        )
+        count = len(self.motions)
+        parts = [
+            f"{len(self.soup)} superpixels",
+            f"{count or 'no'} shared motion{'s' * (count != 1)}",
+            f"median error {np.median(self.error):.2f} px",
+            f"{int(self.borrowed.sum())} borrowed",
+        ]
+        parts += [f"{self.bends.mean():.0%} bending"] * self.bending
+        return f"Start({', '.join(parts)})"
 
     __repr__ = __str__
 
