@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from soup_nlp.arrays import Float
+from soup_nlp.data.flow.consistency import standing_edges
 from soup_nlp.data.formats.cameras import written
 from soup_nlp.data.formats.images import interlaced
 from soup_nlp.evaluation.confidence import MOST_SIGMA
@@ -59,6 +60,8 @@ MATCHED = 0.2
 """Share of usable flow below which the frames may show two scenes, if most of it is a guess."""
 LISTED = 5
 """Number of moving components that are listed."""
+STANDING = 0.001
+"""Share of pixels with edges that stand still over a moving scene from which they are named."""
 WAYS = (("to the right", "to the left"), ("down", "up"), ("ahead", "back"))
 """Directions of the axes of a camera."""
 
@@ -188,7 +191,7 @@ def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
         return ["two frames of the same scene, closer in time: hardly anything is in both"]
     if any(map(interlaced, (run.pair.image_ref, run.pair.image_next))):
         out.append("frames that are not interlaced (ffmpeg -i FILE -vf yadif)")
-    if shares.get("fixed", 0.0) >= LEAST:
+    if shares.get("fixed", 0.0) >= LEAST or standing_edges(run.pair) > STANDING:
         out.append(
             "frames without what stands still in the image while the camera moves (a watermark, a"
             " logo, the bonnet of its car)"
