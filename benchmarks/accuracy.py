@@ -28,8 +28,6 @@ ERROR_COLUMNS = {
     "metrics.solution.mre": "MRE",
     "metrics.constant.mre": "constant",
     "metrics.solution.median_relative": "median",
-    "metrics.solution.delta1": "d<1.25",
-    "metrics.solution.skill": "skill",
     "metrics.solution_rigid.mre": "on rigid",
     "metrics.rigid.mre": "rigid",
     "seen.mre": "seen",
@@ -126,9 +124,7 @@ def beating(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _by_pair(frame: pd.DataFrame) -> str:
     """Table of family and MRE of every method."""
-    columns = {m: metric(frame, m) for m in METHODS}
-    columns |= {k: metric(frame, name=k) for k in ("skill", "coverage")}
-    table = pd.DataFrame(columns).dropna(axis=1, how="all")
+    table = pd.DataFrame({m: metric(frame, m) for m in METHODS}).dropna(axis=1, how="all")
     table.insert(0, "family", frame["family"])
     table["status"], table["CPU s"] = frame["status"], frame["cpu_seconds"]
     return markdown(table, dict.fromkeys(table, ".4f") | {"CPU s": ".0f"})
