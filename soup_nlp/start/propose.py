@@ -53,7 +53,7 @@ class Start:
             one is the scene (`SCENE`).
         part: (N,) group that moves as one: its component, or the scene where its flow is not
             usable, so that its motion is not known; before a camera at rest each piece that moves.
-        motions: The dominant motions.
+        motions: The motions that superpixels share.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
             where a region bends, discontinuities make up most of its outline.
         tie: (N,) origin of the scale of every superpixel's component, an index of `TIES`.
