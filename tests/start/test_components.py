@@ -49,8 +49,12 @@ def test_a_component_gains_little_by_receding(world, factor):
 
 
 @pytest.mark.slow
-def test_the_nlp_keeps_a_swinging_box_off_the_wall():
-    what = {"kind": "scene", "scene": "swing", "seed": 0, "width": 256, "height": 192}
+@pytest.mark.parametrize(
+    "seed",
+    [0, pytest.param(2, marks=pytest.mark.xfail(strict=True, reason="0.31 held, 0.29 free"))],
+)
+def test_the_nlp_keeps_a_swinging_box_off_the_wall(seed):
+    what = {"kind": "scene", "scene": "swing", "seed": seed, "width": 256, "height": 192}
     raw = {"input": what, "flow": {"source": "truth"}, "segmentation": {"superpixels": 60}}
 
     def result(order):
@@ -58,7 +62,7 @@ def test_the_nlp_keeps_a_swinging_box_off_the_wall():
         return run(make_problem(raw, options))
 
     held, free = result(10.0), result(0.0)
-    placed = held.start.tie == TIES.index("occlusion")
+    placed = np.isin(held.start.tie, [TIES.index("occlusion"), TIES.index("too fast")])
     assert placed.any()
     assert held.metrics["solution"].mre < 0.6 * free.metrics["solution"].mre
     # where it is exactly remains a guess
