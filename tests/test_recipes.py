@@ -71,6 +71,7 @@ def test_the_excerpt_of_check_has_the_energies_of_the_export(tmp_path):
         assert energy[name] == pytest.approx(value, rel=1e-3), name
 
 
+@pytest.mark.slow
 def test_a_dataset_is_a_section_that_loads_itself(tmp_path):
     rng = np.random.default_rng(0)
     wide = rng.integers(0, 255, (48, 68, 3), dtype=np.uint8)

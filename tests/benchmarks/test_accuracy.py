@@ -177,6 +177,7 @@ def test_two_pages_are_compared_by_family_and_half(tmp_path):
     assert main(["compare", str(tmp_path), str(tmp_path)]) == 2
 
 
+@pytest.mark.slow
 def test_a_suite_is_measured_once_with_every_number(tmp_path, capsys):
     words = ["accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
     words += ["--width", "128", "--out", str(tmp_path)]

@@ -69,6 +69,7 @@ def dataset(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
+@pytest.mark.slow
 def test_a_tiny_dataset_gives_all_sections(dataset, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(program, "measure_pair", fake)
     out = tmp_path / "out"

@@ -9,6 +9,7 @@ from benchmarks.table import Cell, frame_of
 from soup_nlp.evaluation.confidence import SHARES
 
 
+@pytest.mark.slow
 def test_sigma_by_terms_is_that_of_a_run(small_run):
     sure = small_run.confidence
     terms = {name: term / SHARES[name] for name, term in sure.terms.items()}

@@ -208,6 +208,7 @@ def test_slanted_planes_do_not_lengthen_the_unit(case):
     assert abs(unit - 1) > 1e-4
 
 
+@pytest.mark.slow
 def test_the_papers_nlp_has_the_minimum_of_the_presolve(case):
     """Ipopt starts where the presolve ends: with held slopes it started a fifth of E higher."""
     options = case.options.replace(exact_iterations=20, max_iter=0)

@@ -227,6 +227,7 @@ for line in {list(COMPLETED)}:
 """
 
 
+@pytest.mark.slow
 def test_completion_knows_commands_problems_and_formats():
     run = [sys.executable, "-c", COMPLETE]
     done = subprocess.run(run, capture_output=True, text=True, check=False)

@@ -328,6 +328,7 @@ def test_motorcycle_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- real pairs ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_real_pairs(shared_data: Path) -> None:
     pair = load("kitti2012", shared_data / "kitti2012", index="27")

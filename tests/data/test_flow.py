@@ -46,6 +46,7 @@ def pair_of(truth: Truth | None = None, size: tuple[int, int] = (60, 80)) -> Pai
     return Pair(first, second, K, K, truth=truth, name="test")
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     height=st.integers(16, 90),
@@ -302,6 +303,7 @@ def test_a_first_flow_that_is_half_wrong_is_completed(monkeypatch):
     np.testing.assert_array_equal(same, forward)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("planes", "least", "most"), [(0, 0.0, 0.3), (4, 0.7, 1.0)])
 def test_only_homographies_find_large_displacements(planes, least, most, monkeypatch):
     monkeypatch.setattr(dis, "PLANES", planes)
@@ -332,6 +334,7 @@ def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
     np.testing.assert_allclose(gap[inside], 0.0 if taken else error, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_text_that_stands_still_over_a_moving_scene_is_seen() -> None:
     wide = np.random.default_rng(2).integers(0, 256, (160, 330, 3), np.uint8)
     wide = cv2.normalize(cv2.GaussianBlur(wide, (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX)

@@ -82,6 +82,7 @@ def test_depth_motion_and_flow_agree_exactly(name):
     np.testing.assert_allclose(rigidly[rigid], moved[rigid], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIRST)
 def test_moved_points_are_seen_or_hidden_or_outside(name):
     p = pair(name)
@@ -102,6 +103,7 @@ def test_moved_points_are_seen_or_hidden_or_outside(name):
     assert 0.001 < T.occluded.mean() < 0.25
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIRST)
 def test_every_component_is_seen_and_moves_by_a_usual_distance(name):
     for p in (pair(name), pair(name, 1, WIDE)):
@@ -180,6 +182,7 @@ def test_limbs_of_a_person_move_differently():
 # --- images carry the truth -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
 def test_images_are_exposed_well_and_keep_their_brightness(name):
     # cars of a jam have too few pixels in the small image

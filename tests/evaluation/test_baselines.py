@@ -105,6 +105,7 @@ def test_points_behind_a_camera_are_unknown():
     assert (fill_nearest(depth) > 0).all()
 
 
+@pytest.mark.slow
 def test_dynamic_scene_is_not_rigid():
     pair = render_scene("street", width=256, height=109)
     depth = rigid_depth(pair.with_flow(flow_from_truth(pair)))

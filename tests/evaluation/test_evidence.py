@@ -144,6 +144,7 @@ def seen_by(kind: str, x: float, exact: Matches) -> Matches:
     return exact._replace(ray=a, target=b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "x"),
     [
@@ -167,6 +168,7 @@ def test_the_error_of_a_camera_is_found(kind, x):
         assert found[kind].size == pytest.approx(abs(np.expm1(-2 * x)) / 2, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_right_camera_is_believed(seed):
     found = camera_errors(matches(seed))

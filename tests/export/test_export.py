@@ -83,6 +83,7 @@ def test_several_sizes_and_formulations_are_exported_and_read_back(tmp_path):
     assert len(hashes) == 4
 
 
+@pytest.mark.slow
 def test_casadi_and_hdf5_agree_with_the_nlp(exported):
     case, nlp, _, _, _ = problem_of(exported)
     oracle = ca.Function.load(str(exported / "oracle.casadi"))
@@ -214,6 +215,7 @@ def test_a_false_claim_of_success_is_not_verified(exported, tmp_path, capsys):
     assert "no success claimed" in str(limit)
 
 
+@pytest.mark.slow
 def test_the_worst_superpixel_is_named(exported):
     _, nlp, layout, (v, r), _ = problem_of(exported)
     x = nlp.x0.copy()
@@ -229,6 +231,7 @@ def test_the_worst_superpixel_is_named(exported):
     assert kind("normal", np.array([0.0, np.nan]), 1e-6).largest == np.inf
 
 
+@pytest.mark.slow
 def test_a_changed_export_is_refused(exported, tmp_path):
     sol = answer(exported, "good.sol")
     other = tmp_path / "other"
@@ -258,6 +261,7 @@ def test_options_are_checked(tmp_path, capsys):
     assert not list(tmp_path.rglob("manifest.json"))
 
 
+@pytest.mark.slow
 def test_a_presolved_start_has_multipliers(tmp_path, capsys):
     assert (
         main(["export", "orbit", "--presolve", "-o", str(tmp_path), *TINY, "--superpixels", "16"])
@@ -280,6 +284,7 @@ def test_a_presolved_start_has_multipliers(tmp_path, capsys):
     assert line == f"energy      start {energy}  solution {energy}"
 
 
+@pytest.mark.slow
 def test_no_multipliers_where_the_start_is_not_stationary(exported):
     manifest = json.loads((exported / "manifest.json").read_text())
     assert manifest["start"] == "proposal"

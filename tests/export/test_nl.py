@@ -195,6 +195,7 @@ def pounce_agrees(nlp: NLP, file: NLFile, x: np.ndarray) -> None:
     close(H + np.tril(H, -1).T, nlp.hessian(x, lam, 0.7).toarray()[np.ix_(v, v)])
 
 
+@pytest.mark.slow
 def test_pounce_agrees(written):
     pounce = pytest.importorskip("pounce", reason="pounce-solver is not installed")
     nlp, layout, file = written
@@ -205,6 +206,7 @@ def test_pounce_agrees(written):
     assert list(back.con_names) == [g_names[k] for k in file.rows]
 
 
+@pytest.mark.slow
 def test_scip_reads_it(written):
     scip = pytest.importorskip("pyscipopt", reason="PySCIPOpt is not installed")
     nlp, _, file = written

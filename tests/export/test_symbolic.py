@@ -90,6 +90,7 @@ def test_the_sensitivity_of_the_guide_is_that_of_a_second_solve():
     np.testing.assert_allclose(names["change"], change, atol=0.02 * largest)
 
 
+@pytest.mark.slow
 def test_the_symbols_are_the_program():
     nlp = soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL)
     n = len(nlp.case)

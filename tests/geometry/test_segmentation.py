@@ -39,6 +39,7 @@ def test_superpixels_are_connected_and_numbered(image, method, count):
     assert abs(n - count) <= near
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "count"), [((60, 80), 40), ((60, 80), 150), ((120, 320), 60), ((120, 320), 300)]
 )

@@ -245,6 +245,7 @@ def test_interruption_and_time_limit_keep_the_best():
     assert not late.rounds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "status"),
     [("stop", "interrupted"), ("interrupt", "interrupted"), ("wait", "time limit")],

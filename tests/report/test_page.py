@@ -56,6 +56,7 @@ def folder(written, tmp_path):
     return Path(shutil.copytree(written, tmp_path / "result"))
 
 
+@pytest.mark.slow
 def test_the_page_is_one_file_that_fetches_nothing(text):
     addresses = set(re.findall(r'(?:src|href)="([^"]{0,20})', text))
     assert addresses
@@ -143,6 +144,7 @@ def test_a_far_sky_is_left_out_at_first(shown):
     assert scene["middle"] < scene["far"] <= 1.001 * scene["deepest"]
 
 
+@pytest.mark.slow
 def test_a_folder_makes_the_same_page_again(folder, capsys):
     written = (folder / "report.html").read_text()
     assert main(["view", str(folder), "--renew", "--no-open"]) == 0
@@ -150,6 +152,7 @@ def test_a_folder_makes_the_same_page_again(folder, capsys):
     assert (folder / "report.html").read_text() == written
 
 
+@pytest.mark.slow
 def test_the_page_can_be_left_out(small_run, folder):
     problem = small_run.problem.replace(output={"page": False})
     assert problem.digest() == small_run.problem.digest()

@@ -117,6 +117,7 @@ def test_large_meshes_are_thinned(result, monkeypatch):
     assert (np.ptp(vertices[:, 2][faces], axis=1) < 1e-9).all()
 
 
+@pytest.mark.slow
 def test_colmap_models_are_read_by_pycolmap(tmp_path, result):
     pycolmap = pytest.importorskip("pycolmap")
     write_formats(tmp_path, Chain.of(result), ["colmap"])
@@ -165,6 +166,7 @@ def test_depth_is_read_by_numpy_and_opencv(tmp_path, result):
         np.testing.assert_array_equal(read_pfm(tmp_path / f"depth_{name}.pfm")[known], found[known])
 
 
+@pytest.mark.slow
 def test_recordings_are_read_by_rerun(tmp_path, result):
     chunk = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk (extra: rerun)")
     write_formats(tmp_path, Chain.of(result), ["rrd"])
@@ -231,6 +233,7 @@ def test_transforms_project_points_where_the_cameras_see_them(tmp_path, result):
         assert 0.5 < (mask == 255).mean() < 0.9
 
 
+@pytest.mark.slow
 def test_a_chain_has_every_format_of_a_pair(tmp_path):
     chain = make_chain(toy_pairs())
     formats = [name for name in FORMATS if name != "rrd"]

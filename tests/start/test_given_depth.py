@@ -63,6 +63,7 @@ def pan() -> Seen:
     return Seen("pan")
 
 
+@pytest.mark.slow
 def test_a_confirmed_prior_gives_a_swinging_object_its_scale(swing):
     before = np.abs(swing.error(swing.start)).mean()
     start, given = swing.by(swing.depth * np.exp(0.1 * WAVE))
@@ -72,6 +73,7 @@ def test_a_confirmed_prior_gives_a_swinging_object_its_scale(swing):
     assert TIES.index("given depth") in start.tie
 
 
+@pytest.mark.slow
 def test_inverse_depth_with_a_shift_is_found(swing):
     start, given = swing.by(0.05 + 1 / swing.depth)
     assert given.evidence.kind == "inverse"
@@ -106,6 +108,7 @@ def median_in(depth: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return np.array([np.log(np.median(depth[labels == i])) for i in range(labels.max() + 1)])
 
 
+@pytest.mark.slow
 def test_orientation_is_held_where_the_prior_decides(pan):
     start, given = pan.by(pan.depth)
     pair, seg = pan.pair, pan.seg
@@ -189,6 +192,7 @@ def test_evidence_for_a_prior_is_independent_of_superpixel_count(swing, monkeypa
     assert numbers[0] == numbers[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["constant", "smooth", "upside down", "unknown", "pixels"])
 def test_a_wrong_prior_changes_nothing(swing, pan, wrong):
     for seen in (swing, pan):
@@ -206,6 +210,7 @@ def test_a_wrong_prior_changes_nothing(swing, pan, wrong):
         assert "not used" in str(given.evidence)
 
 
+@pytest.mark.slow
 def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
     assert pan.start.at_rest
     start, given = pan.by(pan.depth)
@@ -219,6 +224,7 @@ def test_before_a_camera_that_turns_a_prior_is_a_guess(pan):
     np.testing.assert_allclose(first, second, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_ordinal_values_count_by_their_order_alone(pan):
     (start, given), (_, other) = (pan.by(v, "ordinal") for v in (pan.depth, np.exp(pan.depth)))
     assert given.evidence.kind == "ordinal"
@@ -264,6 +270,7 @@ def test_steps_on_image_edges_tell_a_map_of_it(monkeypatch):
 # --- files -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_prior_of_another_size_is_brought_to_the_image(tmp_path, swing):
     np.save(tmp_path / "half.npy", swing.depth[::2, ::2])
     pair = PriorOptions(source="half.npy").load(swing.pair, lambda name: tmp_path / name)
@@ -275,6 +282,7 @@ def test_a_prior_of_another_size_is_brought_to_the_image(tmp_path, swing):
     np.testing.assert_allclose(pair.depth_prior / 1000, swing.depth, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_a_prior_that_cannot_be_one_is_refused(swing):
     with pytest.raises(DataError, match="differ in shape"):
         pair_with_prior(swing.pair, swing.depth[:, :100], "a file")

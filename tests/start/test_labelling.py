@@ -114,6 +114,7 @@ def test_neighbours_agree_unless_the_flow_jumps(world):
         assert mrf_energy(other, cost, seg.pairs, tables) >= best - 1e-9
 
 
+@pytest.mark.slow
 def test_what_is_not_seen_has_no_motion_of_its_own(world):
     """Superpixels of the wedge without flow have its motion, and continue its surface."""
     pair, flow, component, (room, wedge) = world
@@ -164,6 +165,7 @@ def test_a_random_walk_finds_the_surface_along_edges_of_like_colour():
     assert (np.diff(share[:, 0]) < 0).all()
 
 
+@pytest.mark.slow
 def test_a_camera_at_rest_starts_near_its_flow():
     """The room has no parallax; the depths that it borrows must not throw it across the image."""
     pair, seg, _ = corner(np.eye(4), WEDGE, count=100)

@@ -113,6 +113,7 @@ def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     np.testing.assert_array_equal(start.order != 0, moves[seg.pairs].sum(axis=1) == 1)
 
 
+@pytest.mark.slow
 def test_what_moves_before_a_resting_camera_is_a_part_without_an_order_too():
     pair, seg = sliding(True)
     moves = (pair.flow.uv[..., 0] != 0).ravel()[np.unique(seg.labels, return_index=True)[1]]
@@ -160,6 +161,7 @@ def test_a_swinging_object_comes_before_the_wall(swing):
     assert not (start.tie[main] == TIES.index("occlusion")).any()
 
 
+@pytest.mark.slow
 def test_an_image_without_discontinuities_keeps_its_start(swing):
     pair, seg = swing
     still = pair.with_flow(Flow(0 * pair.flow.uv, pair.flow.confidence, "zero"))

@@ -58,6 +58,7 @@ def clean(seg):
     return start_of(seg, scene_flow())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STILL)
 def test_a_still_region_before_a_moving_camera_is_fixed(seg, clean, name):
     where, turn = STILL[name]

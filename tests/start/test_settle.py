@@ -78,6 +78,7 @@ def correspondences(turn, shift, wrong, noise=0.05):
     return Matches(r, q, np.ones(400), FOCAL * wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [0.7, 1.25])
 def test_a_turn_with_parallax_determines_the_focal_length(wrong):
     matched = correspondences((0.05, 0.1, 0.02), (0.4, 0.1, 0.2), wrong)
@@ -86,6 +87,7 @@ def test_a_turn_with_parallax_determines_the_focal_length(wrong):
     assert error.deviation < 0.15
 
 
+@pytest.mark.slow
 def test_a_shift_without_a_turn_keeps_the_focal_length():
     """A longer lens and as much deeper a scene have the same flow."""
     matched = correspondences((0, 0, 0), (0.4, 0, 0), 1.25)

@@ -95,7 +95,9 @@ def assert_usable(start: Start, seg: Segmentation, K_ref: np.ndarray = CORNER_K)
 # --- the truth of noise-free planes --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("shift", [(0.35, 0.05, 0.1), (1.0, 0.1, 0.2), (-0.2, 0.0, 0.5)])
+@pytest.mark.parametrize(
+    "shift", [(0.35, 0.05, 0.1), pytest.param((-0.2, 0.0, 0.5), marks=pytest.mark.slow)]
+)
 def test_one_motion_is_recovered_exactly(shift):
     pair, seg, pure = corner(motion((0.5, -1.5, 0.3), shift))
     start = propose(fitted(pair, seg))
@@ -114,6 +116,7 @@ def test_one_motion_is_recovered_exactly(shift):
     assert (start.motion == 0).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_two_motions_are_told_apart():
     pair, seg, pure = corner(wedge=WEDGE)
     start = propose(fitted(pair, seg))
@@ -134,6 +137,7 @@ def test_two_motions_are_told_apart():
     assert np.quantile(start.error[pure], 0.95) < 0.5
 
 
+@pytest.mark.slow
 def test_noise_makes_it_worse_but_not_wild(room):
     """Half a pixel of noise raises the errors, but to a limit."""
     pair, seg, pure = room
@@ -146,6 +150,7 @@ def test_noise_makes_it_worse_but_not_wild(room):
     assert 0.3 < np.median(start.error) < 1.0
 
 
+@pytest.mark.slow
 def test_confident_pixels_decide(room):
     """Wrong flow with confidence 0 has no effect."""
     pair, seg, pure = room
@@ -158,6 +163,7 @@ def test_confident_pixels_decide(room):
     assert e.depth().max() < 2e-3
 
 
+@pytest.mark.slow
 def test_outliers_of_full_confidence_are_outvoted(room):
     pair, seg, pure = room
     rng = np.random.default_rng(99)
@@ -172,6 +178,7 @@ def test_outliers_of_full_confidence_are_outvoted(room):
     assert np.median(e.depth()) < 0.02
 
 
+@pytest.mark.slow
 def test_two_cameras_with_different_intrinsics(room):
     pair, seg, pure = room
     K_next = camera.intrinsics(230.0, 210.0, 80.0, 60.0)
@@ -201,6 +208,7 @@ def test_the_start_is_a_function_of_its_seed():
 # --- degenerate input ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_superpixels_without_confidence_borrow(room):
     pair, seg, pure = room
     blind = np.zeros(len(seg), bool)
@@ -214,6 +222,7 @@ def test_superpixels_without_confidence_borrow(room):
     assert (e.depth()[blind] < 0.5).all()
 
 
+@pytest.mark.slow
 def test_a_superpixel_without_parallax_borrows_its_depth(room):
     """The camera's rotation alone moves it, as it does the sky."""
     pair, seg, _ = room
@@ -246,6 +255,7 @@ def test_flow_that_determines_no_depth_is_finite_and_flagged(room, what):
     assert start.borrowed.all() or what != "zero flow"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn", [(0.0, 2.0, 0.0), (1.0, -1.0, 3.0)])
 def test_pure_rotation_is_finite_explains_the_flow_and_is_flagged(turn):
     """The flow does not determine any depth."""

@@ -45,6 +45,7 @@ def test_one_worker_calls_the_jobs_here_in_their_order(monkeypatch):
     assert rows[3][1]["error"] == "ValueError: out of numbers"
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_one_failed_row(monkeypatch):
     for name in ONE_THREAD:
         monkeypatch.delenv(name, raising=False)
@@ -57,6 +58,7 @@ def test_a_worker_that_dies_is_one_failed_row(monkeypatch):
     assert "died by SIGKILL" in rows["5"]["error"]
 
 
+@pytest.mark.slow
 def test_fresh_processes_and_their_wall_time():
     rows = dict(each({"a": partial(job, 1), "b": partial(job, 2)}, fresh=True))
     assert rows["a"]["process"] != rows["b"]["process"]
@@ -81,6 +83,7 @@ print(sorted(row["square"] for _, row in each({str(k): partial(square, k) for k 
 """
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_guard(tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT)
     words = [sys.executable, str(tmp_path / "script.py")]
@@ -110,6 +113,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 def test_after_ctrl_c_no_worker_is_left():
     ended = subprocess.run(
         [sys.executable, "-"], input=INTERRUPTED, capture_output=True, text=True, check=True

@@ -62,7 +62,7 @@ NAMES = st.sets(st.sampled_from(["a", "b", "c/x", "c/d/y"]), min_size=1)
 ENDS = st.sampled_from([None, None, None, RuntimeError, KeyboardInterrupt, OSError, DataError])
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(st.lists(st.tuples(NAMES, st.sampled_from(["whole", "part", "user"]), ENDS), max_size=6))
 def test_results_and_files_of_the_user_share_a_folder(steps):
     """Results that are written, or fail, and files of the user, against two dicts of files."""
@@ -326,6 +326,7 @@ with staged(sys.argv[1], True) as new:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moves", range(5))
 def test_a_kill_leaves_the_old_or_the_new_result(moves, tmp_path):
     """Killed before a move: old folder aside, new one in its place, the user's file, clean up."""
@@ -353,6 +354,7 @@ for k in range(8):
 """
 
 
+@pytest.mark.slow
 def test_processes_that_write_into_one_folder_lose_no_files(tmp_path):
     target = tmp_path / "out"
     writers = [
@@ -408,6 +410,7 @@ except DataError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_ends_in_an_error(tmp_path):
     target = tmp_path / "out"
     write(target, a="1")

@@ -77,6 +77,7 @@ def test_h5_round_trip(tmp_path):
 NOLOCK = Path(__file__).resolve().parents[2] / ".." / "shared" / "cases" / "nolock.c"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (shutil.which("gcc") and NOLOCK.is_file()), reason="no gcc, or no source")
 def test_a_file_system_without_locks(tmp_path):
     library = tmp_path / "nolock.so"
