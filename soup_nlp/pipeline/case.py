@@ -26,7 +26,7 @@ from soup_nlp.start.camera_error import camera_error
 from soup_nlp.start.components import TIES, TOO_FAST
 from soup_nlp.start.epipolar import Matches, estimate
 from soup_nlp.start.given_depth import Given, by_prior
-from soup_nlp.start.occlusion import in_order
+from soup_nlp.start.occlusion import covering
 from soup_nlp.start.prior_evidence import LEAST_SIGMA, PIECES, PriorEvidence, judged
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.start_options import SeededStart
@@ -148,10 +148,8 @@ def _flow_fit(problem: Problem, pair: Pair, seg: Segmentation) -> FlowFit:
 def _begun(problem: Problem, pair: Pair, seg: Segmentation) -> Begun:
     """The start on given superpixels, without a depth prior."""
     fitted = _flow_fit(problem, pair, seg)
-    start = propose(fitted)
-    if problem.energy.weights.order > 0:
-        start = in_order(start, pair, fitted)
-    return start, pair, fitted
+    contrast = covering(pair, fitted) if problem.energy.weights.order > 0 else None
+    return propose(fitted, contrast), pair, fitted
 
 
 def _judged(problem: Problem, labels: Labels, begun: Begun) -> tuple[Begun, PriorEvidence]:

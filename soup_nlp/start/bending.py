@@ -17,9 +17,9 @@ from scipy.optimize import least_squares
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import connected_labels, connected_pieces
+from soup_nlp.start.components import connected_labels, connected_pieces, numbered
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.labelling import Labelling, candidates, dominant
+from soup_nlp.start.labelling import PIECE_SIZE, Labelling, candidates, dominant
 from soup_nlp.start.views import FlowFit, Views
 
 REFERENCE = 1000
@@ -141,12 +141,14 @@ def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
 def moving_pieces(flow: FlowFit) -> Int:
     """(N,) piece of every superpixel before a camera at rest, or one that only turns.
 
-    0 is everything that the turn explains, the others are connected pieces of what moves.
+    0 is everything that the turn explains, the others are connected pieces of what moves. Those
+    with too few superpixels whose flow is usable count as still.
     """
     jump = flow.options.discontinuity_px
     still = fit_turn(flow.views)[1] < jump
-    continuous = ~flow.seg.across(still) & (flow.jump < jump)
-    return np.where(still, 0, 1 + connected_labels(continuous, flow.seg))
+    piece = connected_labels(~flow.seg.across(still) & (flow.jump < jump), flow.seg)
+    still |= np.bincount(piece, flow.views.usable)[piece] < PIECE_SIZE
+    return numbered(np.where(still, -1, piece))
 
 
 LEAST_SURFACE = 0.06

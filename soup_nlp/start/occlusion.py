@@ -1,12 +1,10 @@
-"""Occlusion order along outlines: which side covers the other, and components placed accordingly.
+"""Occlusion order along outlines: which side covers the other.
 
 Where two regions move differently, one covers the other along their outline. If they close in on
 each other, pixels of the farther region are covered in the next frame: followed with the flow of
 their own region they do not look as before. If they part, the area that appears between them
 belongs to the farther region, and looks like the pixels of that region beside the outline.
 """
-
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,16 +13,7 @@ from soup_nlp.arrays import Float, Image, Int
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.bending import moving_pieces
-from soup_nlp.start.components import (
-    FIXED,
-    TIES,
-    numbered,
-    outlines,
-    quantile,
-)
-from soup_nlp.start.propose import Start
+from soup_nlp.start.components import numbered
 from soup_nlp.start.views import FlowFit
 
 WIDEST = 8
@@ -39,9 +28,6 @@ MOST_GREY = 40.0
 """Limit of the cost of a pixel, grey levels."""
 LEAST_ORDER = 0.8
 """Probability from which the order along an outline counts."""
-IN_FRONT = 0.35
-"""Median step of log depth along the outline of a region that is placed, a guess: true steps have
-medians of 0.2 to 1.9. A step of less than half of it does not agree with the order."""
 
 
 def covering(pair: Pair, flow: FlowFit) -> Float:
@@ -146,89 +132,3 @@ def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
     sure = ((total + np.abs(lead)) / 2 + 1) / (total + 2)
     holds = (a != b) & (votes * lead[outline] >= 0) & (sure[outline] > LEAST_ORDER)
     return np.where(holds, np.sign(lead[outline]) * turned * sure[outline], 0.0)
-
-
-def in_order(start: Start, pair: Pair, flow: FlowFit) -> Start:
-    """The start with its components in the order that their outlines show.
-
-    Only scales that neither flow nor parallax determines change. A region before a camera at rest,
-    or one that bends, becomes a component of its own if it is placed.
-
-    Args:
-        start: The start before its components are ordered.
-        pair: Images and cameras.
-        flow: The flow of its superpixels.
-    """
-    seg, region, contrast = flow.seg, regions(start, flow), covering(pair, flow)
-    whole = vote(contrast, region, seg)
-    if not whole.any():
-        return start
-    order = np.where(np.abs(contrast) > CONTRAST, whole, 0.0)
-    factor = placed(flow, start.soup, region, order, start.tie)
-    moved = factor != 1
-    # the scale of a placed region is held along its whole outline
-    beside_moved = moved[seg.pairs].any(axis=1) & (flow.jump >= CLOSING_PX)
-    order = np.where(beside_moved, whole, order)
-    if start.order is not None:
-        order = np.where(order == 0, start.order, order)
-    soup = replace(start.soup, lam=start.soup.lam * factor).normalised()
-    tie = np.where(moved, TIES.index("occlusion"), start.tie)
-
-    def with_regions(group: Int) -> Int:
-        return numbered(np.where(moved & start.bends, len(seg) + region, group))
-
-    part = with_regions(start.part) if start.bends.all() else start.part
-    component = with_regions(start.component)
-    return replace(start, soup=soup, tie=tie, component=component, part=part, order=order)
-
-
-def regions(start: Start, flow: FlowFit) -> Int:
-    """(N,) regions with one scale each: rigid components, and surfaces in components that bend.
-
-    Before a camera at rest everything that does not move is one region; the others are connected
-    pieces of moving superpixels.
-    """
-    if start.at_rest:
-        return moving_pieces(flow)
-    return np.where(start.bends, len(flow.seg) + start.surface, start.component)
-
-
-def placed(flow: FlowFit, soup: Soup, region: Int, order: Float, tie: Int) -> Float:
-    """(N,) factor by which the scale of every superpixel is multiplied to bring regions in order.
-
-    The largest region of the scene and those fixed in the image stay. The others are placed one
-    after the other, the one with the most votes against placed regions first. Where the median step
-    of log depth across its outlines is less than half of `IN_FRONT`, the region comes nearer or
-    recedes until it is that. The lower outline does not count where the rest has votes: what stands
-    on something has no step there.
-
-    Args:
-        flow: The flow of every superpixel.
-        soup: Planes.
-        region: (N,) region of every superpixel.
-        order: (P,) see `vote`.
-        tie: (N,) origin of every superpixel's scale, see `components.TIES`.
-    """
-    seg, region = flow.seg, numbered(region)
-    count = int(region.max()) + 1
-    shift, done = np.zeros(count), np.zeros(count, bool)
-    scene = np.argmax(np.bincount(region, tie == TIES.index("reference")))
-    done[[scene, *region[tie == FIXED]]] = True
-    across = seg.across(region)
-    around = outlines(region, seg)
-    a, b, length = around.component, around.other, around.contact
-    behind = np.concatenate([order[across], -order[across]])
-    step = np.log(soup.depth_across(seg.pairs[across], flow.middle[across]))
-    step = np.concatenate([step[0] - step[1], step[1] - step[0]])
-    while (use := ~done[a] & done[b] & (behind != 0)).any():
-        c = int(np.argmax(np.bincount(a[use], np.abs(behind[use]), minlength=count)))
-        # c recedes behind regions that cover it, and comes in front of those that it covers
-        for sign in (1.0, -1.0):
-            counted = use & (a == c) & (sign * behind > 0)
-            rest = counted & ~(around.below & flow.options.upright)
-            counted = rest if rest.any() else counted
-            now = sign * (step - shift[b])
-            gap = quantile(now[counted], length[counted], 0.5) if counted.any() else IN_FRONT
-            shift[c] += sign * (IN_FRONT - gap) if gap < IN_FRONT / 2 else 0.0
-        done[c] = True
-    return np.exp(shift)[region]

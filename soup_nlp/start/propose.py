@@ -17,6 +17,7 @@ from soup_nlp.start.bending import (
 )
 from soup_nlp.start.components import (
     SCENE,
+    TIES,
     connected_labels,
     connected_pieces,
     numbered,
@@ -32,10 +33,11 @@ from soup_nlp.start.labelling import (
     labelled,
     limited_noise,
 )
+from soup_nlp.start.occlusion import vote
 from soup_nlp.start.overlay import fixed_to_camera
-from soup_nlp.start.scales import order_in_front, scaled
+from soup_nlp.start.scales import held, scaled
 from soup_nlp.start.settle import settle
-from soup_nlp.start.views import LEAST_PARALLAX_PX, USABLE, FlowFit, Views
+from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit, Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +53,6 @@ class Start:
         component: (N,) index of the rigid component, which shares one scale: the superpixels of a
             dominant motion, or a connected piece of superpixels with their own motions. The first
             one is the scene (`SCENE`).
-        part: (N,) group that moves as one: its component, or the scene where its flow is not
-            usable, so that its motion is not known; before a camera at rest each piece that moves.
         motions: The motions that superpixels share.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
             where a region bends, discontinuities make up most of its outline.
@@ -78,7 +78,6 @@ class Start:
     borrowed: Mask
     motion: Int
     component: Int
-    part: Int
     motions: list[Motion]
     surface: Int
     tie: Int
@@ -113,7 +112,6 @@ class Start:
             borrowed=borrowed,
             motion=zero - 1,
             component=zero,
-            part=zero,
             motions=[],
             surface=zero,
             tie=zero,
@@ -135,14 +133,18 @@ class Start:
         return bool(self.bends.any())
 
 
-def propose(flow: FlowFit) -> Start:
-    """Rotation, translation, plane and scale of every superpixel from its flow."""
+def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
+    """Rotation, translation, plane and scale of every superpixel from its flow.
+
+    Contrasts (P,) across outlines (`covering`) give the order by occlusion; None for none.
+    """
     seg, views, o = flow.seg, flow.views, flow.options
     if o.method == "homography":
         soup, borrowed = unorganised(flow)
         soup = soup.normalised()
         error = views.distance(soup.moved(soup.points(views.ray)))
         return Start.whole(views, soup, error, borrowed, limited_noise(error))
+    contrast = np.zeros(len(seg.pairs)) if contrast is None else contrast
     fixed, shift = fixed_to_camera(flow)
     flow = flow.without(fixed)
     surface = connected_labels(flow.jump < o.discontinuity_px, seg)
@@ -160,7 +162,9 @@ def propose(flow: FlowFit) -> Start:
         every = np.ones(len(seg), bool)
         start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
         start = replace(start, surface=surface, bends=every, unexplained=jumping)
-        return start if turn is None else replace(start, at_rest=True, part=parts_at_rest(flow))
+        start = replace(start, at_rest=turn is not None)
+        part = _scene_first(surface) if turn is None else moving_pieces(flow)
+        return _ordered(flow, start, part, contrast)
     choice = settle(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
     soup, weak = _with_depth(rigid, choice, wrong)
@@ -176,11 +180,10 @@ def propose(flow: FlowFit) -> Start:
             regions = component.max() + 1 + connected_pieces(mask, seg)
             component = numbered(np.where(mask, regions, component))
     reliable = ~weak & rigid.views.usable
-    # the scene is the largest component
-    scene = np.argmax(np.bincount(component, ~fixed))
-    component = numbered(np.where(component == scene, -1, component))
+    component = _scene_first(component, ~fixed)
     floor = ground(flow, 1 / soup.depth_at(views.anchor), reliable & (component == SCENE))
-    scale, tie = scaled(flow, soup, component, fixed, floor)
+    order = vote(contrast, component, seg)
+    scale, tie = scaled(flow, soup, component, order, fixed, floor)
     soup = replace(soup, lam=soup.lam * scale)
     soup, lifted = on_ground(flow, soup, floor, reliable, component)
     weak, wrong = weak | lifted, wrong | lifted
@@ -192,7 +195,6 @@ def propose(flow: FlowFit) -> Start:
         borrowed=weak,
         motion=label,
         component=component,
-        part=component,
         motions=choice.motions,
         surface=surface,
         tie=tie,
@@ -200,8 +202,26 @@ def propose(flow: FlowFit) -> Start:
         unexplained=jumping | _large(wrong & ~bends, seg),
         wrong=wrong & ~bends,
         noise=noise,
-        order=order_in_front(flow, soup, component, tie),
+        order=held(flow, soup, component, tie, order, contrast),
     )
+
+
+def _ordered(flow: FlowFit, start: Start, part: Int, contrast: Float) -> Start:
+    """A start without relief, with its parts (N,) placed in the order by occlusion."""
+    order = vote(contrast, part, flow.seg)
+    scale, tie = scaled(flow, start.soup, part, order)
+    moved = np.abs(scale - 1) > 1e-6
+    soup = replace(start.soup, lam=start.soup.lam * scale).normalised()
+    tie = np.where(moved, TIES.index("occlusion"), 0)
+    component = numbered(np.where(moved | start.at_rest, part, SCENE))
+    stays = held(flow, soup, component, tie, order, contrast)
+    return replace(start, soup=soup, tie=tie, component=component, order=stays)
+
+
+def _scene_first(label: Int, counts: Mask | None = None) -> Int:
+    """(N,) labels, numbered so that the largest is `SCENE`, of those that count (N,)."""
+    scene = np.argmax(np.bincount(label, counts))
+    return numbered(np.where(label == scene, -1, label))
 
 
 def _large(mask: Mask, seg: Segmentation) -> Mask:
@@ -243,23 +263,3 @@ def receding(views: Views, soup: Soup) -> Soup:
     mu = 1 + fall * (views.anchor[:, 1] - (low + high) / 2)
     slope = np.stack([0 * mu, fall * views.radius / mu], axis=1)
     return views.soup(mu, slope, soup.R, soup.translation / mu[:, None]).normalised()
-
-
-SMALL = 0.008
-"""Largest share of the superpixels of a piece that may be a mixture of the flows around it."""
-
-
-def parts_at_rest(flow: FlowFit) -> Int:
-    """(N,) part of every superpixel before a camera at rest: pieces that move, with usable flow.
-
-    Small pieces, whose flow may be a mixture of those around them, count as the scene.
-    """
-    piece = moving_pieces(flow)
-    large = np.bincount(piece)[piece] > SMALL * len(piece)
-    return numbered(np.where(large & _usable(flow, piece), piece, SCENE))
-
-
-def _usable(flow: FlowFit, piece: Int) -> Mask:
-    """(N,) True in pieces (N,) whose flow has a mean confidence of at least `USABLE`."""
-    total = np.bincount(piece, flow.views.weight.mean(axis=1))
-    return (total / np.maximum(np.bincount(piece), 1) >= USABLE)[piece]

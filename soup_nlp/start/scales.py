@@ -7,9 +7,8 @@ pair of neighbours and x the log scales, the program adds up
   the quantile `STANDS` below it, where it stands, and `HIDES` elsewhere, where it hides what is
   behind it;
 * pace: what a component moves farther than the scene, and a little of what it moves less;
-* ground: how far a component reaches below the ground of the scene.
-
-The order by occlusion changes scales afterwards (`soup_nlp.start.occlusion`).
+* ground: how far a component reaches below the ground of the scene;
+* order: by how much a component that covers another one is less than `IN_FRONT` before it.
 """
 
 from typing import NamedTuple
@@ -20,7 +19,8 @@ from scipy.optimize import linprog
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import FIXED, SCENE, TIES, TOO_FAST, outlines
+from soup_nlp.start.components import FIXED, SCENE, STEEP, TIES, TOO_FAST, numbered, outlines
+from soup_nlp.start.occlusion import CLOSING_PX, CONTRAST
 from soup_nlp.start.views import FlowFit
 
 STANDS, HIDES = 0.4, 0.2
@@ -33,6 +33,9 @@ FREE = 1.0
 """Log units by which a component that stands on something may move farther than the scene."""
 UNDER = 2.0
 """Price of a log unit by which a component lies below the ground."""
+IN_FRONT, COVERS = 0.3, 4.0
+"""Least step of log depth along the outline of what covers something (true steps have medians of
+0.2 to 1.9), and the price of a log unit less."""
 UNKNOWN = np.log(100.0)
 """If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
 MOST = 6.0
@@ -77,7 +80,7 @@ def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
     x = linprog(cost, A_eq=A.tocsr(), b_eq=r.value, bounds=np.vstack([bounds, slack])).x[:count]
     exact = np.abs(x[r.a] - x[r.b] - r.value) < 1e-7
     tie = np.full(count, TIES.index("nothing"))
-    for end in (r.a, r.b):
+    for end in (r.b, r.a):
         for row in np.flatnonzero(exact)[np.argsort((r.up + r.down)[exact], kind="stable")]:
             tie[end[row]] = r.tie[row]
     tie[still] = TIES.index("reference")
@@ -121,13 +124,50 @@ def above(flow: FlowFit, soup: Soup, label: Int, floor: Float) -> Rows:
     )
 
 
-def scaled(flow: FlowFit, soup: Soup, label: Int, fixed: Mask, floor: Float) -> tuple[Float, Int]:
-    """(N,) scale of the component (N,) of every superpixel, and (N,) what decides it."""
+def before(flow: FlowFit, soup: Soup, label: Int, order: Float) -> Rows:
+    """Rows of the order by occlusion (P,) of components (N,), see `Start.order`.
+
+    In an upright image none are below what covers: what stands on something has no step there.
+    """
+    seg, at = flow.seg, np.flatnonzero(order)
+    ends = np.where(order[at, None] > 0, seg.pairs[at, ::-1], seg.pairs[at])
+    way = np.diff(seg.anchors[ends], axis=1)[:, 0]
+    steps = (not flow.options.upright) | (way[:, 1] <= STEEP * np.linalg.norm(way, axis=1))
+    at, ends = at[steps], ends[steps]
+    front, back = label[ends].T
+    z = soup.depth_across(ends, flow.middle[at])
+    length = seg.boundary_length[at].astype(float)
+    outline = numbered(front * (int(label.max()) + 1) + back)
+    weight = COVERS * length / np.bincount(outline, length)[outline]
+    return rows(front, back, np.log(z[1] / z[0]) - IN_FRONT, weight, 0.0, "occlusion")
+
+
+def scaled(
+    flow: FlowFit,
+    soup: Soup,
+    label: Int,
+    order: Float,
+    fixed: Mask | None = None,
+    floor: Float | None = None,
+) -> tuple[Float, Int]:
+    """(N,) scale of the component (N,) of every superpixel, and (N,) what decides it.
+
+    Args:
+        flow: The flow of every superpixel.
+        soup: Planes and motions.
+        label: (N,) component.
+        order: (P,) order by occlusion, see `Start.order`.
+        fixed: (N,) True where the image stands still before a moving camera.
+        floor: (N,) inverse depth of the ground, 0 where there is none. None if there is no rigid
+            scene, with which displacements could be compared.
+    """
     count = int(label.max()) + 1
     if count == 1 or not len(flow.seg.pairs):
         return np.ones(len(soup)), np.full(len(soup), TIES.index("reference"))
-    parts = contact(flow, soup, label, fixed)
-    parts += [pace(flow, soup, label), above(flow, soup, label, floor)]
+    fixed = np.zeros(len(soup), bool) if fixed is None else fixed
+    parts = [*contact(flow, soup, label, fixed), before(flow, soup, label, order)]
+    if floor is not None:
+        parts += [pace(flow, soup, label), above(flow, soup, label, floor)]
     x, tie = minimum(count, parts, np.array([SCENE]))
     tie = np.where(fixed, FIXED, tie[label])
     return np.exp(x)[label], tie
@@ -136,19 +176,25 @@ def scaled(flow: FlowFit, soup: Soup, label: Int, fixed: Mask, floor: Float) -> 
 # --- how far components move ---------------------------------------------------------------------
 
 
-def order_in_front(flow: FlowFit, soup: Soup, label: Int, tie: Int) -> Float | None:
-    """(P,) order along the outlines of components that contact makes too fast, see `Start.order`.
+def held(
+    flow: FlowFit, soup: Soup, label: Int, tie: Int, order: Float, contrast: Float
+) -> Float | None:
+    """(P,) order that the energy holds, see `Start.order`; None where nothing is known.
 
-    It holds their steps of depth, which the energy would close otherwise, since nothing else gives
-    them a scale. None without such components among those of `label` (N,), with ties (N,).
+    It is the order by occlusion (P,) where the images tell it, by contrasts (P,), and along all
+    outlines of the components (N,) that it places. Those that contact makes too fast, by their ties
+    (N,), keep the steps of the soup, which the energy would close otherwise.
     """
-    pairs, near = flow.seg.pairs, (tie == TOO_FAST)[flow.seg.pairs]
-    if not near.any():
-        return None
+    pairs = flow.seg.pairs
+    by_order = (tie == TIES.index("occlusion"))[pairs].any(axis=1)
+    told = np.abs(contrast) > CONTRAST
+    out = np.where(told | (by_order & (flow.jump >= CLOSING_PX)), order, 0.0)
+    near = (tie == TOO_FAST)[pairs]
     z = soup.depth_across(pairs, flow.middle)
     second = np.where(z[1] < z[0], near[:, 1], 0.0)
     first = np.where(z[0] < z[1], near[:, 0], 0.0)
-    return np.where(flow.seg.across(label), second - first, 0.0)
+    out = np.where((out == 0) & flow.seg.across(label), second - first, out)
+    return out if out.any() else None
 
 
 def log_pace(far: Float, label: Int) -> Float:

@@ -16,8 +16,9 @@ from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.start.components import TIES
-from soup_nlp.start.occlusion import IN_FRONT, LEAST_ORDER, covering, in_order, vote
+from soup_nlp.start.occlusion import LEAST_ORDER, covering, vote
 from soup_nlp.start.propose import Start, propose
+from soup_nlp.start.scales import IN_FRONT
 
 HEIGHT, WIDTH, CELL = 96, 128, 16
 K = camera.intrinsics(120.0, 120.0, 63.5, 47.5)
@@ -52,8 +53,9 @@ def begun(covers: bool) -> Start:
     return propose(fitted(*sliding(covers)))
 
 
-def ordered(before: Start, seg: Segmentation, pair: Pair) -> Start:
-    return in_order(before, pair, fitted(pair, seg))
+def ordered(seg: Segmentation, pair: Pair) -> Start:
+    flow = fitted(pair, seg)
+    return propose(flow, covering(pair, flow))
 
 
 @pytest.mark.parametrize("covers", [True, False])
@@ -94,7 +96,7 @@ def test_a_vote_needs_several_strips_and_agreement():
 @pytest.mark.parametrize("covers", [True, False])
 def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     (pair, seg), before = sliding(covers), begun(covers)
-    start = ordered(before, seg, pair)
+    start = ordered(seg, pair)
     assert before.at_rest
     z = np.log(start.soup.depth_at(camera.rays(K, seg.anchors)))
     z -= np.log(before.soup.depth_at(camera.rays(K, seg.anchors)))
@@ -108,7 +110,6 @@ def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     flows = [reconstruct(soup, seg.labels, K, K).flow for soup in (start.soup, before.soup)]
     np.testing.assert_allclose(*flows, atol=1e-9)
     assert len(np.unique(start.component)) == 3
-    np.testing.assert_array_equal(start.part, start.component)
     # the order is held along the whole outline, upper and lower edges included
     np.testing.assert_array_equal(start.order != 0, moves[seg.pairs].sum(axis=1) == 1)
 
@@ -119,16 +120,15 @@ def test_what_moves_before_a_resting_camera_is_a_part_without_an_order_too():
     moves = (pair.flow.uv[..., 0] != 0).ravel()[np.unique(seg.labels, return_index=True)[1]]
     start = begun(True)
     assert start.at_rest
-    assert not start.component.any()
-    np.testing.assert_array_equal(start.part > 0, moves)
-    assert len(np.unique(start.part)) == 3
+    np.testing.assert_array_equal(start.component > 0, moves)
+    assert len(np.unique(start.component)) == 3
     # a piece of flow that is hardly usable need not move
     left = np.arange(WIDTH) < WIDTH / 2
     doubtful = np.where((pair.flow.uv[..., 0] != 0) & left, 0.3, 1.0)
     pair = pair.with_flow(Flow(pair.flow.uv, doubtful))
     start = propose(fitted(pair, seg))
     assert start.at_rest
-    np.testing.assert_array_equal(start.part > 0, moves & (seg.anchors[:, 0] > WIDTH / 2))
+    np.testing.assert_array_equal(start.component > 0, moves & (seg.anchors[:, 0] > WIDTH / 2))
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def swing() -> tuple[Pair, Segmentation]:
 def test_a_swinging_object_comes_before_the_wall(swing):
     pair, seg = swing
     before = propose(fitted(pair, seg))
-    start = ordered(before, seg, pair)
+    start = ordered(seg, pair)
     u, v = np.rint(seg.anchors).astype(int).T
     truth = np.log(pair.truth.depth_ref[v, u])
     ordered_pairs = start.order != 0
@@ -165,8 +165,9 @@ def test_a_swinging_object_comes_before_the_wall(swing):
 def test_an_image_without_discontinuities_keeps_its_start(swing):
     pair, seg = swing
     still = pair.with_flow(Flow(0 * pair.flow.uv, pair.flow.confidence, "zero"))
-    start = propose(fitted(still, seg))
-    assert ordered(start, seg, still) is start
+    start, same = propose(fitted(still, seg)), ordered(seg, still)
+    np.testing.assert_array_equal(same.soup.distance, start.soup.distance)
+    assert same.order is None
 
 
 OPTIONS = ("segmentation.superpixels=48", "segmentation.neighbours=6", "refine.enabled=false")

@@ -6,7 +6,7 @@ from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry import camera
 from soup_nlp.start.components import TIES, TOO_FAST
-from soup_nlp.start.scales import FREE, Rows, minimum, order_in_front, rows, scaled
+from soup_nlp.start.scales import FREE, IN_FRONT, Rows, held, minimum, rows, scaled
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 HANGS = [[0] * 5, [0, 0, 1, 0, 0], [0] * 5, [0] * 5]
@@ -14,7 +14,7 @@ STANDS = [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0] * 5]
 CUT_OFF = [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 0, 0]]
 
 
-def found(z, component, far=0.5, floor=0.0, **options):
+def found(z, component, far=0.5, floor=0.0, order=None, **options):
     """Log scale and tie of component 1, whose planes are at depth 1 in its own unit.
 
     There it moves by `far` where the scene moves by 1.
@@ -23,8 +23,8 @@ def found(z, component, far=0.5, floor=0.0, **options):
     flow = flow_of(squares(*np.shape(component)), K=K, **options)
     moved = np.where(label, far, 1.0)[:, None] * [1.0, 0.0, 0.0]
     soup = facing(np.where(label == 1, 1.0, np.ravel(z)), moved)
-    none = np.zeros(len(soup), bool)
-    scale, tie = scaled(flow, soup, label, none, np.full(len(soup), floor))
+    says = np.zeros(len(flow.seg.pairs)) if order is None else order(label, flow.seg)
+    scale, tie = scaled(flow, soup, label, says, floor=np.full(len(soup), floor))
     assert (scale[label == 0] == 1).all()
     assert (tie[label == 0] == TIES.index("reference")).all()
     return float(np.log(scale[label == 1][0])), TIES[tie[label == 1][0]]
@@ -88,9 +88,27 @@ def test_what_is_too_fast_covers_all_that_it_touches():
     flow = flow_of(squares(4, 5), K=K)
     soup, tie = facing(np.where(label, 1.0, 8.0), np.ones(3)), np.where(label, TOO_FAST, 0)
     ends = label[flow.seg.pairs]
-    order = order_in_front(flow, soup, label, tie)
+    none = np.zeros(len(ends))
+    order = held(flow, soup, label, tie, none, none)
     np.testing.assert_array_equal(order, ends[:, 1] - ends[:, 0])
-    assert order_in_front(flow, soup, label, 0 * tie) is None
+    assert held(flow, soup, label, 0 * tie, none, none) is None
+
+
+def covers(label, seg):
+    """Component 1 covers all that it touches."""
+    ends = label[seg.pairs]
+    return 0.9 * (ends[:, 1] - ends[:, 0])
+
+
+def test_what_covers_is_in_front_of_all_but_what_it_stands_on():
+    wall = np.full((4, 5), 8.0)
+    log_scale, tie = found(wall, HANGS, far=1e-3, order=covers, upright=False)
+    assert tie == "occlusion"
+    np.testing.assert_allclose(log_scale, np.log(8) - IN_FRONT, rtol=1e-6)
+    wall[-1] = 4.0
+    log_scale, tie = found(wall, STANDS, far=1e-3, order=covers)
+    assert tie == "contact below"
+    np.testing.assert_allclose(log_scale, np.log(4), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("floor", "expected"), [(0.0, np.log(8)), (0.25, np.log(4))])
