@@ -264,12 +264,12 @@ def load(folder: str | Path) -> Result:
         given = {f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)}
         seg, (height, width) = Segmentation(**given), tree["depth"]["next"].shape
         rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
-        part, borrowed = tree["start"]["part"], tree["start"]["borrowed"].astype(bool)
+        group, borrowed = tree["start"]["component"], tree["start"]["borrowed"].astype(bool)
         return Result(
             tree=tree,
             summary=summary,
             reconstruction=replace(rec, sigma_ref=require(tree, "depth/sigma_ref")),
-            components=find_components(soup, seg, part, K_ref, K_next, borrowed),
+            components=find_components(soup, seg, group, K_ref, K_next, borrowed),
             metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
         )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
