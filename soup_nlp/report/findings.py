@@ -8,6 +8,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.data.flow.consistency import standing_edges
 from soup_nlp.data.formats.cameras import written
 from soup_nlp.data.formats.images import interlaced
+from soup_nlp.data.working_size import scaled_camera
 from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
 from soup_nlp.start.camera_error import better_camera
@@ -207,7 +208,10 @@ def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
         out.append("frames farther apart in time")
     if camera is not None:
         said = f"undistorted images and exact intrinsics: the flow suggests an error of {camera}"
-        fits = better_camera(run.pair.K_ref, camera, run.confidence.evidence.errors[camera].mean)
+        # for the images as they were given
+        size = run.pair.size if run.full is None else run.full.depth_ref.shape
+        K = scaled_camera(run.pair.K_ref, run.pair.size, size)
+        fits = better_camera(K, camera, run.confidence.evidence.errors[camera].mean)
         out.append(said if fits is None else f"{said}, and --intrinsics {written(fits)} would fit")
     if run.pair.focal_sigma > UNSURE_FOCAL and shares["weak"] >= SHARE:
         out.append("the focal length of the camera (--fov or --intrinsics)")

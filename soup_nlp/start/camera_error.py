@@ -32,7 +32,7 @@ MEASUREMENTS = 80
 """The flow counts as this many independent measurements: its errors are alike over parts of the
 image, so that its pixels are no independent ones."""
 LEAST_ODDS = 3.0
-"""Log odds from which there is an error: twenty to one."""
+"""Log odds at which there is an error, and, against it, none that counts: twenty to one."""
 PIXELS, NOISE_PX, ROUNDS = 2000, 0.05, 4
 """Largest number of correspondences, the scale of their robust loss in pixels, and the rounds of a
 fit that begins at that of the error before."""
@@ -58,9 +58,12 @@ class CameraError(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Root of the mean square of its effect; 0 below `LEAST_ODDS`."""
+        """Root of the mean square of its effect; 0 where the odds against it are `LEAST_ODDS`.
+
+        What the flow leaves open, such as the focal length on a straight drive, counts.
+        """
         probability = float(special.expit(self.log_odds))
-        return self.effect * probability**0.5 * (self.log_odds > LEAST_ODDS)
+        return self.effect * probability**0.5 * (self.log_odds > -LEAST_ODDS)
 
 
 def corrected(kind: str, x: float, ref: Float, following: Float) -> tuple[Float, Float]:

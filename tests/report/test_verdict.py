@@ -1,5 +1,6 @@
 """The printed verdict: what was found comes first, what concerns the solver only on request."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.geometry.constraints import DEFINITIONS, constraints
+from soup_nlp.pipeline.record import FullSize
 from soup_nlp.report import findings
 from soup_nlp.report.check import _constraints
 from soup_nlp.report.summary import certainty
@@ -101,6 +103,21 @@ def test_hints_name_what_would_help(small_run):
     assert findings.hints(seen(small_run, focal=0.1), weak) == []
     (told,) = findings.hints(seen(small_run, focal=0.3), weak)
     assert "--fov" in told
+
+
+def test_proposed_intrinsics_are_those_of_the_images_as_given(small_run):
+    wrong = seen(small_run, camera="focal length")
+    height, width = small_run.pair.size
+    twice = FullSize(np.ones((2 * height, 2 * width)), np.ones((1, 1)), None)
+    shares = dict.fromkeys(certainty(small_run), 0.0)
+    focal = []
+    for run in (wrong, replace(wrong, full=twice)):
+        (told,) = findings.hints(run, shares)
+        fx, fy = map(float, re.search(r"--intrinsics ([\d.]+),([\d.]+)", told).groups())
+        assert fx == fy
+        focal.append(fx)
+    assert focal[0] == pytest.approx(small_run.pair.K_ref[0, 0] * np.exp(0.1), rel=1e-3)
+    assert focal[1] == pytest.approx(2 * focal[0], rel=1e-3)
 
 
 def test_frames_without_a_common_scene_are_told_nothing_else(small_run):
