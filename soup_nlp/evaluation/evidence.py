@@ -17,7 +17,6 @@ from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.start.bending import (
-    LEAST_GAP,
     PLAIN_TURN,
     displaced,
     fit_robustly,
@@ -33,11 +32,9 @@ from soup_nlp.start.camera_error import (
 )
 from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Matches
+from soup_nlp.start.prior_evidence import least_gap
 from soup_nlp.start.settle import RELIEF
 
-LEAST_GAP_PX = 0.5
-"""Least gain of depth over a turn alone or a constant depth in explaining the flow of a component,
-in pixels; below it, or below `LEAST_GAP` noises of the flow, depth is a guess."""
 OPEN = 0.5
 """Systematic error of the flow that leaves motions undetermined, in units of its noise."""
 CLIP_PX = 3.0
@@ -80,8 +77,8 @@ class Evidence:
 
     @property
     def guess(self) -> Mask:
-        """(C,) True where the depth of a component is a guess."""
-        return ~(self.gap >= max(LEAST_GAP_PX, LEAST_GAP * self.noise))
+        """(C,) True where the depth of a component is a guess, see `least_gap`."""
+        return ~(self.gap >= least_gap(self.noise))
 
     def rows(self) -> list[dict[str, float | bool | None]]:
         """A row for every component: errors in pixels, the gap in units of the noise, whether its

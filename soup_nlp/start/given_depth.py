@@ -20,6 +20,7 @@ from soup_nlp.start.prior_evidence import (
     LEAST_SIGMA,
     PriorEvidence,
     Seen,
+    least_gap,
     without_gaps,
 )
 from soup_nlp.start.propose import Start
@@ -86,7 +87,7 @@ def by_prior(
     fixed = start.tie == FIXED
     off, strong = np.zeros(n), fixed.copy()
     for c in np.unique(start.component[~start.bends & ~fixed]):
-        determined = evidence.determined if c == SCENE else seen.relief(c) > seen.tells
+        determined = evidence.determined if c == SCENE else seen.relief(c) > least_gap(start.noise)
         soup, firm = _shaped(seen, soup, c, prior, evidence.sigma, determined)
         strong |= firm
         if not firm.any():

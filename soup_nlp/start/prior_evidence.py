@@ -20,27 +20,27 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.start.bending import displaced, fit_robustly, trimmed_mean
+from soup_nlp.start.bending import LEAST_GAP, RELIEF, displaced, fit_robustly, trimmed_mean
 from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.labelling import CLIP
 from soup_nlp.start.propose import Start
-from soup_nlp.start.settle import RELIEF, common_error, most_probable
+from soup_nlp.start.settle import common_error, most_probable
 from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
 
 Kind = Literal["metric", "relative", "inverse", "ordinal"]
 
-CONFIRMED = 0.68
-"""Largest spread of the log ratio of depths by flow and prior, relative to that of log depth by the
-flow, with which the flow confirms a prior. Right maps warped by 20 % have 0.58 and less, maps of
-other scenes 0.78 and more."""
-TELLS_PX, TELLS = 0.5, 3.0
-"""Pixels, and multiples of the flow's noise, by which the depths of a component must explain its
-flow better than one depth, so that it determines them; from a third on it may confirm a prior."""
-LEAST_SIGMA, UNCONFIRMED = 0.12, 0.35
-"""Standard deviation of log depth of a prior: the least, and that of an unconfirmed one."""
-PRECISE = 0.1
-"""Noise of the flow relative to the parallax up to which depth tells if values rise with it."""
+EXPLAINED = 0.5
+"""Least share of a variance that is explained: of log depth by the flow by a prior that the flow
+confirms (right maps warped by 20 % explain 0.66 and more, maps of other scenes 0.39 and less), and
+of a map by the superpixels, which explain next to nothing of independent pixels."""
+LEAST_GAP_PX = 0.5
+"""Pixels by which depths must explain the flow of a component better than one depth or a turn, at
+least `LEAST_GAP` noises of the flow, so that it determines them; from a third on it may confirm a
+prior."""
+LEAST_SIGMA, UNCONFIRMED = 0.12, RELIEF * EXPLAINED**0.5
+"""Standard deviation of log depth of a prior: the least, and that of an unconfirmed one, which is
+that of one that the flow hardly confirms in a usual scene."""
 COMPARED = 8
 """Least number of superpixels whose flow is compared with a prior."""
 DEEPEST = 50.0
@@ -54,8 +54,6 @@ are shifted over the image vary little within superpixels, too."""
 TRIALS, FARTHEST, NEAREST = 60, 1 / 3, 0.1
 """Shifted maps, every other one mirrored; the largest shift relative to the side, and the least one
 of a map that is not mirrored, relative to the width."""
-WITHIN = 0.5
-"""Largest share of a map's variance within superpixels: that of independent pixels is nearly 1."""
 LEAST = 3.0
 """Standard deviations by which a right map follows superpixels (counted twice) and edges better
 than the shifted ones. Where no flow confirms them right maps have 3.2 and more, maps of other
@@ -85,7 +83,7 @@ class PriorEvidence:
     margin: float = np.nan
 
     def __str__(self) -> str:
-        by_flow = f"it differs by {self.ratio:.0%} of the relief by flow, limit {CONFIRMED:.0%}"
+        by_flow = f"it explains {self.explained:.0%} of the relief by flow, limit {EXPLAINED:.0%}"
         by_edges = f"it follows edges by {self.margin:.1f} deviations from chance, limit {LEAST:g}"
         why = by_flow if np.isnan(self.margin) else by_edges
         if not self.used:
@@ -96,12 +94,17 @@ class PriorEvidence:
     __repr__ = __str__
 
     @property
+    def explained(self) -> float:
+        """Share of the variance of log depth by the flow that the prior explains."""
+        return max(1 - self.ratio**2, 0.0) if np.isfinite(self.ratio) else np.nan
+
+    @property
     def confirmed(self) -> bool:
         """Whether the flow confirms the prior.
 
         Where it does not determine depth, that has to make the prior surer.
         """
-        return self.ratio <= CONFIRMED and (self.determined or self.sigma < UNCONFIRMED)
+        return self.explained >= EXPLAINED and (self.determined or self.sigma < UNCONFIRMED)
 
     @property
     def used(self) -> bool:
@@ -150,11 +153,6 @@ class Seen(NamedTuple):
         floor = min(self.start.noise, float(np.median(self.start.error[at])))
         return self.motion(at, np.ones(len(at)))[0] - floor
 
-    @property
-    def tells(self) -> float:
-        """Pixels of relief that determine the depth of a component."""
-        return max(TELLS_PX, TELLS * self.start.noise)
-
     def settled(self, soup: Soup, c: int, prior: Float, sigma: float) -> tuple[Soup, Mask]:
         """Soup with planes and motion of a rigid component by its flow, near a prior's depths.
 
@@ -178,6 +176,11 @@ class Seen(NamedTuple):
         slope = np.where(strong[:, None], planes.slope[:, 0], 0.0)
         by_flow = views.soup(np.where(strong, mu, 1.0), slope, best.R, best.t)
         return soup.taking(by_flow, mask), strong
+
+
+def least_gap(noise: float) -> float:
+    """Pixels of relief that determine the depth of a component, by the noise of the flow."""
+    return max(LEAST_GAP_PX, LEAST_GAP * noise)
 
 
 def without_gaps(pair: Pair, seg: Segmentation) -> tuple[Float, Mask, Float]:
@@ -216,11 +219,9 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
     value, with_value, whole = without_gaps(pair, flow.seg)
     anchor, relief = flow.views.anchor, seen.relief(SCENE)
     known = with_value & seen.usable & (start.component == SCENE)
-    determined, tells = (
-        relief > seen.tells,
-        relief > seen.tells / 3 and known.sum() >= COMPARED,
-    )
-    sure = known & ~start.borrowed & (PRECISE * flow.views.parallax(start.soup) > start.noise)
+    determined = relief > least_gap(start.noise)
+    tells = relief > least_gap(start.noise) / 3 and known.sum() >= COMPARED
+    sure = known & ~start.borrowed
     if tells and sure.sum() >= COMPARED:
         far = ranks(start.soup.depth_at(anchor)[sure]), ranks(value[sure])
     else:
@@ -305,7 +306,7 @@ def edge_margin(values: Float, image: Image) -> float:
     chance = np.array(trials)
     unshifted = np.array(scores(0, 0.0, 0.0))
     better = (unshifted - chance.mean(axis=0)) / np.maximum(chance.std(axis=0), 1e-12)
-    return float(better @ [-2.0, 1.0]) if unshifted[0] <= WITHIN else -np.inf
+    return float(better @ [-2.0, 1.0]) if unshifted[0] <= 1 - EXPLAINED else -np.inf
 
 
 def _gradient(values: Float) -> Float:

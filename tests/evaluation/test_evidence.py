@@ -7,7 +7,7 @@ import pytest
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair
-from soup_nlp.evaluation.evidence import LEAST_GAP_PX, Evidence, evidence
+from soup_nlp.evaluation.evidence import Evidence, evidence
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
@@ -19,12 +19,14 @@ from soup_nlp.report.summary import certainty
 from soup_nlp.start.bending import ANY_TURN, PLAIN_TURN, fit_robustly, turned
 from soup_nlp.start.camera_error import (
     KINDS,
+    CameraError,
     better_camera,
     camera_errors,
     corrected,
     likeliest,
 )
 from soup_nlp.start.epipolar import Matches
+from soup_nlp.start.prior_evidence import LEAST_GAP_PX
 
 NOISE = 0.05
 
@@ -174,6 +176,12 @@ def test_a_right_camera_is_believed(seed):
     found = camera_errors(matches(seed))
     assert likeliest(found) is None
     assert [error.size for error in found.values()] == [0.0] * len(KINDS)
+
+
+def test_an_error_counts_unless_the_flow_excludes_it():
+    open_to_it, excluded = (CameraError(0.0, 0.8, 1.0, odds).size for odds in (-1.1, -3.1))
+    assert open_to_it == pytest.approx(0.5, abs=0.01)
+    assert excluded == 0.0
 
 
 def test_a_better_camera_has_square_pixels():

@@ -25,7 +25,7 @@ from soup_nlp.report.summary import certainty, summary
 from soup_nlp.start import prior_evidence
 from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
-from soup_nlp.start.prior_evidence import CONFIRMED, LEAST, edge_margin, judged
+from soup_nlp.start.prior_evidence import EXPLAINED, LEAST, edge_margin, judged
 from soup_nlp.start.propose import Start, propose
 
 WAVE = np.sin(np.mgrid[0:240, 0:320] / 40.0).prod(axis=0)
@@ -68,7 +68,7 @@ def test_a_confirmed_prior_gives_a_swinging_object_its_scale(swing):
     before = np.abs(swing.error(swing.start)).mean()
     start, given = swing.by(swing.depth * np.exp(0.1 * WAVE))
     assert given.evidence.kind == "relative"
-    assert given.evidence.ratio < CONFIRMED
+    assert given.evidence.explained > EXPLAINED
     assert np.abs(swing.error(start)).mean() < 0.5 * before
     assert TIES.index("given depth") in start.tie
 
@@ -134,7 +134,8 @@ def test_a_prior_scales_objects_beside_a_determined_background():
     seg = road.seg
     start, given = road.by(road.depth * np.exp(0.4 * WAVE))
     assert given.evidence.determined
-    assert 0.1 < given.evidence.ratio < CONFIRMED
+    assert given.evidence.ratio > 0.1
+    assert given.evidence.explained > EXPLAINED
     main = start.component == np.bincount(start.component).argmax()
     firm = main & ~given.from_prior
     assert (main & given.from_prior).any()
