@@ -140,9 +140,7 @@ def test_one_rigid_motion_is_compared_on_its_own_pixels():
     metrics |= {"rigid": {"mre": 0.025, "coverage": 0.6}, "solution_rigid": {"mre": 0.02}}
     assert "beats every baseline on 1 of 1" in text_of(row)
     metrics["solution_rigid"]["mre"] = 0.026
-    text = text_of(row)
-    assert "beats every baseline on 0 of 1" in text
-    assert "| p, dis | rigid | 0.0250 | 0.0260 | 0.6000 |" in text
+    assert "beats every baseline on 0 of 1" in text_of(row)
     assert set(BASELINES) <= set(METHODS)
 
 
