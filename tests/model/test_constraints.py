@@ -313,7 +313,9 @@ def test_the_raw_answer_keeps_every_constraint(gauge, name, ratio):
     np.testing.assert_allclose(kept.n, soup.n, atol=RAW)
 
 
-@pytest.mark.parametrize("gauge", GAUGES)
+@pytest.mark.parametrize(
+    "gauge", ["unit-offset", pytest.param("unit-translation", marks=pytest.mark.slow)]
+)
 def test_so_it_does_with_slack_variables(gauge):
     _, layout, x = smooth_answer("slanted", gauge, 5.0)
     _, data = world("slanted", "pixels", False)

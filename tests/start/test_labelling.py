@@ -41,7 +41,13 @@ def turned(m: Motion, degrees: float, axis: int) -> Motion:
     return Motion(R @ m.R, t / np.linalg.norm(t))
 
 
-@pytest.mark.parametrize("given", ["none", "room", "three of the wedge"])
+@pytest.mark.parametrize(
+    "given",
+    [
+        "three of the wedge",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("none", "room")),
+    ],
+)
 def test_every_region_gets_one_motion(world, given):
     _, flow, component, (room, wedge) = world
     several = [turned(wedge, 0.4, 0), turned(wedge, -0.4, 1), turned(wedge, 0.4, 2)]
