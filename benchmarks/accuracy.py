@@ -46,6 +46,8 @@ SIGMA_COLUMNS = {
     "guess": "guess",
 }
 """Titles of the columns on sigma."""
+SIGMA_BY_PAIR = ("NLL", "within 1", "within 2", "sure and wrong", "AUSE", "guess")
+"""Those that the table of all pairs shows."""
 ABOUT_ERRORS = (
     "Means over the pairs. Seen: superpixels with usable flow (mean confidence above 0.5); moving:"
     " pixels that move by themselves, where a mask or the true motion is known."
@@ -90,8 +92,8 @@ def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = F
         blocks += ["## By half", ABOUT_HALVES, _halves(scored)]
         blocks += ["## By family", ABOUT_ERRORS, _by_family(scored)]
         blocks += ["## Sigma", ABOUT_SIGMA]
-        by_pair = pd.DataFrame({t: numbers(by_pair, c) for c, t in SIGMA_COLUMNS.items()})
-        blocks.append(markdown(by_pair.dropna(axis=1, how="all")))
+        sigma = {t: numbers(by_pair, c) for c, t in SIGMA_COLUMNS.items() if t in SIGMA_BY_PAIR}
+        blocks.append(markdown(pd.DataFrame(sigma).dropna(axis=1, how="all")))
         if picture:
             blocks.append(f"![Sparsification by sigma, and its reliability]({name}.png)")
     return page_text(blocks, frame)
@@ -110,8 +112,9 @@ def best(frame: pd.DataFrame) -> pd.Series:
 
 
 def _by_pair(frame: pd.DataFrame) -> str:
-    """Table of family, MRE of every method, and time."""
-    table = pd.DataFrame({m: metric(frame, m) for m in METHODS}).dropna(axis=1, how="all")
+    """Table of family, MRE of every method but the filled rigid depth, and time."""
+    shown = [m for m in METHODS if m != "rigid_filled"]
+    table = pd.DataFrame({m: metric(frame, m) for m in shown}).dropna(axis=1, how="all")
     table.insert(0, "family", frame["family"])
     table["CPU s"] = frame["cpu_seconds"]
     return markdown(table, dict.fromkeys(table, ".4f") | {"CPU s": ".0f"})
