@@ -72,6 +72,11 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+def called(node: ast.expr) -> str:
+    """The last part of a dotted name; "" for any other expression."""
+    return getattr(node, "attr", getattr(node, "id", ""))
+
+
 def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[str, bool]]:
     """Absolute names that a module imports, also inside functions and by `import_module`.
 
@@ -80,11 +85,11 @@ def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[str,
     left = [(tree, False)]
     while left:
         node, typed = left.pop()
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+        if isinstance(node, ast.If) and called(node.test) == "TYPE_CHECKING":
             left += [(line, True) for line in node.body] + [(line, typed) for line in node.orelse]
             continue
         left += [(inner, typed) for inner in ast.iter_child_nodes(node)]
-        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+        if isinstance(node, ast.Call) and called(node.func) == "import_module":
             yield from ((a.value, typed) for a in node.args if isinstance(a, ast.Constant))
         elif isinstance(node, ast.Import):
             yield from ((a.name, typed) for a in node.names)

@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import cv2
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from pydantic import Field
@@ -133,27 +131,27 @@ NOTEBOOKS = ROOT / "docs/notebooks"
 
 
 @pytest.fixture
-def no_windows():
+def pyplot():
     """Matplotlib draws into memory; figures are closed afterwards."""
-    backend = matplotlib.get_backend()
-    matplotlib.use("Agg")
-    yield
+    import matplotlib.pyplot as plt  # takes a second, which fast tests need not wait for
+
+    backend = plt.get_backend()
+    plt.switch_backend("Agg")
+    yield plt
     plt.close("all")
-    matplotlib.use(backend)
+    plt.switch_backend(backend)
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("no_windows")
-def test_a_pair_becomes_pictures():
+def test_a_pair_becomes_pictures(pyplot):
     names = runpy.run_path(str(NOTEBOOKS / "pair_to_pictures.py"))
     assert names["run"].solution.residuals["so3"] < 1e-8
     assert names["score"].mre < 0.15
-    assert len(plt.get_fignums()) == 1
+    assert len(pyplot.get_fignums()) == 1
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("no_windows")
-def test_a_file_becomes_depth_by_another_solver(monkeypatch):
+def test_a_file_becomes_depth_by_another_solver(pyplot, monkeypatch):
     # POUNCE need not be here; CasADi's Ipopt is
     which = shutil.which
 
@@ -165,4 +163,4 @@ def test_a_file_becomes_depth_by_another_solver(monkeypatch):
     result = names["result"]
     assert check_folder(result).ok
     assert (result / "depth_ref.png").stat().st_size > 0
-    assert len(plt.get_fignums()) == 1
+    assert len(pyplot.get_fignums()) == 1
