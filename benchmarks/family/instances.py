@@ -21,7 +21,7 @@ from soup_nlp.export.artefact import CHOICES, form_label, parse_formulation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
-from soup_nlp.model.formulation import Coordinates, Formulation
+from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_tangent_nlp, exact_chart
@@ -107,7 +107,6 @@ def select(
     scenes: Sequence[str],
     forms: Sequence[str],
     starts: Sequence[str] = STARTS,
-    coordinates: Coordinates = "matrix",
 ) -> list[Instance]:
     """Instances of sizes, scenes, formulations and starts.
 
@@ -126,7 +125,7 @@ def select(
             )
     labels = {}
     for form in forms:
-        words = dict(zip(CHOICES, STANDARD.split("/"))) | parse_formulation(form, coordinates)
+        words = dict(zip(CHOICES, STANDARD.split("/"))) | parse_formulation(form)
         labels["/".join([words.pop("coordinates", words["gauge"]), words["norm"]])] = form
     return [
         Instance(scene, form, size, start)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from typing_extensions import TypedDict
 
 from benchmarks.family.frozen import RECORDS, load_frozen
 from benchmarks.family.instances import VERSION, Instance, build_instance, case_of, parse_name
@@ -182,33 +181,13 @@ def check_sol(path: Path) -> tuple[str, bool]:
     return text, r.optimal
 
 
-class Objective(TypedDict):
-    """A point of an instance."""
-
-    objective: float
-
-
-class Indexed(TypedDict):
-    """An instance, as it is read back."""
-
-    name: str
-    best_known: Objective
-
-
-class Index(TypedDict):
-    """Entries of the index that are read back."""
-
-    instances: list[Indexed]
-
-
 def family_tasks(folder: Path) -> Iterator[Labelled]:
     """The tasks of all instances in a folder, for `export.compare.compare`.
 
     Raises:
         DataError: the index cannot be read.
     """
-    entries = read_json(folder / INDEX, "index of the family", Index)["instances"]
-    for entry in entries:
+    for entry in read_json(folder / INDEX, "index of the family", dict[str, Any])["instances"]:
         instance = parse_name(entry["name"])
         label = {
             "problem": f"{instance.scene} {instance.start}",
