@@ -1,10 +1,9 @@
 """Names and words of a camera file: JSON, YAML, INI, lines of names and numbers, NumPy arrays.
 
 Nothing is interpreted here: a word is a number only for `camera_files`, and a name that occurs
-twice stays twice.
+twice stays twice. In trees a mapping is a tuple of its pairs.
 """
 
-import contextlib
 import json
 import re
 from collections.abc import Iterator
@@ -16,8 +15,8 @@ from soup_nlp.data.formats.map_files import npy_array, read_npz
 from soup_nlp.errors import DataError
 from soup_nlp.storage.files import MOST_TEXT, PathLike, parse_yaml, read_bytes
 
-Leaf: TypeAlias = tuple[tuple[str, ...], list[str]]
-"""Names from the outermost to the innermost, and the words of the value."""
+Named: TypeAlias = list[tuple[str, list[str]]]
+"""Names such as "cam0.intrinsics", empty for none, and the words of their values."""
 
 _SECTION = re.compile(r"\s*\[([^\[\],]*[A-Za-z][^\[\],]*)\]\s*")
 _LIKE_NUMBER = re.compile(r"[-+.\d]|(?:nan|inf)\b", re.IGNORECASE)
@@ -33,119 +32,103 @@ _COLMAP = {
 """Parameters of the models of COLMAP that have OpenCV's distortion."""
 
 
-class _Pairs(list[tuple[str, Any]]):
-    """A mapping that keeps a name that occurs twice."""
-
-
-def leaves(path: PathLike) -> list[Leaf]:
+def named_words(path: PathLike) -> Named:
     """The names and words of a camera file; ValueError for a content of none of these formats."""
     content = read_bytes(path, "camera file", most=MOST_TEXT)
     if content.startswith((b"\x93NUMPY", b"PK")):
-        return list(_flat(_arrays(path, content)))
+        return _arrays(path, content)
     utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     text = content.decode("utf-16" if utf16 else "utf-8-sig")
-    if "\0" in text:
-        raise ValueError("binary content")
-    if text.lstrip().startswith("<"):
-        raise ValueError("XML")
+    if "\0" in text or text.lstrip().startswith("<"):
+        raise ValueError("XML" if text.lstrip().startswith("<") else "binary content")
     brackets = text.lstrip().startswith(("{", "[")) and not _SECTION.match(text)
     try:
         tree = _json(text) if brackets else _yaml(text)
-        return list(_flat(tree) if isinstance(tree, list) else _lines(text))
+        return list(_lines(text) if tree is None else _leaves(tree))
     except RecursionError:
         raise ValueError("brackets are nested too deeply") from None
 
 
-def _arrays(path: PathLike, content: bytes) -> Any:
+def _arrays(path: PathLike, content: bytes) -> Named:
     """The array of a .npy file, or the arrays of a .npz file by name."""
     try:
         one = content.startswith(b"\x93")
-        stored = {"": npy_array(content, path, "")} if one else read_npz(path, "")
+        arrays = {"": npy_array(content, path, "")} if one else read_npz(path, "")
     except DataError as error:
         raise ValueError(f"a NumPy file that{error.what}: {error.found}") from None
-    small = {name: values for name, values in stored.items() if values.size < 1000}
-    tree = _Pairs((name, [repr(float(x)) for x in a.ravel()]) for name, a in small.items())
-    return tree[0][1] if one and tree else tree
+    return [(name, [repr(float(x)) for x in a.flat]) for name, a in arrays.items() if a.size < 1000]
 
 
 def _json(text: str) -> Any:
     """The tree of a JSON text, or of YAML in brackets."""
     try:
         return json.loads(
-            text, object_pairs_hook=_Pairs, parse_float=str, parse_int=str, parse_constant=str
+            text, object_pairs_hook=tuple, parse_float=str, parse_int=str, parse_constant=str
         )
     except ValueError as error:
         tree = _yaml(text)
-        if not isinstance(tree, list):
+        if tree is None:
             raise ValueError(f"damaged JSON ({error})") from None
         return tree
 
 
 def _yaml(text: str) -> Any:
-    """The tree of a YAML text with all values as written; None for other text."""
+    """The tree of a YAML text, a mapping or a list; None for other text."""
     trees: list[Any] = []
     # OpenCV's header and tag are no YAML, and ROS prints a line behind every message
     text = text.replace("!!opencv-matrix", "")
-    parts = re.split(r"^(?:%YAML.*|---|\.\.\.)\s*$", text, flags=re.MULTILINE)
     try:
-        for part in parts:
+        for part in re.split(r"^(?:%YAML.*|---|\.\.\.)\s*$", text, flags=re.MULTILINE):
             parse_yaml(part, see=lambda node: trees.append(_tree(node)))
     except ValueError:
         return None
-    if trees and all(isinstance(tree, _Pairs) for tree in trees):
-        return _Pairs(pair for tree in trees for pair in tree)
-    return trees[0] if len(trees) == 1 else None
+    if trees and all(isinstance(tree, tuple) for tree in trees):
+        return sum(trees, ())
+    return trees[0] if len(trees) == 1 and isinstance(trees[0], list) else None
 
 
 def _tree(node: yaml.Node) -> Any:
+    """All values as they are written."""
     if isinstance(node, yaml.MappingNode):
-        return _Pairs((str(key.value), _tree(value)) for key, value in node.value)
+        return tuple((str(key.value), _tree(value)) for key, value in node.value)
     return [_tree(item) for item in node.value] if isinstance(node.value, list) else node.value
 
 
-def _flat(tree: Any, path: tuple[str, ...] = ()) -> Iterator[Leaf]:
-    """The leaves of a tree; a list without names inside is one leaf."""
-    if isinstance(tree, _Pairs):
-        # OpenCV and ROS have rows, cols and data
-        matrix = {"rows", "data"} <= {name for name, _ in tree}
-        for name, value in tree:
-            if not matrix:
-                yield from _flat(value, (*path, *name.split(".")))
-            elif name == "data":
-                yield path, list(_split(str(value)))
-    elif isinstance(tree, list) and _has_names(tree):
-        for number, value in enumerate(tree):
-            yield from _flat(value, (*path, str(number)))
-    else:
-        yield path, list(_split(str(tree)))
+def _leaves(tree: Any, name: str = "") -> Iterator[tuple[str, list[str]]]:
+    """The values of a tree; a list without names inside is one."""
+    if isinstance(tree, list) and any(isinstance(item, tuple) for item in tree):
+        tree = tuple((str(k), item) for k, item in enumerate(tree))
+    if not isinstance(tree, tuple):
+        yield name, words_of(str(tree))
+        return
+    # OpenCV and ROS have rows, cols and data
+    matrix = {"rows", "data"} <= {key for key, _ in tree}
+    for key, value in tree:
+        if not matrix:
+            yield from _leaves(value, f"{name}.{key}".lstrip("."))
+        elif key == "data":
+            yield name, words_of(str(value))
 
 
-def _has_names(tree: list[Any]) -> bool:
-    return any(
-        isinstance(item, _Pairs) or (isinstance(item, list) and _has_names(item)) for item in tree
-    )
-
-
-def _split(text: str) -> Iterator[str]:
+def words_of(text: str) -> list[str]:
     """Words between blanks, brackets, quotes and commas, which may also be decimal ones."""
-    for chunk in re.split(r"[\s;\[\](){}\"']+", text):
-        decimal = re.fullmatch(r"[-+]?\d+,\d+,?", chunk)
-        yield from (word for word in ([chunk] if decimal else chunk.split(",")) if word)
+    text = re.sub(r"[;\[\](){}\"']", " ", text)
+    return re.findall(r"(?<!\S)[-+]?\d+,\d+,?(?!\S)|[^\s,]+", text)
 
 
-def _lines(text: str) -> Iterator[Leaf]:
-    """Leaves of lines such as `fx: 500`, `fx 500 fy 500`, names above their numbers, numbers."""
+def _lines(text: str) -> Iterator[tuple[str, list[str]]]:
+    """Values of lines such as `fx: 500`, `fx 500 fy 500`, names above their numbers, numbers."""
     found: list[tuple[str, list[str], list[str]]] = [("", [], [])]
     section = ""
     for line in text.splitlines():
         line = re.sub(r"(?:#|//|%).*", "", line).strip()
         if head := _SECTION.fullmatch(line):
-            section = head.group(1)
+            section = f"{head.group(1)}."
             found.append((section, [], []))
         elif row := _COLMAP_ROW.fullmatch(line):
-            yield from _colmap(*row.groups())
+            yield from _colmap(row[1], row[2], words_of(row[3]))
         else:
-            words = list(_split(re.sub(r"[:=]", " ", line)))
+            words = words_of(re.sub(r"[:=]", " ", line))
             last = max((k for k, word in enumerate(words) if _LIKE_NUMBER.match(word)), default=-1)
             for k, word in enumerate(words):
                 _, names, values = found[-1]
@@ -157,22 +140,17 @@ def _lines(text: str) -> Iterator[Leaf]:
                 else:
                     names.append(word)
     for section, names, values in found:
-        path = (section,) if section else ()
         if len(names) > 1 and len(names) == len(values):
-            yield from (((*path, name), [value]) for name, value in zip(names, values))
+            yield from ((section + name, [value]) for name, value in zip(names, values))
         elif names or values:
-            yield (*path, *"_".join(names).split(".")) if names else path, values
+            yield (section + "_".join(names)).rstrip("."), values
 
 
-def _colmap(camera: str, model: str, values: str) -> Iterator[Leaf]:
+def _colmap(camera: str, model: str, words: list[str]) -> Iterator[tuple[str, list[str]]]:
     """A row of cameras.txt; the centre of COLMAP's first pixel is (0.5, 0.5), here (0, 0)."""
-    path, words = (f"camera {camera}",), list(_split(values))
-    yield (*path, "camera_model"), [model]
     names = _COLMAP.get(model, "").split()
     if names and len(words) != len(names):
         raise ValueError(f"{len(words)} parameters of a camera {model} of COLMAP, not {len(names)}")
+    yield f"camera {camera}.camera_model", [model]
     for name, word in zip(names, words):
-        if name[0] == "c":
-            with contextlib.suppress(ValueError):
-                word = repr(float(word) - 0.5)
-        yield (*path, name), [word]
+        yield f"camera {camera}.{name}", [repr(float(word) - 0.5) if name[0] == "c" else word]

@@ -1,8 +1,7 @@
 """Intrinsics of pictures: estimated where no file gives them, and checked for plausibility."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from PIL.ExifTags import Base
@@ -20,10 +19,6 @@ NARROWEST, WIDEST = 10.0, 150.0
 """Plausible fields of view along the longer side, degrees."""
 
 _LONGER_35 = 36.0  # longer side of a frame of 35 mm film, mm
-_UNITS = {2: 25.4, 3: 10.0}  # millimetres in EXIF's units of length: inches and centimetres
-_SENSORS = (13.2, 17.3, 18.7, 22.3, 23.5, 28.4, 36.0, 43.8, 53.7)  # widths of large sensors, mm
-_SMALL = (2.5, 9.5)  # range in which small sensors of any width exist, mm
-_LONGEST_OF_SMALL = 14.0  # focal length that a lens of a small sensor rarely exceeds, mm
 
 
 def estimated_cameras(
@@ -39,7 +34,7 @@ def estimated_cameras(
     Warns:
         DataWarning: the origin of a focal length without `fov`; one that is implausible.
     """
-    exif_focals = [exif_focal(path, image) for path, image in zip(paths, images, strict=True)]
+    exif_focals = [exif_focal(path) for path in paths]
     first_exif = next((focal for focal in exif_focals if focal), None)
     relative = [focal or first_exif or GUESS for focal in exif_focals]
     sizes = [(image.shape[1], image.shape[0]) for image in images]
@@ -77,44 +72,20 @@ def _degrees(focal: float) -> float:
     return 2 * math.degrees(math.atan(0.5 / focal))
 
 
-def exif_focal(path: PathLike | None, image: Image) -> float | None:
-    """Plausible focal length of EXIF relative to the longer side of a picture; None without."""
-    tags = {} if path is None else exif_tags(path)
-    candidates = [_number(tags, Base.FocalLengthIn35mmFilm) / _LONGER_35, _by_sensor(tags, image)]
-    focals = [focal for focal in candidates if focal > 0]
-    for focal in focals:
-        if NARROWEST <= _degrees(focal) <= WIDEST:
-            return focal
-    if focals:
-        side = f"{focals[0]:.3g} times the longer side ({_degrees(focals[0]):.1f} degrees of view)"
-        warn(path, f"the focal length of EXIF is ignored, since {side} is implausible")
-    return None
-
-
-def _by_sensor(tags: Mapping[int, Any], image: Image) -> float:
-    """Focal length over the width of the sensor; 0 if unknown, as of a cropped or reduced picture.
-
-    Where a program reduced the size in EXIF, but not the resolution, no existing sensor has it.
-    """
-    short, long = sorted(image.shape[:2])
-    low, high = sorted(_number(tags, x) for x in (Base.ExifImageWidth, Base.ExifImageHeight))
-    length, per_unit = (_number(tags, x) for x in (Base.FocalLength, Base.FocalPlaneXResolution))
-    if per_unit == 0 or (low and abs(high * short / (low * long) - 1) > 0.02):
-        return 0.0
-    unit = _UNITS.get(int(_number(tags, Base.FocalPlaneResolutionUnit)), 25.4)
-    sensor = (high or long) / per_unit * unit
-    built = any(abs(sensor / width - 1) < 0.05 for width in _SENSORS)
-    small = _SMALL[0] < sensor < _SMALL[1] and length <= _LONGEST_OF_SMALL
-    return length / sensor if built or small else 0.0
-
-
-def _number(tags: Mapping[int, Any], tag: int) -> float:
-    """Value of a tag; 0 if it is no positive number."""
+def exif_focal(path: PathLike | None) -> float | None:
+    """Focal length of EXIF relative to the longer side of a picture; None if not plausible."""
     try:
-        value = float(tags.get(tag, 0))
+        tag = ({} if path is None else exif_tags(path)).get(Base.FocalLengthIn35mmFilm, 0)
+        focal = float(tag) / _LONGER_35
     except Exception:  # a malformed tag may raise any type
-        return 0.0
-    return value if math.isfinite(value) and value > 0 else 0.0
+        return None
+    if not (math.isfinite(focal) and focal > 0):
+        return None
+    if NARROWEST <= _degrees(focal) <= WIDEST:
+        return focal
+    side = f"{focal:.3g} times the longer side ({_degrees(focal):.1f} degrees of view)"
+    warn(path, f"the focal length of EXIF is ignored, since {side} is implausible")
+    return None
 
 
 # --- plausibility ---------------------------------------------------------------------------------
@@ -193,25 +164,22 @@ def _explanation(K: Float, size: Sequence[int]) -> tuple[str, Float]:
     """The likely cause of implausible intrinsics, and intrinsics without it."""
     (fx, fy), (cx, cy), (height, width) = K[[0, 1], [0, 1]], K[:2, 2], size
     middle = (width - 1) / 2, (height - 1) / 2
-    candidates = {
-        "the order is fx cx fy cy": intrinsics(fx, cx, fy, cy),
-        "cx and cy are exchanged": intrinsics(fx, fy, cy, cx),
-    }
     # scale from the image that has its middle at the principal point to this image
     across, down = width / max(2 * cx + 1, 1e-9), height / max(2 * cy + 1, 1e-9)
-    other = f"intrinsics of an image of {2 * cx + 1:.0f} x {2 * cy + 1:.0f}"
+    resized = intrinsics(fx * across, fy * down, *middle)
     if _ratio(across, down) < ALIKE:
         # square pixels stay square, and images are mostly halved or doubled: the principal point
         # is not exactly in the middle
         scale = math.sqrt(across * down)
         whole = float(round(max(scale, 1 / scale))) ** (1 if scale > 1 else -1)
         scale = whole if _ratio(whole, scale) < ALIKE else scale
-        candidates[other] = intrinsics(
-            fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5
-        )
-    elif _ratio(fx * across, fy * down) < ALIKE:
-        # the focal lengths show that the sizes do not keep their proportions
-        candidates[other] = intrinsics(fx * across, fy * down, *middle)
+        centre = (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5
+        resized = intrinsics(fx * scale, fy * scale, *centre)
+    candidates = {
+        "the order is fx cx fy cy": intrinsics(fx, cx, fy, cy),
+        "cx and cy are exchanged": intrinsics(fx, fy, cy, cx),
+        f"intrinsics of an image of {2 * cx + 1:.0f} x {2 * cy + 1:.0f}": resized,
+    }
     for cause, fits in candidates.items():
         near = _off_middle(fits[0, 2], fits[1, 2], size) < 2 * NEAR_MIDDLE
         if near and fits.diagonal().min() > 0 and not _problems(fits, size, False):
