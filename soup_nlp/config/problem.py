@@ -30,7 +30,6 @@ from soup_nlp.schema.section import (
     Whole,
     explain,
     nearest,
-    texts_expected,
 )
 from soup_nlp.solve.solver_options import SolverOptions, refuse_libraries
 from soup_nlp.start.start_options import StartOptions
@@ -294,21 +293,14 @@ def make_problem(
         expect(item, str, "override", "text such as 'solver.max_iter=200'")
     expect(where, str, "where", "a name for messages")
     tree = copy.deepcopy(dict(raw))
-    overridden = {override(tree, item): item for item in overrides}
-    lines = {**(lines or {}), **{keys: f"--set {item}" for keys, item in overridden.items()}}
+    lines = {**(lines or {}), **{override(tree, item): f"--set {item}" for item in overrides}}
     preset = tree.get("preset")
     # the validation refuses an unknown one
     tree = merged(PRESETS.get(preset, {}) if isinstance(preset, str) else {}, tree)
     try:
         return Problem.model_validate(tree)
     except ValidationError as error:
-        # --set input.index=000138 is text, though it looks like a number
-        texts = {keys: item.partition("=")[2].strip() for keys, item in overridden.items()}
-        words = [keys for keys in texts_expected(error, tree) if keys in texts]
-        if not words:
-            raise explain(error, Problem, tree, where, lines) from error
-        more = [f"{'.'.join(keys)}={json.dumps(texts[keys])}" for keys in words]
-        return make_problem(raw, [*overrides, *more], where, lines)
+        raise explain(error, Problem, tree, where, lines) from error
 
 
 USUAL = (

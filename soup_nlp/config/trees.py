@@ -1,6 +1,7 @@
 """Trees of options: read from YAML with the line of every key, merged over presets, overridden.
 
-Numbers and booleans are those of YAML 1.2: 1e-3 and 010 are numbers, `no` is a word.
+Numbers and booleans are those of YAML 1.2: 1e-3 is a number, `no` is a word. A number that starts
+with further zeros, such as 000138, is text: it names something.
 """
 
 import copy
@@ -13,38 +14,23 @@ import yaml
 
 from soup_nlp.errors import ConfigError
 from soup_nlp.schema.section import Keys
-from soup_nlp.storage.files import parse_yaml
+from soup_nlp.storage.files import compose_yaml
 
 Tree = dict[str, Any]
 
-
-class _Loader(yaml.SafeLoader):
-    """Reads numbers and booleans of version 1.2."""
+_WORDS = {"": None, "~": None, "null": None, "true": True, "false": False}
+_INT = re.compile(r"[-+]?(0|[1-9]\d{0,99})")
+_FLOAT = re.compile(
+    r"[-+]?(\.\d+|(0|[1-9]\d*)(\.\d*)?)(e[-+]?\d+)?|[-+]?\.inf|\.nan", re.IGNORECASE
+)
 
 
 class Dumper(yaml.SafeDumper):
     """Quotes strings that YAML 1.1 or 1.2 would read as another type."""
 
 
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, rule) for tag, rule in rules if tag.split(":")[-1] in ("null", "merge")]
-    for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_FLOAT = r"[-+]?(\.\d+|\d+(\.\d*)?)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
-for _tag, _rule, _first in (
-    ("bool", r"true|false|True|False|TRUE|FALSE", "tTfF"),
-    ("int", r"[-+]?\d+", "-+0123456789"),
-    ("float", _FLOAT, "-+.0123456789"),
-):
-    for _class in (_Loader, Dumper):
-        _class.add_implicit_resolver(
-            f"tag:yaml.org,2002:{_tag}", re.compile(rf"(?:{_rule})\Z"), list(_first)
-        )
-# 010 is ten, not eight
-_Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
-_Loader.add_constructor(
-    "tag:yaml.org,2002:float",
-    lambda loader, node: float(node.value.lower().replace(".inf", "inf").replace(".nan", "nan")),
+Dumper.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(rf"(?i:{_FLOAT.pattern})\Z"), list("-+.0123456789")
 )
 
 
@@ -52,27 +38,42 @@ def parse(text: str, source: str) -> tuple[Any, dict[Keys, str]]:
     """The content of a YAML text, and the line of every key."""
     lines: dict[Keys, str] = {}
     try:
-        return parse_yaml(text, _Loader, lambda node: _locate(node, (), lines, source)), lines
+        node = compose_yaml(text)
     except ValueError as error:
         mark = getattr(error.__cause__, "problem_mark", None)
         raise ConfigError(
-            "text is not YAML",
+            "text is not YAML of a problem file",
             where=f"{source}, line {mark.line + 1}" if mark else source,
             found=getattr(error.__cause__, "problem", None) or error,
         ) from error
+    return None if node is None else _value(node, (), lines, source), lines
 
 
-def _locate(node: yaml.Node, path: Keys, lines: dict[Keys, str], source: str) -> None:
-    """Fill in the line of every key; a key that is given twice is an error."""
-    if not isinstance(node, yaml.MappingNode):
-        return
-    for key, value in node.value:
-        here = (*path, str(key.value))
-        line = f"line {key.start_mark.line + 1}"
-        if here in lines:
-            raise ConfigError("key is given twice", where=f"{source}, {line}", found=".".join(here))
-        lines[here] = line
-        _locate(value, here, lines, source)
+def _value(node: yaml.Node, path: Keys, lines: dict[Keys, str], source: str) -> Any:
+    """The value of a node; fills in the line of every key, which may not be given twice."""
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(item, path, lines, source) for item in node.value]
+    if isinstance(node, yaml.MappingNode):
+        out = {}
+        for key, value in node.value:
+            here = (*path, str(key.value))
+            line = f"line {key.start_mark.line + 1}"
+            if here in lines:
+                where, found = f"{source}, {line}", ".".join(here)
+                raise ConfigError("key is given twice", where=where, found=found)
+            lines[here] = line
+            out[here[-1]] = _value(value, here, lines, source)
+        return out
+    text = str(node.value)
+    if node.style is not None:
+        # in quotes
+        return text
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
+    if _INT.fullmatch(text):
+        return int(text)
+    word = text.lower().replace(".inf", "inf").replace(".nan", "nan")
+    return float(word) if _FLOAT.fullmatch(text) else text
 
 
 PRESET_FILES: Mapping[str, Path] = {"paper": Path(__file__).with_name("paper.yaml")}
@@ -96,18 +97,13 @@ def override(tree: Tree, item: str) -> Keys:
     key, eq, value = item.partition("=")
     path = tuple(key.strip().split("."))
     if not eq or not all(path):
-        raise ConfigError(
-            "override is not key=value", where="--set", found=item, expected="solver.max_iter=200"
-        )
+        what, expected = "override is not key=value", "solver.max_iter=200"
+        raise ConfigError(what, where="--set", found=item, expected=expected)
     node: Any = tree
     for part in path[:-1]:
         node = node.setdefault(part, {})
         if not isinstance(node, dict):
-            raise ConfigError(
-                "override goes below a value",
-                where="--set",
-                found=item,
-                expected=f"{part} is a section",
-            )
+            what, expected = "override goes below a value", f"{part} is a section"
+            raise ConfigError(what, where="--set", found=item, expected=expected)
     node[path[-1]] = parse(value, f"--set {item}")[0]
     return path

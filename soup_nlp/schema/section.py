@@ -67,7 +67,7 @@ def explain(
         return ConfigError("missing key" + suffix, where=where, expected=key, hint=hint)
     hint = nearest(printable(value, 60), [word for item in mistakes for word in _words(item)])
     if kind == "string_type" and isinstance(value, int | float):
-        hint = "write it in quotes, with its leading zeros, which a number loses"
+        hint = "write it in quotes"
     return ConfigError(
         "value does not fit" + suffix,
         where=where,
@@ -75,15 +75,6 @@ def explain(
         expected=", or ".join(dict.fromkeys(map(_expected, mistakes))),
         hint=hint,
     )
-
-
-def texts_expected(error: ValidationError, tree: Mapping[str, Any]) -> list[Keys]:
-    """Keys whose value is a number in place of a text."""
-    kinds: dict[Keys, set[bool]] = {}
-    for item in error.errors():
-        number = item["type"] == "string_type" and isinstance(item["input"], int | float)
-        kinds.setdefault(_keys_of(item["loc"], tree, item["type"]), set()).add(number)
-    return [keys for keys, numbers in kinds.items() if numbers == {True}]
 
 
 def _keys_of(loc: tuple[int | str, ...], tree: Any, kind: str) -> Keys:

@@ -9,7 +9,6 @@ import os
 import stat
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,10 +27,6 @@ MOST_TEXT = 64 << 20
 """Size limit of text files, bytes."""
 MOST_YAML = 1 << 20
 """Size limit of YAML texts, characters."""
-MOST_NODES = 100_000
-"""Limit of the values in a YAML text with expanded aliases."""
-DEEPEST = 64
-"""Limit of nesting in YAML."""
 
 
 def as_path(
@@ -185,48 +180,23 @@ def _printable(value: Any) -> Any:
     return [_printable(item) for item in value] if isinstance(value, list) else value
 
 
-def parse_yaml(
-    text: str,
-    kind: type[yaml.SafeLoader] = yaml.SafeLoader,
-    see: Callable[[yaml.Node], None] = lambda node: None,
-) -> Any:
-    """The value of a YAML text, by a loader; `see` is called with the document before.
+def compose_yaml(text: str) -> yaml.Node | None:
+    """The nodes of a YAML text without aliases and tags; None for an empty one.
 
     Raises:
         ValueError: it is not YAML (its cause is the YAML error), too long, nested too deeply, or
-            has too many values.
+            has an alias, by which a short text may have many values, or a tag.
     """
     if len(text) > MOST_YAML:
         raise ValueError(f"{len(text)} characters, at most {MOST_YAML} are read")
-    seen = count(1)
-
-    def check(node: yaml.Node, level: int) -> None:
-        """Visit every value as often as aliases expand it."""
-        if level > DEEPEST:
-            raise ValueError(f"brackets are nested more than {DEEPEST} deep")
-        if next(seen) > MOST_NODES:
-            raise ValueError(f"more than {MOST_NODES} values")
-        if isinstance(node, yaml.CollectionNode):
-            mapping = isinstance(node, yaml.MappingNode)
-            for item in chain(*node.value) if mapping else node.value:
-                check(item, level + 1)
-
     try:
-        loader = kind(text)
-        try:
-            node = loader.get_single_node()
-            if node is None:
-                return None
-            check(node, 0)
-            see(node)
-            return loader.construct_document(node)
-        finally:
-            loader.dispose()
+        for token in yaml.scan(text) if "*" in text or "!" in text else ():
+            if isinstance(token, yaml.AliasToken | yaml.TagToken):
+                line = token.start_mark.line + 1
+                raise ValueError(f"an alias (*name) or a tag (!name) in line {line}")
+        return yaml.compose(text, yaml.SafeLoader)
     except (yaml.YAMLError, RecursionError) as problem:
         raise ValueError(printable(problem)) from problem
-    except (TypeError, AttributeError, LookupError) as problem:
-        # PyYAML does not check what has a tag: `!!bool 5`, `!!timestamp x`, `!!int [1]`
-        raise ValueError(f"a value does not fit its tag: {printable(problem)}") from problem
 
 
 # --- writing ------------------------------------------------------------------------------------

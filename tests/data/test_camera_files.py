@@ -257,9 +257,9 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "empty file": ("", "is empty"),
     "binary": (b"\x80\x04\x95\x00\x00", "not text"),
     "odd UTF-16": (FOUR.encode("utf-16")[:-1], "not text"),
-    "objects": (npy(np.array([None])), "not text"),
+    "objects": (npy(np.array([None])), "no readable array"),
     "other .npy": (npy(np.ones(3)), "wrong number of values"),
-    "damaged .npy": (npy(K)[:-5], "not text"),
+    "damaged .npy": (npy(K)[:-5], "no readable array"),
     "prose": ("the camera of my phone", "no camera"),
 }
 

@@ -96,16 +96,16 @@ def test_folder_bad_truth(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None
         ({}, "m", "lacks an array"),
         ({"xyz_mm_0": np.zeros((3, 3))}, "m", "wrong shape"),
         ({"xyz_mm_0": np.ones((2, 3))}, "feet", "millimetres"),
-        ({"xyz_mm_0": np.ones((2, 3), complex)}, "m", r"points file, xyz_mm_0\.npy[\s\S]*complex"),
+        ({"xyz_mm_0": np.ones((2, 3), complex)}, "m", r"points.npz, xyz_mm_0[\s\S]*complex"),
     ]:
         np.savez(folder / "points.npz", uv_0=np.zeros((2, 2)), **arrays)
         with raises(match):
             load("folder", folder, unit=unit)
-    with monkeypatch.context() as m, raises("points file is too large"):
+    with monkeypatch.context() as m, raises("at most 32 are read"):
         m.setattr("soup_nlp.data.formats.map_files.MAX_PIXELS", 1)
         load("folder", folder)
     (folder / "points.npz").write_bytes(b"PK no zip")
-    with raises(r"is no \.npz"):
+    with raises("no readable array"):
         load("folder", folder)
     np.save(folder / "depth.npy", np.ones((H, W + 1)))
     (folder / "points.npz").unlink()

@@ -17,7 +17,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.data.formats.camera_files import read_intrinsics, undistorted
 from soup_nlp.data.formats.cameras import check_cameras, estimated_cameras
 from soup_nlp.data.formats.images import read_images, read_mask
-from soup_nlp.data.formats.map_files import read_depth, read_flow, read_npz
+from soup_nlp.data.formats.map_files import read_arrays, read_depth, read_flow
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
@@ -215,7 +215,7 @@ def _refuse_result(folder: Folder) -> None:
 
 def _read_points(path: Path, unit: str) -> Float:
     """(M, 3) sparse truth (u, v, z) from points.npz."""
-    arrays = read_npz(path, "points file")
+    arrays = read_arrays(path, "points file")
     uv, xyz = arrays.get("uv_0", np.empty(0)), arrays.get("xyz_mm_0", np.empty(0))
     if uv.ndim != 2 or uv.shape[1] != 2 or xyz.shape != (len(uv), 3):
         raise DataError(

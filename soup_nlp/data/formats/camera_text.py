@@ -11,9 +11,8 @@ from typing import Any, TypeAlias
 
 import yaml
 
-from soup_nlp.data.formats.map_files import npy_array, read_npz
-from soup_nlp.errors import DataError
-from soup_nlp.storage.files import MOST_TEXT, PathLike, parse_yaml, read_bytes
+from soup_nlp.data.formats.map_files import read_arrays
+from soup_nlp.storage.files import MOST_TEXT, PathLike, compose_yaml, read_bytes
 
 Named: TypeAlias = list[tuple[str, list[str]]]
 """Names such as "cam0.intrinsics", empty for none, and the words of their values."""
@@ -36,7 +35,8 @@ def named_words(path: PathLike) -> Named:
     """The names and words of a camera file; ValueError for a content of none of these formats."""
     content = read_bytes(path, "camera file", most=MOST_TEXT)
     if content.startswith((b"\x93NUMPY", b"PK")):
-        return _arrays(path, content)
+        arrays = read_arrays(path, "camera file")
+        return [(n, [repr(float(x)) for x in a.flat]) for n, a in arrays.items() if a.size < 1000]
     utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     text = content.decode("utf-16" if utf16 else "utf-8-sig")
     if "\0" in text or text.lstrip().startswith("<"):
@@ -47,16 +47,6 @@ def named_words(path: PathLike) -> Named:
         return list(_lines(text) if tree is None else _leaves(tree))
     except RecursionError:
         raise ValueError("brackets are nested too deeply") from None
-
-
-def _arrays(path: PathLike, content: bytes) -> Named:
-    """The array of a .npy file, or the arrays of a .npz file by name."""
-    try:
-        one = content.startswith(b"\x93")
-        arrays = {"": npy_array(content, path, "")} if one else read_npz(path, "")
-    except DataError as error:
-        raise ValueError(f"a NumPy file that{error.what}: {error.found}") from None
-    return [(name, [repr(float(x)) for x in a.flat]) for name, a in arrays.items() if a.size < 1000]
 
 
 def _json(text: str) -> Any:
@@ -74,12 +64,11 @@ def _json(text: str) -> Any:
 
 def _yaml(text: str) -> Any:
     """The tree of a YAML text, a mapping or a list; None for other text."""
-    trees: list[Any] = []
     # OpenCV's header and tag are no YAML, and ROS prints a line behind every message
     text = text.replace("!!opencv-matrix", "")
+    parts = re.split(r"^(?:%YAML.*|---|\.\.\.)\s*$", text, flags=re.MULTILINE)
     try:
-        for part in re.split(r"^(?:%YAML.*|---|\.\.\.)\s*$", text, flags=re.MULTILINE):
-            parse_yaml(part, see=lambda node: trees.append(_tree(node)))
+        trees = [_tree(node) for node in map(compose_yaml, parts) if node is not None]
     except ValueError:
         return None
     if trees and all(isinstance(tree, tuple) for tree in trees):

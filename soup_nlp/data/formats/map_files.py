@@ -70,44 +70,40 @@ def _read_pieh(path: PathLike, what: str, *channels: int) -> FloatMap:
     return _floats(content[8:], (height, width, *channels), "<", path, what)
 
 
-def npy_array(content: bytes, path: PathLike, what: str) -> NDArray[Any]:
-    """One array of real numbers of the content of a .npy file, without pickles."""
-    stream = io.BytesIO(content)
+def read_arrays(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
+    """The arrays of real numbers of a .npz file, by name, or that of a .npy file under ""."""
+    content, most = read_bytes(path, what), 32 * MAX_PIXELS
     try:
-        array = npy.read_array(stream, allow_pickle=False)
-    except Exception as error:  # parsing the header, a Python literal, raises many types
-        raise DataError(
-            f"{what} is not a readable .npy file", where=path, found=str(error)
-        ) from error
-    if array.dtype.kind not in "fiu":
-        raise DataError(
-            f"{what} does not hold numbers",
-            where=path,
-            found=array.dtype,
-            expected="one array of real numbers",
-        )
-    if stream.read(1):
-        raise DataError(f"{what} has bytes left over", where=path)
-    return np.asarray(array)
+        stored = {"": content}
+        if content.startswith(b"PK"):
+            with zipfile.ZipFile(io.BytesIO(content)) as archive:
+                # a small file may be large when unpacked
+                size = sum(entry.file_size for entry in archive.infolist())
+                if size > most:
+                    raise ValueError(f"{size} bytes in it, at most {most} are read")
+                stored = {name: archive.read(name) for name in archive.namelist()}
+        streams = {name.removesuffix(".npy"): io.BytesIO(part) for name, part in stored.items()}
+        arrays = {n: npy.read_array(part, allow_pickle=False) for n, part in streams.items()}
+    except Exception as error:  # parsing a header, a Python literal, raises many types
+        raise DataError(f"{what} holds no readable array", where=path, found=error) from error
+    for name, array in arrays.items():
+        found = array.dtype if array.dtype.kind not in "fiu" else ""
+        if found or streams[name].read(1):
+            raise DataError(
+                f"{what} does not hold numbers" if found else f"{what} has bytes left over",
+                where=f"{path}, {name}" if name else path,
+                found=found or None,
+                expected="arrays of real numbers",
+            )
+    return arrays
 
 
-def read_npz(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
-    """The real-valued arrays of a .npz file, by name."""
-    content, most = io.BytesIO(read_bytes(path, what)), 32 * MAX_PIXELS
-    try:
-        with zipfile.ZipFile(content) as archive:
-            # a small file may be large when unpacked
-            size = sum(entry.file_size for entry in archive.infolist())
-            names = archive.namelist() if size <= most else []
-            parts = {name: archive.read(name) for name in names}
-    except Exception as error:  # zipfile raises many types
-        raise DataError(f"{what} is no .npz", where=path, found=str(error)) from error
-    if size > most:
-        raise DataError(f"{what} is too large", where=path, found=f"{size} bytes", expected=most)
-    return {
-        name.removesuffix(".npy"): npy_array(part, path, f"{what}, {name}")
-        for name, part in parts.items()
-    }
+def _array(path: PathLike, what: str) -> NDArray[Any]:
+    """The array of a .npy file."""
+    arrays = read_arrays(path, what)
+    if "" not in arrays:
+        raise DataError(f"{what} is not one array", where=path, expected="a .npy file")
+    return arrays[""]
 
 
 def _by_suffix(path: PathLike, readers: Mapping[str, Reader], what: str) -> NDArray[Any]:
@@ -183,7 +179,7 @@ def read_flow(path: PathLike) -> Float:
     readers: dict[str, Reader] = {
         ".flo": lambda p: _read_pieh(p, "flow file", 2),
         ".png": lambda p: (_read_flow_png(p, "KITTI flow") - 2.0**15) / 64.0,
-        ".npy": lambda p: npy_array(read_bytes(p, "flow file"), p, "flow file"),
+        ".npy": lambda p: _array(p, "flow file"),
     }
     return _known_flow(_by_suffix(path, readers, "flow"), path)
 
@@ -191,7 +187,7 @@ def read_flow(path: PathLike) -> Float:
 def read_confidence(path: PathLike) -> NDArray[Any]:
     """The confidence of a .npy file, or of a grey image of 8 or 16 bits (black is 0, white 1)."""
     if Path(path).suffix == ".npy":
-        return npy_array(read_bytes(path, "confidence file"), path, "confidence file")
+        return _array(path, "confidence file")
     image = decode(path, "confidence map")
     whole = image.dtype.kind == "u"
     return image / np.iinfo(image.dtype).max if whole else image
@@ -285,7 +281,7 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
 
     readers: dict[str, Reader] = {
         ".dpt": lambda p: _read_pieh(p, "depth file"),
-        ".npy": lambda p: npy_array(read_bytes(p, "depth file"), p, "depth file"),
+        ".npy": lambda p: _array(p, "depth file"),
         ".npz": _one_map,
         ".pfm": read_pfm,
         ".png": by_scale,
@@ -295,7 +291,7 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
 
 def _one_map(path: PathLike) -> NDArray[Any]:
     """The array named depth of a .npz file, or the only one of two axes."""
-    arrays = read_npz(path, "depth file")
+    arrays = read_arrays(path, "depth file")
     maps = {name: a for name, a in arrays.items() if np.squeeze(a).ndim == 2}
     if "depth" not in arrays and len(maps) != 1:
         raise DataError(
