@@ -14,10 +14,7 @@ from typing import Annotated, Any, Literal, Self
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.progress import Progress as Bars
 
-from soup_nlp.config.problem import Problem as ProblemFile
 from soup_nlp.config.problem import shipped_problems
 from soup_nlp.config.trees import PRESETS
 from soup_nlp.data.formats.images import DataWarning
@@ -195,42 +192,33 @@ PACKAGE = "soup_nlp"
 
 
 class SolveLog(logging.Handler):
-    """Lines for the terminal and for log.txt, and progress bars, as a context manager.
+    """Lines for the terminal and for log.txt, and the present iteration, as a context manager.
 
     Attributes:
         lines: All lines, for log.txt.
     """
 
-    def __init__(
-        self, quiet: bool, verbose: bool = False, problem: ProblemFile | None = None
-    ) -> None:
-        """Make the log; `problem` gives the length of the bars, `verbose` prints all lines."""
+    def __init__(self, quiet: bool, verbose: bool = False) -> None:
+        """Make the log; `verbose` prints all lines."""
         super().__init__(logging.INFO)
         self.console = Console(stderr=True, highlight=False)
         self.quiet, self.verbose = quiet, verbose
         self.lines: list[str] = []
-        self._stages = _stages(problem)
         self._detail, self._announced, self._mark = "", set[str](), time.perf_counter()
-        live = self.console.is_terminal and not quiet
-        name, left = TextColumn("{task.description:<13}"), TextColumn("left")
-        remaining, step = TimeRemainingColumn(compact=True), TextColumn("{task.fields[it]}")
-        columns = name, BarColumn(20), TimeElapsedColumn(), left, remaining, step
-        self._bars = Bars(*columns, console=self.console, transient=True, disable=not live)
-        self._task = self._bars.add_task("", total=None, it="")
-        self._step, self._done = "", 0
+        self._now = self.console.status("")
+        self._live = self.console.is_terminal and not quiet
 
     def __enter__(self) -> Self:
         self._logger = logging.getLogger(PACKAGE)
         self._level = self._logger.level
         self._logger.setLevel(logging.INFO)
         self._logger.addHandler(self)
-        self._bars.start()
-        self._begin()
+        if self._live:
+            self._now.start()
         return self
 
     def __exit__(self, *error: object) -> None:
-        if not self._bars.disable:
-            self._bars.stop()
+        self._now.stop()
         self._logger.removeHandler(self)
         self._logger.setLevel(self._level)
 
@@ -255,24 +243,18 @@ class SolveLog(logging.Handler):
             self._print(line)
 
     def stage(self, name: str) -> None:
-        """End a stage: print its time and result, and begin the next one."""
+        """End a stage: print its time and result."""
         now = time.perf_counter()
         self._print(f"{name:<13}{now - self._mark:6.1f} s  {self._detail}".rstrip())
         self._mark, self._detail = now, ""
-        self._stages.pop(name, None)
-        if name != "files":
-            self._begin()
+        if self._live:
+            self._now.update("")
 
     def iteration(self, progress: Progress) -> None:
         """Add an iteration of presolve, Ipopt or TRW-S."""
         self.lines.append(str(progress))
-        if progress.stage != self._step:
-            self._done += bool(self._step)
-            self._step = progress.stage
-        # the number of iterations of a stage is unknown; most take fewer than 15
-        part = progress.iteration / (progress.iteration + 7)
-        words = f"{progress.stage}, iteration {progress.iteration}"
-        self._bars.update(self._task, completed=self._done + part, it=words)
+        if self._live:
+            self._now.update(f"{progress.stage}, iteration {progress.iteration}")
 
     def _warn(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         if issubclass(category, DataWarning):
@@ -293,25 +275,6 @@ class SolveLog(logging.Handler):
         self.lines.append(line)
         os.write(2, f"\n{line}\n".encode())
 
-    def _begin(self) -> None:
-        """Show the bar of the next stage."""
-        name, total = next(iter(self._stages.items()), ("files", None))
-        self._step, self._done = "", 0
-        self._bars.reset(self._task, total=total, description=name, it="")
-
     def _print(self, line: str, even_if_quiet: bool = False) -> None:
         if even_if_quiet or not self.quiet:
             self.console.print(line, markup=False, soft_wrap=True)
-
-
-def _stages(problem: ProblemFile | None) -> dict[str, int | None]:
-    """Stages in their order with the number of steps of their bars; None if unknown."""
-    steps: dict[str, int | None] = dict.fromkeys(("load", "flow", "segmentation", "start"))
-    if problem is not None:
-        refine, solver = problem.refine, problem.solver
-        if not (refine.enabled and refine.from_start):
-            # majorant, Gauss-Newton and exact Hessians, then the constrained NLP
-            steps["nlp"] = (len(solver.presolve_eps) + 4) * solver.presolve + 1
-        if refine.enabled:
-            steps["refine"] = refine.rounds
-    return steps | {"evaluation": None}

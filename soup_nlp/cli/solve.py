@@ -101,7 +101,7 @@ def solve(
     # the expected MRE is that of the problem file without overrides
     limit = None if changes else chosen.expected.mre_at_most
     folder = out or default_folder(chosen.name, chosen.subject)
-    log = options.SolveLog(quiet, verbose, chosen)
+    log = options.SolveLog(quiet, verbose)
     return solve_problem(chosen, folder, log, limit, json_, overwrite)
 
 
@@ -207,7 +207,7 @@ def demo(
     for name, text in PAIRS.items():
         print(f"\n{name}: {text}", flush=True)
         problem = load_problem(name)
-        log, limit = options.SolveLog(quiet, problem=problem), problem.expected.mre_at_most
+        log, limit = options.SolveLog(quiet), problem.expected.mre_at_most
         codes.append(solve_problem(problem, out / name, log, limit, overwrite=overwrite))
     pages = " and ".join(str(out / name / PAGE) for name in PAIRS)
     print(f"\nopen        {pages} in a browser")
