@@ -18,7 +18,7 @@ from soup_nlp.config.problem import (
 )
 from soup_nlp.config.trees import PRESET_FILES
 from soup_nlp.data.scenes.catalogue import LAYOUTS
-from soup_nlp.errors import ConfigError, printable
+from soup_nlp.errors import ConfigError
 from soup_nlp.export.artefact import (
     EXPORT_FILES,
     FORMATS,
@@ -33,7 +33,7 @@ from soup_nlp.export.verify import Limits
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.formats import FORMATS as RESULT_FORMATS
 from soup_nlp.storage.each import Row
-from soup_nlp.storage.files import is_folder, write_text
+from soup_nlp.storage.files import write_text
 from soup_nlp.storage.folders import claim, default_folder, staged
 
 PAGE, ROWS = "README.md", "runs.jsonl"
@@ -65,21 +65,13 @@ def show(
     print(f"{dump_problem(chosen, all_options)}{footer}# hash {chosen.digest()}")
 
 
-def list_(
-    folder: Annotated[Path | None, typer.Argument(help="Folder of other problem files.")] = None,
-) -> None:
-    """Print the problems, scenes and formats of the package, or the problems of a folder."""
-    if folder is not None and not is_folder(folder):
-        raise ConfigError("no such folder", where=folder, hint="soup-nlp list without a folder")
-    files = {str(p): p for p in sorted(folder.glob("*.yaml"))} if folder else shipped_problems()
-    for name, path in files.items():
-        print(f"{printable(name):<14} {description(path)}")
-    if folder is None:
-        print("\nsoup-nlp solve NAME; templates take --set input.root=DIR, folder input.path=DIR")
-        print(f"soup-nlp chain scene:NAME, of {', '.join(LAYOUTS)}")
-        print(f"soup-nlp convert RESULT --to {','.join(RESULT_FORMATS)}")
-    elif not files:
-        print(f"no problem files (*.yaml) in {printable(str(folder))}")
+def list_() -> None:
+    """Print the problems, scenes and formats of the package."""
+    for name, path in shipped_problems().items():
+        print(f"{name:<14} {description(path)}")
+    print("\nsoup-nlp solve NAME; templates take --set input.root=DIR, folder input.path=DIR")
+    print(f"soup-nlp chain scene:NAME, of {', '.join(LAYOUTS)}")
+    print(f"soup-nlp convert RESULT --to {','.join(RESULT_FORMATS)}")
 
 
 def export(

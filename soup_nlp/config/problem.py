@@ -33,7 +33,7 @@ from soup_nlp.schema.section import (
 )
 from soup_nlp.solve.solver_options import SolverOptions, refuse_libraries
 from soup_nlp.start.start_options import StartOptions
-from soup_nlp.storage.files import MOST_YAML, as_path, is_file, is_folder, read_text
+from soup_nlp.storage.files import as_path, is_file, is_folder, read_text
 from soup_nlp.storage.folders import digest_of
 
 LONGEST_NAME = 100
@@ -237,13 +237,8 @@ def load_problem(
 
 
 def description(path: Path) -> str:
-    """The comment in the first line of a problem file."""
-    try:
-        text = read_text(path, "problem file", error=ConfigError, most=MOST_YAML)
-    except ConfigError as error:
-        return f"({error.what})"
-    first = text.partition("\n")[0]
-    return printable(first.removeprefix("#").strip(), 200) if first[:1] == "#" else ""
+    """The comment in the first line of a shipped problem file."""
+    return path.read_text("utf-8").partition("\n")[0].removeprefix("# ")
 
 
 def _find(path: Path) -> tuple[Path, Path]:

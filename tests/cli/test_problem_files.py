@@ -259,12 +259,3 @@ def test_problems_are_found_by_name_anywhere(tmp_path, monkeypatch, capsys):
     (tmp_path / "street").write_text("input: {kind: motorcycle}\n")
     # a file of that name is meant first
     assert load_problem("street").input.kind == "motorcycle"
-    assert main(["list", "nowhere"]) == 2
-    (tmp_path / "empty").mkdir()
-    capsys.readouterr()
-    assert main(["list", "empty"]) == 0
-    assert "no problem files" in capsys.readouterr().out
-
-
-def test_the_wheel_holds_the_problems():
-    assert '"problems" = "soup_nlp/problems"' in text("pyproject.toml")

@@ -31,7 +31,6 @@ READ = {
     "chain image": "chain {odd.png} {odd.png} -q -o {out}",
     "chain video": "chain {odd.mp4} -q -o {out}",
     "show": "show {odd.yaml}",
-    "list": "list {odd}",
     "export": "export {odd.yaml} -o {out}",
     "compare": "compare {odd.yaml} --solvers ipopt -o {out}",
     "check": "check {odd}",
@@ -103,21 +102,9 @@ def _part(name: str) -> Any:
     return make
 
 
-def _listed(w: World, o: Path, kind: str) -> str:
-    """A folder that holds an odd file, or a link to it."""
-    name = w.odd(kind, ".yaml")
-    if kind in ("newline", "escape"):
-        (o / Path(name).name).write_text("# fine\n")
-    elif Path(name).parent == w.root / "odd" and "\0" not in name and len(name) < 250:
-        (o / "link.yaml").symlink_to(name)
-    return str(o)
-
-
 def path_cases() -> Iterator[Case]:
     for door, line in READ.items():
-        # an empty folder lists no problem, which is no mistake
-        other = {"folder": (0,)} if door == "list" else None
-        yield from cases(f"{door} {{}}", line, KINDS, other=other)
+        yield from cases(f"{door} {{}}", line, KINDS)
     for name, text in DATASETS.items():
         make = _dataset(name, text)
         yield from cases(f"dataset {name} {{}}", "solve {x} -o {out}", KINDS, make=make)
@@ -126,7 +113,6 @@ def path_cases() -> Iterator[Case]:
         yield from cases(f"part {name} {{}}", line, MALFORMED, make=_part(name))
     for door, line in WRITE.items():
         yield from cases(f"{door} -o {{}}", line, NO_FOLDER)
-    yield from cases("list of {}", "list {x}", KINDS, (0, 2), make=_listed)
     for name in ("depth_ref.png", "points_next.ply", "overview.png", "result.h5", "summary.json"):
         codes = (2,) if name in ("result.h5", "summary.json") else (1,)
         make = changed("result", name, _instead)
@@ -177,7 +163,6 @@ USES: dict[str, tuple[str, Any, tuple[int, ...]]] = {
     "over manifest": ("export {p} -q -o {x}", changed("exported", "manifest.json"), (0, 2)),
     "problem": ("check {x}/soup.sol", changed("exported", "problem.yaml"), (2,)),
     "show": ("show {x}", written("p.yaml"), (2,)),
-    "list": ("list {o}", written("p.yaml"), (0, 2)),
 }
 """Commands that read a text, by the file or argument that has it."""
 
@@ -243,7 +228,6 @@ UNTRUSTING: dict[str, tuple[str, Any, tuple[int, ...]]] = {
     ),
     "unknown key": ("show {x}", _named("{}: 1"), (2,)),
     "wrong value": ("show {x}", _named("seed: {}"), (2,)),
-    "first line": ("list {o}", lambda w, o, t: write(o / "p.yaml", f"# {t}\n"), (0,)),
     "option": ("solve --{x}", None, (2,)),
     "verb": ("{x}", None, (2,)),
     "override": ("show {p} --set {x}", None, (2,)),
