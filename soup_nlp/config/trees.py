@@ -65,7 +65,7 @@ def _value(node: yaml.Node, path: Keys, lines: dict[Keys, str], source: str) -> 
             out[here[-1]] = _value(value, here, lines, source)
         return out
     text = str(node.value)
-    if node.style is not None:
+    if isinstance(node, yaml.ScalarNode) and node.style is not None:
         # in quotes
         return text
     if text.lower() in _WORDS:
