@@ -294,7 +294,7 @@ def test_tum(tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> N
     with raises(r"1\.png"):
         load("tum", root, depth_scale=5000.0)
     (root / "rgb.txt").write_text("1.0\n")
-    with raises("line of a file list"):
+    with raises("file list is not understood"):
         load("tum", root, depth_scale=5000.0)
     with raises(r"rgb\.txt[\s\S]*expected: rgb\.txt, depth\.txt"):
         load("tum", folder)

@@ -12,7 +12,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.data.datasets.folders import Folder, PairInput, Resolve, make_pair
 from soup_nlp.data.formats.camera_files import check_intrinsics, number, read_cam, read_intrinsics
 from soup_nlp.data.formats.cameras import written
-from soup_nlp.data.formats.images import assumed, decode, read_mask
+from soup_nlp.data.formats.images import decode, read_mask, warn
 from soup_nlp.data.formats.map_files import (
     KITTI_DISPARITY,
     read_depth,
@@ -80,7 +80,7 @@ CAMERAS = {
 def assumed_camera(name: str, where: Path, missing: str, doubt: str = "") -> Float:
     """A camera of `CAMERAS`, with a warning."""
     K = intrinsics(*CAMERAS[name])
-    assumed(where, missing, f"fx,fy,cx,cy {written(K)} of {name}{doubt}")
+    warn(where, f"{missing}; assumed: fx,fy,cx,cy {written(K)} of {name}{doubt}")
     return K
 
 
@@ -281,8 +281,8 @@ class TumInput(PairInput):
             K = assumed_camera(sensor.group() if sensor else "TUM RGB-D", folder.path, missing)
         maps = []
         for time, _ in (images[k] for k in numbers):
-            near = [entry for entry in depths if abs(entry[0] - time) <= TUM_SLACK]
-            best = [name for _, name in sorted(near, key=lambda entry: abs(entry[0] - time))[:1]]
+            near = sorted((abs(at - time), name) for at, name in depths)[:1]
+            best = [name for gap, name in near if gap <= TUM_SLACK]
             maps.append(folder.read(read_depth, *best, scale=self.depth_scale, usual=TUM_SCALE))
         files = [folder.need(images[k][1]) for k in numbers]
         return make_pair(files, [K, K], Truth(maps[0], maps[1]))
@@ -290,18 +290,9 @@ class TumInput(PairInput):
 
 def _tum_list(path: Path) -> list[tuple[float, str]]:
     """(time stamp in seconds, name of a file) of each line of rgb.txt or depth.txt."""
-    out = []
-    for row, line in enumerate(read_text(path, "file list").splitlines(), 1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        words = line.split()
-        try:
-            out.append((float(words[0]), words[1]))
-        except (ValueError, IndexError):
-            raise DataError(
-                "line of a file list is not understood",
-                where=f"{path}, line {row}",
-                found=repr(line[:60]),
-                expected="'timestamp file'",
-            ) from None
-    return out
+    lines = [line.split() for line in read_text(path, "file list").splitlines()]
+    try:
+        return [(float(w[0]), w[1]) for w in lines if w and not w[0].startswith("#")]
+    except (ValueError, IndexError) as error:
+        what, expected = "file list is not understood", "lines 'timestamp file'"
+        raise DataError(what, where=path, found=error, expected=expected) from None

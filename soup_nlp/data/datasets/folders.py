@@ -5,7 +5,6 @@ Each needs the two images and the camera. The truth is None without its file, an
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -22,7 +21,7 @@ from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.schema.section import Positive, Section
-from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder, read_json
+from soup_nlp.storage.files import PathLike, as_path, is_file, is_folder
 from soup_nlp.storage.folders import SUMS, read_sums
 
 T = TypeVar("T")
@@ -199,17 +198,14 @@ class FolderInput(FramesInput):
 
 def _refuse_result(folder: Folder) -> None:
     """Raise DataError for a folder with a result."""
-    marked, summary = read_sums(folder.path) is not None, {}
-    with suppress(DataError):
-        summary = read_json(folder.path / "summary.json", "summary.json", dict[str, Any])
-    if marked or "problem_hash" in summary:
+    marked = read_sums(folder.path) is not None
+    if marked or folder.find("result.h5"):
         raise DataError(
             "input folder holds a result, whose depth and flow would pass for truth",
             where=folder.path,
-            found=f"{SUMS} of a solve" if marked else "summary.json of a solve",
+            found=f"{SUMS if marked else 'result.h5'} of a solve",
             expected="a folder with inputs only",
-            hint="move the frames, K.txt and the truth to a folder of their own"
-            + (f"; delete {SUMS} where no solve has left files" if marked else ""),
+            hint="move the frames, K.txt and the truth to a folder of their own",
         )
 
 

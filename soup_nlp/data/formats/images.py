@@ -50,11 +50,6 @@ def warn(where: object, text: str) -> None:
     warnings.warn(f"{where}: {text}", DataWarning, stacklevel=3)
 
 
-def assumed(where: object, missing: str, taken: str) -> None:
-    """Warn that a value is missing in the input, and name the value that is assumed."""
-    warn(where, f"{missing}; assumed: {taken}")
-
-
 def check_body(count: int, expected: int, path: PathLike, what: str) -> None:
     """Raise DataError unless a file body has the number of bytes given by its header."""
     if count != expected:

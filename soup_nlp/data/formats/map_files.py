@@ -22,7 +22,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap
-from soup_nlp.data.formats.images import assumed, check_body, decode, decode_png16
+from soup_nlp.data.formats.images import check_body, decode, decode_png16, warn
 from soup_nlp.errors import DataError, repr_of
 from soup_nlp.schema.section import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, as_path, read_bytes
@@ -276,7 +276,7 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
     def by_scale(path: PathLike) -> Float:
         if scale is None:
             taken = f"{usual:g} values per unit of length; depth_scale (--depth-scale) sets them"
-            assumed(Path(path).parent, "the scale of its 16-bit depth is not given", taken)
+            warn(Path(path).parent, f"the scale of its 16-bit depth is not given; assumed: {taken}")
         return read_depth_png16(path, usual if scale is None else scale)
 
     readers: dict[str, Reader] = {
@@ -310,6 +310,6 @@ def read_prior(path: PathLike) -> Float:
     grey = image[:, :, 0] if image.ndim == 3 else image
     if image.dtype != np.uint8 or (image.ndim == 3 and (image[:, :, :3] != grey[..., None]).any()):
         return read_depth(path, 1.0)
-    taken = "its grey values, of which black is unknown; a file of numbers is more exact"
-    assumed(path, f"a depth prior of 8 bits has {len(np.unique(grey))} different values", taken)
+    few = f"a depth prior of 8 bits has {len(np.unique(grey))} different values; assumed: its grey"
+    warn(path, f"{few} values, of which black is unknown; a file of numbers is more exact")
     return known_depth(grey, path)
