@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 
 from soup_nlp.errors import ConfigError, SoupError, StoppedError, printable
 from soup_nlp.storage.progress import interruptible
@@ -144,23 +144,7 @@ def _explained(error: Exception) -> int:
     return ABORTED if stopped else 2
 
 
-class _Flags:
-    """A command whose flags show no type in its help, as they take no value."""
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        """Options and arguments, `--help` included."""
-        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
-        for param in params:
-            if getattr(param, "is_flag", False):
-                param.metavar = ""
-        return params
-
-
-class Command(_Flags, TyperCommand):
-    """A command of the program."""
-
-
-class LazyGroup(_Flags, TyperGroup):
+class LazyGroup(TyperGroup):
     """A group that imports a command only when it is called, which makes `--help` fast."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
@@ -177,7 +161,7 @@ def _load(name: str, home: str) -> Any:
     module, _, function = home.partition(":")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     function_of = getattr(import_module(f"soup_nlp.cli.{module}"), function)
-    alone.command(name=name, cls=Command)(function_of)
+    alone.command(name=name)(function_of)
     return typer.main.get_command(alone)
 
 

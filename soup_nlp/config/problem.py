@@ -87,14 +87,6 @@ def _is_title(text: str) -> str:
     return text
 
 
-_FILES = {
-    "input": ("ref", "next", "intrinsics", "intrinsics_next", "depth", "depth_next"),
-    "flow": ("source", "backward", "confidence"),
-    "depth_prior": ("source",),
-}
-"""Keys that may name a file."""
-
-
 class Problem(Section):
     """One problem file."""
 
@@ -161,11 +153,10 @@ class Problem(Section):
                 if (known := getattr(pair.truth, key, None)) is not None:
                     content = np.ascontiguousarray(known).tobytes()
                     tree["input"][key] = hashlib.sha256(content).hexdigest()
-        for section, keys in _FILES.items():
-            for key in keys:
-                name = tree[section].get(key)
-                if isinstance(name, str) and (section == "input" or self.path(name).is_file()):
-                    tree[section][key] = digest_of(self.path(name))
+        for section in tree.values():
+            for key, name in section.items() if isinstance(section, dict) else ():
+                if isinstance(name, str) and is_file(self.path(name)):
+                    section[key] = digest_of(self.path(name))
         return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:16]
 
     @property
