@@ -155,7 +155,8 @@ class Problem(Section):
                     tree["input"][key] = hashlib.sha256(content).hexdigest()
         for section in tree.values():
             for key, name in section.items() if isinstance(section, dict) else ():
-                if isinstance(name, str) and is_file(self.path(name)):
+                named = isinstance(name, str) and is_file(self.path(name))
+                if named or name in self.input.files():
                     section[key] = digest_of(self.path(name))
         return hashlib.sha256(json.dumps(tree, sort_keys=True).encode()).hexdigest()[:16]
 
