@@ -142,20 +142,25 @@ class FilesInput(FramesInput):
                 " belong to the images before",
             )
         truth = Truth(depth(self.depth), depth(self.depth_next), unit=self.unit)
-        read = read_camera if self.undistort else lambda file: (read_intrinsics(file), np.zeros(0))
-        lenses: list[tuple[Float | None, Float]] = []
+        cameras: list[Float | None] = []
+        lenses: list[Float] = []
         for camera in (self.intrinsics, self.intrinsics_next or self.intrinsics):
-            four = intrinsics(*camera) if isinstance(camera, list) else None
-            lenses.append(read(path(camera)) if isinstance(camera, str) else (four, np.zeros(0)))
+            K = intrinsics(*camera) if isinstance(camera, list) else None
+            if isinstance(camera, str) and self.undistort:
+                K, lens = read_camera(path(camera))
+                lenses.append(lens)
+            elif isinstance(camera, str):
+                K = read_intrinsics(path(camera))
+            cameras.append(K)
         return make_pair(
             [path(self.ref), path(self.next)],
-            [K for K, _ in lenses],
+            cameras,
             truth,
             self.white,
             fov=self.fov,
             focal_sigma=self.focal_sigma,
             cropped=self.cropped,
-            distortion=[d for _, d in lenses] if self.undistort else (),
+            distortion=lenses,
         )
 
     def files(self) -> list[str]:
