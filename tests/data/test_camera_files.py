@@ -241,6 +241,7 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "underscores": (FOUR.replace("256", "25_6"), "'25_6'"),
     "two numbers": (FOUR.replace("256", "[256, 257]"), "fx is not one number"),
     "NaN distortion": (FOUR + "k1: .nan", "distortion k1 is unclear"),
+    "NaN distortion without names": ("256 257 159.5 119.5 0.1 nan", "wrong number of values"),
     "NaN": (FOUR.replace("256", ".nan"), "no camera matrix"),
     "infinite": (json.dumps({**GROUP, "fx": float("inf")}), "no camera matrix"),
     "negative": (json.dumps({**GROUP, "fx": -1}), "no camera matrix"),
