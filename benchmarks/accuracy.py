@@ -41,9 +41,9 @@ SIGMA_COLUMNS = {
     "sigma.within2": "within 2",
     "sigma.sure_wrong": "sure and wrong",
     "sigma.wrong_sure": "wrong and sure",
-    "sigma.right_guess": "right but guess",
+    "sigma.right_unsure": "right but unsure",
     "sigma.ause": "AUSE",
-    "guess": "guess",
+    "drawn": "drawn",
 }
 """Titles of the columns on sigma."""
 SIGMA_BY_PAIR = ("NLL", "within 1", "within 2", "sure and wrong", "AUSE", "guess")
@@ -57,9 +57,9 @@ ABOUT_SIGMA = (
     " same for the best constant sigma. Within k: share of the pixels within k sigma. Sure and"
     " wrong: of the pixels with a sigma below 10 %, the share that is wrong by more than 20 %;"
     " wrong and sure: of those wrong by more than 20 %, the share with a sigma below 10 %; right"
-    " but guess: of those right to 10 %, the share that is called a guess. AUSE: area between the"
+    " but unsure: of those right to 10 %, the share with a sigma above 25 %. AUSE: area between the"
     " sparsification curve of sigma and the oracle's, over the MRE; 0 is perfect, 0.8 to 1 is"
-    " chance. Guess: share of the image."
+    " chance. Drawn: share of the image."
 )
 ABOUT_HALVES = (
     "Geometric mean over the families of their mean MRE. Half A has the families that rules were"

@@ -73,7 +73,7 @@ def scores(result: Run) -> Row:
         "good": result.solved,
         "stages": dict(result.seconds),
         "iterations": sum(stage.iterations for stage in solution.stages),
-        "guess": result.confidence.guessed,
+        "drawn": result.confidence.share("drawn"),
     }
     if truth is None or not has_depth(truth):
         return {**row, "metrics": {}}
@@ -117,7 +117,7 @@ def sigma_scores(error: Float, sigma: Float) -> Row:
         "within1", "within2": share of the pixels within one and two sigma.
         "sure_wrong": of the sure pixels, the share that is wrong.
         "wrong_sure": of the wrong pixels, the share that is sure.
-        "right_guess": of the right pixels, the share that is called a guess.
+        "right_unsure": of the right pixels, the share with a sigma above `MOST_SIGMA`.
         "ause": area between the sparsification curve and the oracle's, over the MRE.
         "curve": (kept share, error, error of the oracle) of the sparsification.
         "reliability": (mean sigma, root mean square error) by tenths of the pixels by sigma.
@@ -136,7 +136,7 @@ def sigma_scores(error: Float, sigma: Float) -> Row:
         "within2": within[1],
         "sure_wrong": _share(wrong, sure),
         "wrong_sure": _share(sure, wrong),
-        "right_guess": _share(sigma > MOST_SIGMA, right),
+        "right_unsure": _share(sigma > MOST_SIGMA, right),
         "ause": measured.ause,
         "curve": curve.tolist(),
         "reliability": [

@@ -43,12 +43,11 @@ def made(scene: str) -> str:
     drawn = pictures(Chain.of(result_of(run, summary(run))))
     sheet = strip([drawn[name] for name in PANELS], "", columns=len(PANELS), panel_width=270)
     Image.fromarray(sheet).save(PAGE.with_name("gallery") / f"{scene}.jpg", quality=80)
-    shares = certainty(run)
     scores = (f"{name} {run.metrics[name].mre:.3f}" for name in ("solution", "constant"))
     sections = {
         "found": found_words(run),
-        "certainty": certainty_lines(shares),
-        "try": hints(run, shares),
+        "certainty": certainty_lines(certainty(run)),
+        "try": hints(run),
         "MRE": [", ".join(scores)],
         "exit code": [f"{0 if run.good else 1}"],
     }

@@ -30,7 +30,7 @@ PAGES = [
 INSTALLATION = {"pip", "make"}
 """Programs of an installation, which `.ci/run` uses."""
 SOLVES = {"solve", "demo", "chain"}
-"""Commands that write their result and end with 1 where most of a small image is a guess."""
+"""Commands that write their result and end with 1 where most of a small image is drawn."""
 
 
 def small(tree):

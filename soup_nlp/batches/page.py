@@ -10,7 +10,7 @@ import numpy as np
 from soup_nlp.report.result import PAGE
 from soup_nlp.storage.rows import failed, reason
 
-HEADS = ("", "pair", "MRE", "constant", "guess", "seconds", "MB", "exit", "reason")
+HEADS = ("", "pair", "MRE", "constant", "drawn", "seconds", "MB", "exit", "reason")
 DRAWS = 2000
 """Draws of the bootstrap."""
 HTML = """<!doctype html>
@@ -74,7 +74,7 @@ def page(rows: Sequence[Mapping[str, Any]], total: int, title: str = "Batch") ->
         cells = [
             _number(row.get("mre"), ".4f"),
             _number(row.get("constant"), ".4f"),
-            _number(row.get("guess"), ".0%"),
+            _number(row.get("drawn"), ".0%"),
             _number(row.get("seconds"), ".0f"),
             _number(size and size / 2**20, ".0f"),
             f"<td>{2 if bad else row.get('exit_code')}</td>",

@@ -27,10 +27,10 @@ from soup_nlp.storage.rows import Say, append_row, failed, reason
 
 FILES = ("table.csv", "index.html")
 COLUMNS = (
-    *("pair", "exit_code", "reason", "mre", "constant", "guess", "seconds", "cpu_seconds"),
+    *("pair", "exit_code", "reason", "mre", "constant", "drawn", "seconds", "cpu_seconds"),
     *("peak_bytes", "superpixels", "seed", "code", "identity"),
 )
-"""Columns of table.csv; seconds are wall seconds, guess is the share of the image."""
+"""Columns of table.csv; seconds are wall seconds, drawn is the share of the image."""
 BEAT, STALE = 10.0, 120.0
 """Seconds between the signs of life of a run, and without one after which its pairs are free."""
 PAUSE = 1.0

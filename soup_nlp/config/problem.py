@@ -70,7 +70,7 @@ class OutputOptions(Section):
     page: bool = True
     """Write report.html, the page with the 3D view."""
     min_confidence: Share = 0.5
-    """Least confidence, 1 - sigma / 0.5, of the points in clouds and meshes; 0 keeps guesses."""
+    """Least confidence, 1 - sigma / 0.5, of the points in clouds and meshes; 0 keeps all."""
 
 
 def title(text: object) -> str:

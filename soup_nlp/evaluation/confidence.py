@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import ModelError
 from soup_nlp.evaluation.evidence import Evidence, evidence
 from soup_nlp.evaluation.information import Marginals, information, marginals, spread_in_image
 from soup_nlp.geometry.soup import Reconstruction
+from soup_nlp.geometry.surface import hidden
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
@@ -54,9 +55,11 @@ LARGEST = 1e6
 NO_CONFIDENCE = 0.5
 """Sigma from which the confidence, 1 - sigma / `NO_CONFIDENCE`, is 0."""
 MIN_CONFIDENCE = 0.5
-"""A pixel whose confidence is less is a guess."""
+"""Least confidence of a pixel of a cloud."""
 MOST_SIGMA = (1 - MIN_CONFIDENCE) * NO_CONFIDENCE
 """The sigma of that confidence."""
+KINDS = ("measured", "inferred", "drawn")
+"""By what the depth of a pixel is known, see `kinds`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,7 @@ class Confidence:
         component_sigma: (C,) standard deviation of the components' log scale.
         evidence: Evidence of the flow for the depth of every component.
         terms: (H, W) terms of sigma by the names of `SHARES`, times their factors.
+        kind: (H, W) by what the depth is known, an index of `KINDS`.
     """
 
     sigma: Float
@@ -78,11 +82,11 @@ class Confidence:
     component_sigma: Float
     evidence: Evidence
     terms: Mapping[str, Float]
+    kind: Image
 
-    @property
-    def guessed(self) -> float:
-        """Share of the pixels whose depth is a guess."""
-        return float(np.mean(self.sigma > MOST_SIGMA))
+    def share(self, kind: str) -> float:
+        """Share of the pixels of one of `KINDS`."""
+        return float(np.mean(self.kind == KINDS.index(kind)))
 
 
 def flow_misfit(rec: Reconstruction, flow: Flow) -> Float:
@@ -176,6 +180,25 @@ def terms(
     }
 
 
+def kinds(rec: Reconstruction, flow: Flow, start: Start, drawn: Mask, given: Mask) -> Image:
+    """(H, W) by what the depth of every pixel is known, an index of `KINDS`.
+
+    Measured: by parallax, in the static scene. Inferred: from a contact or an order (what moves by
+    itself), from a surface that is continued where no flow can be used or nothing is seen of it in
+    the next frame, from how a surface bends, or from a given depth. Drawn: nothing tells it.
+
+    Args:
+        rec: The answer.
+        flow: The flow of the solve.
+        start: Components, and what bends or takes its depth from neighbours.
+        drawn: (H, W) True where nothing tells the depth.
+        given: (N,) True where a given depth decides.
+    """
+    by_others = (start.component != SCENE) | start.bends | start.borrowed | given
+    inferred = by_others[rec.labels] | (flow.confidence <= 0) | hidden(rec)
+    return np.where(drawn, 2, inferred).astype(np.uint8)
+
+
 def confidence(
     rec: Reconstruction,
     pair: Pair,
@@ -227,8 +250,13 @@ def confidence(
     )
     drawn = (start.at_rest | fixed | (start.bends & start.unexplained))[labels]
     sigma = np.where(drawn, DRAWN, with_prior(np.sqrt(squares)))
+    given = np.zeros(len(rec.soup), bool)
     if given_depth is not None:
         # where the depth is that of a prior which no flow confirms, the flow is no evidence
         alone = np.isfinite(given_depth.sigma) & (given_depth.sigma > MOST_SIGMA)
         sigma = with_prior(np.where(alone[labels], PRIOR, sigma), given_depth.sigma[labels])
-    return Confidence(sigma, spread, variances, with_prior(component), sure, known)
+        given = given_depth.from_prior
+    # what is as uncertain as a drawing is one
+    nothing = (drawn & ~given[labels]) | (sigma >= DRAWN)
+    kind = kinds(rec, pair.flow, start, nothing, given)
+    return Confidence(sigma, spread, variances, with_prior(component), sure, known, kind)

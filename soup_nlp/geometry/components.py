@@ -32,7 +32,7 @@ class Component:
         pixels: Number of its pixels.
         residual_px: Median distance, in the next image, between the component's points moved by
             `motion` and by their superpixels' motions, pixels; large if it is not rigid.
-        borrowed: Share of its pixels whose depth is a guess from neighbours.
+        borrowed: Share of its pixels whose depth is that of neighbours.
         centre: (3,) median of its points in the reference frame.
     """
 
@@ -132,7 +132,7 @@ def find_components(
         group: (N,) groups, such as the components of the start; the first is the background.
         K_ref: (3, 3) intrinsics of the reference frame.
         K_next: (3, 3) intrinsics of the next frame.
-        borrowed: (N,) superpixels whose depth is a guess; None for none.
+        borrowed: (N,) superpixels with the depth of neighbours; None for none.
     """
     ray = rays(K_ref, np.concatenate([seg.anchors[:, None], seg.rim], axis=1))
     before = soup.points(ray)
@@ -155,7 +155,7 @@ def find_components(
     pixels = np.bincount(label, seg.sizes, len(motions)).astype(np.int64)
     order = np.concatenate([[0], 1 + np.argsort(-pixels[1:], kind="stable")])
     label = np.argsort(order)[label]
-    guess = np.zeros(len(soup), bool) if borrowed is None else borrowed
+    lent = np.zeros(len(soup), bool) if borrowed is None else borrowed
     members = []
     for c, old in enumerate(order):
         mask = label == c
@@ -168,7 +168,7 @@ def find_components(
                 superpixels=int(mask.sum()),
                 pixels=int(pixels[old]),
                 residual_px=float(np.median(_gap(motion, x, y, K_next))) if len(x) else np.nan,
-                borrowed=float(seg.sizes[mask & guess].sum() / pixels[old]),
+                borrowed=float(seg.sizes[mask & lent].sum() / pixels[old]),
                 centre=np.median(x, axis=0) if len(x) else np.full(3, np.nan),
             )
         )

@@ -192,8 +192,8 @@ class Run(Case):
 
     @property
     def good(self) -> bool:
-        """Whether the solve ended well and at most half of the image is a guess."""
-        return self.solved and self.confidence.guessed <= 0.5
+        """Whether the solve ended well and at most half of the image is drawn."""
+        return self.solved and self.confidence.share("drawn") <= 0.5
 
     @property
     def solved(self) -> bool:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import FrameError
-from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.motion import RigidMotion
@@ -115,7 +114,7 @@ class Link:
         spread: Robust standard deviation of the same over pixels (1.4826 MAD).
         pixels: Number of pixels.
         bridge: Whether a pair without parallax lies between the two.
-        flagged: Whether it is a guess: a pair has no parallax, or few pixels are shared.
+        flagged: Whether it is doubtful: a pair has no parallax, or few pixels are shared.
     """
 
     first: int
@@ -137,6 +136,7 @@ class Frame:
         K: (3, 3) intrinsics, pixels.
         depth: (H, W) z; NaN where unknown.
         sigma: (H, W) standard deviation of log z; NaN where unknown.
+        drawn: (H, W) True where nothing tells the depth; False where it is unknown.
         components: (H, W) what moves by itself, by number of its track; 0 is the static scene, -1
             unknown.
         pose: world_from_camera; the world is the first frame's camera.
@@ -147,33 +147,29 @@ class Frame:
     K: Float
     depth: Float
     sigma: Float
+    drawn: Mask
     components: NDArray[np.int32]
     pose: RigidMotion
 
     def __str__(self) -> str:
         h, w = self.depth.shape
-        return f"Frame({self.name}, {w}x{h}, {self.guess.mean():.0%} a guess)"
+        return f"Frame({self.name}, {w}x{h}, {self.drawn.mean():.0%} drawn)"
 
     __repr__ = __str__
-
-    @property
-    def guess(self) -> Mask:
-        """(H, W) True where the depth is a guess; False where it is unknown."""
-        return np.asarray(self.sigma > MOST_SIGMA)
 
     def _repr_html_(self) -> str:
         near, far = depth_range(self.depth)
         sigma = colourise_shares(self.sigma, 0.3, "viridis")
         panels = [
             Picture("image", "image", self.image),
-            self.picture(near, far, "depth, pale = a guess"),
+            self.picture(near, far, "depth, pale = drawn"),
             Picture("sigma", "expected depth error (1 sigma), bright = 30 % and more", sigma),
         ]
         return shown(str(self), strip(panels, ""))
 
     def picture(self, near: float, far: float, title: str) -> Picture:
-        """The depth in colours from `near` to `far`, pale where it is a guess."""
-        image = colourise_depth(self.depth, near, far, self.guess)
+        """The depth in colours from `near` to `far`, pale where it is drawn."""
+        image = colourise_depth(self.depth, near, far, self.drawn)
         return Picture("depth", title, image, depth_legend(near, far))
 
     @property
@@ -224,10 +220,10 @@ class Chain:
     def __str__(self) -> str:
         low, high = self.scales.min(), self.scales.max()
         flagged = sum(k.flagged for k in self.links)
-        guess = self.certainty["guess"]
+        drawn = self.certainty["drawn"]
         return (
             f"Chain({len(self)} frames, scales {low:.3g}..{high:.3g}, {flagged} flagged links,"
-            f" {guess:.0%} a guess)"
+            f" {drawn:.0%} drawn)"
         )
 
     __repr__ = __str__
@@ -316,15 +312,18 @@ class Chain:
         """A frame by its number."""
         k, last = self.seen(number)
         pair = self.pairs[k]
-        components, sigma = self.of_track(k)[pair.components.of_pixel], pair.sigma
+        components = self.of_track(k)[pair.components.of_pixel]
+        sigma, drawn = pair.sigma, pair.drawn
         if last:
             components, sigma = pair.in_next(components, -1), pair.in_next(sigma, np.nan)
+            drawn = pair.in_next(drawn, False)
         return Frame(
             name=self.names[number],
             image=pair.images[last],
             K=(pair.K, pair.K_next)[last],
             depth=pair.depths[last],
             sigma=sigma,
+            drawn=drawn,
             components=components.astype(np.int32),
             pose=self.world_from_camera[number],
         )

@@ -32,11 +32,11 @@ VIVID = (
 """Colours of tab10 without its grey, which means unknown."""
 
 PALE = 0.35
-"""Share of its colour that the depth of a guess keeps; the rest is white."""
+"""Share of its colour that drawn depth keeps; the rest is white."""
 LEAST_RANGE = 1.1
 """Least ratio of the two ends of a colour scale of depth.
 
-Bending papers have a relief of 7 to 27 %, guesses without parallax mostly one of 0 to 5 %.
+Bending papers have a relief of 7 to 27 %, drawn depth mostly one of 0 to 5 %.
 """
 
 
@@ -57,8 +57,8 @@ def depth_range(depth: AnyFloat) -> tuple[float, float]:
     return near, far
 
 
-def colourise_depth(depth: AnyFloat, near: float, far: float, guess: Mask | bool = False) -> Image:
-    """Depth (H, W) in colour by even steps of 1/z: near is red, far is blue, a guess is pale.
+def colourise_depth(depth: AnyFloat, near: float, far: float, drawn: Mask | bool = False) -> Image:
+    """Depth (H, W) in colour by even steps of 1/z: near is red, far is blue, what is drawn is pale.
 
     It is grey where not finite or not positive.
     """
@@ -66,7 +66,7 @@ def colourise_depth(depth: AnyFloat, near: float, far: float, guess: Mask | bool
     known = np.isfinite(z) & (z > 0)
     safe = np.clip(np.where(known, z, near), near, far)
     colours = _paint((1 / safe - 1 / far) / (1 / near - 1 / far), known, "turbo")
-    colours[known & guess] = 255 - PALE * (255 - colours[known & guess])
+    colours[known & drawn] = 255 - PALE * (255 - colours[known & drawn])
     return colours
 
 

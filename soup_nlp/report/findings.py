@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.flow.consistency import standing_edges
 from soup_nlp.data.formats.cameras import written
 from soup_nlp.data.formats.images import interlaced
@@ -12,45 +12,30 @@ from soup_nlp.data.working_size import scaled_camera
 from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
 from soup_nlp.start.camera_error import better_camera
+from soup_nlp.start.components import FIXED, SCENE
 
-SHARES = {
-    "flow": "by flow and parallax",
-    "contact": "with the scale of a contact",
-    "outline": "with the scale of an outline",
-    "fast": "nearer than its contact, at which it would move too far",
-    "covering": "with a guessed place in front of what it covers",
-    "free": "without contact to anything that has a scale",
-    "given": "by the given depth",
-    "rest": "the camera only turns or stands still",
-    "fixed": "stands still in the image while the camera moves",
-    "unseen": "no usable flow",
-    "unexplained": "no motion that was found explains its flow",
-    "flat": "a turn alone or a constant depth explains the flow nearly as well",
-    "scale": "with a scale that contact hardly determines",
-    "weak": "little information",
+SAID = {
+    "measured": "measured by parallax",
+    "inferred": "inferred from contact, order, bending, a continued surface or a given depth",
+    "drawn": "drawn: nothing tells its depth",
 }
-"""Words for the shares of `certainty`."""
+"""Words for the kinds of depth (`evaluation.confidence.KINDS`)."""
 ORIGINS = {
-    "reference": ("flow", "the largest, which defines the scale"),
-    "contact below": ("contact", "its scale from what it stands on"),
-    "outline": ("outline", "its scale from what is around it"),
-    "nothing": ("free", "its scale unknown: nothing that has a scale touches it"),
-    "ground": ("contact", "lifted to the ground"),
-    "fixed in the image": ("outline", "still in the image though the camera moves"),
-    "given depth": ("given", "its scale from the given depth"),
-    "occlusion": ("covering", "placed by a guess in front of what it covers"),
-    "too fast": ("fast", "nearer than its contact, at which it would move too far"),
+    "reference": "the largest, which defines the scale",
+    "contact below": "its scale from what it stands on",
+    "outline": "its scale from what is around it",
+    "nothing": "its scale unknown: nothing that has a scale touches it",
+    "ground": "lifted to the ground",
+    "fixed in the image": "still in the image though the camera moves",
+    "given depth": "its scale from the given depth",
+    "occlusion": "placed in front of what it covers",
+    "too fast": "nearer than its contact, at which it would move too far",
 }
-"""By what gives a component its scale (`components.TIES`): the share of its determined pixels in
-`certainty`, and words for the component."""
-DETERMINED = tuple(dict.fromkeys(name for name, _ in ORIGINS.values()))
-"""Shares that are determined."""
-GUESSES = ("rest", "fixed", "unseen", "unexplained", "flat", "scale", "weak")
-"""Shares that are a guess."""
+"""Words for what gives a component its scale (`components.TIES`)."""
 USABLE = 0.8
 """Share of usable flow below which the flow counts as a limit."""
 LEAST, SHARE = 0.005, 0.05
-"""Shares of the image from which a share of the certainty is named, and a limit mentioned."""
+"""Shares of the image from which a kind of depth is named, and a limit mentioned."""
 FAST = 0.05
 """Median length of the flow, relative to the image's width, above which motion is fast."""
 UNSURE_FOCAL = 0.2
@@ -58,7 +43,7 @@ UNSURE_FOCAL = 0.2
 SAME_PX = 0.1
 """Median length of the flow, pixels, below which the frames count as the same."""
 MATCHED = 0.2
-"""Share of usable flow below which the frames may show two scenes, if most of it is a guess."""
+"""Share of usable flow below which the frames may show two scenes, if most depth is drawn."""
 LISTED = 5
 """Number of moving components that are listed."""
 STANDING = 0.001
@@ -67,34 +52,19 @@ WAYS = (("to the right", "to the left"), ("down", "up"), ("ahead", "back"))
 """Directions of the axes of a camera."""
 
 
-def certainty_lines(shares: Mapping[str, float]) -> list[str]:
-    """The shares of `certainty` as sentences on the determined part and on the guess."""
-    determined = (
-        f"{shares['determined']:.0%} of the image is determined, half of it to"
-        f" {shares['median_sigma']:.1%} (1 sigma): {_parts(shares, DETERMINED)}"
-    )
-    lines = {"determined": determined, "guess": guess_words(shares)}
-    return [line for name, line in lines.items() if shares[name] >= LEAST]
+def certainty_lines(shares: Mapping[str, float], of: str = "the image") -> list[str]:
+    """A sentence for every kind of depth that is worth a mention; `shares` by `certainty`."""
+    lines = []
+    for kind, words in SAID.items():
+        half = f", half of it to {shares['median_sigma']:.1%} (1 sigma)" * (kind == "measured")
+        if shares[kind] >= LEAST:
+            lines.append(f"{shares[kind]:.0%} of {of} is {words}{half}")
+    return lines
 
 
-def guess_line(shares: Mapping[str, float], of: str = "the image") -> str:
-    """The share that is a guess, with the reason of its largest part; "" for next to none."""
-    if shares["guess"] < LEAST:
-        return ""
-    reason = SHARES[max(GUESSES, key=lambda name: shares.get(name, 0.0))]
-    return f"{shares['guess']:.0%} of {of} is a guess: {reason}"
-
-
-def guess_words(shares: Mapping[str, float]) -> str:
-    """Sentence on the share that is a guess and the reasons."""
-    reasons = _parts(shares, GUESSES)
-    return f"{shares['guess']:.0%} is a guess (sigma above {MOST_SIGMA:.0%}): {reasons}"
-
-
-def _parts(shares: Mapping[str, float], names: tuple[str, ...]) -> str:
-    """The shares that are worth a mention, or else the largest one."""
-    large = [f"{shares[k]:.0%} {SHARES[k]}" for k in names if shares.get(k, 0.0) >= LEAST]
-    return ", ".join(large) or f"mostly {SHARES[max(names, key=lambda k: shares.get(k, 0.0))]}"
+def drawn_line(shares: Mapping[str, float], of: str = "the image") -> str:
+    """The sentence on what is drawn; "" for next to none."""
+    return "".join(certainty_lines({**shares, "measured": 0.0, "inferred": 0.0}, of))
 
 
 def found_words(run: Run) -> list[str]:
@@ -102,16 +72,16 @@ def found_words(run: Run) -> list[str]:
     start, parts, labels = run.start, run.components, run.segmentation.labels
     assert run.pair.flow is not None
     turn = f"by {parts.camera.angle:.2f} degrees"
-    if _unmatched(run.pair.flow.usable, run.confidence.guessed):
-        turn += " (a guess: hardly any flow is usable)"
+    if unmatched(run):
+        turn += " (hardly any flow is usable)"
 
     def shift(label: int, vector: Float) -> str:
-        unsure = run.confidence.sigma[parts.of_pixel == label] > MOST_SIGMA
-        words = " (a guess, as its distance is)" if unsure.mean() > 0.5 else ""
+        sigma = float(np.median(run.confidence.sigma[parts.of_pixel == label]))
+        words = f" (right to {sigma:.0%}, as its distance is)" if sigma > MOST_SIGMA else ""
         return f"by {_shift(run, vector)}{words}"
 
     if start.at_rest:
-        lines = [f"the camera stands still or only turns, {turn}: depth is a guess"]
+        lines = [f"the camera stands still or only turns, {turn}"]
     elif start.bends.all():
         lines = ["surfaces bend: their relief is weakly determined"]
     else:
@@ -147,9 +117,10 @@ def found_words(run: Run) -> list[str]:
     return lines
 
 
-def _unmatched(usable: float, guess: float) -> bool:
+def unmatched(run: Run) -> bool:
     """True if hardly any flow is usable, so that neither motion nor its causes can be told."""
-    return usable < MATCHED and guess > 0.5
+    assert run.pair.flow is not None
+    return run.pair.flow.usable < MATCHED and run.confidence.share("drawn") > 0.5
 
 
 def _shift(run: Run, shift: Float) -> str:
@@ -181,18 +152,25 @@ def flow_words(run: Run) -> list[str]:
     return lines
 
 
-def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
-    """What would give a better depth; `shares` are those of `certainty`."""
+def hints(run: Run) -> list[str]:
+    """What would give a better depth."""
     assert run.pair.flow is not None
     uv, usable, out = run.pair.flow.uv, run.pair.flow.confidence > 0, list[str]()
-    camera = run.confidence.evidence.camera
+    start, sure, labels = run.start, run.confidence, run.segmentation.labels
+    camera, drawn = sure.evidence.camera, sure.share("drawn")
     length = float(np.median(np.linalg.norm(uv, axis=-1)[usable])) if usable.any() else 0.0
-    if _unmatched(float(usable.mean()), shares["guess"]):
+    unsure = sure.sigma > MOST_SIGMA
+
+    def share(part: Mask) -> float:
+        """Share of the image that is unsure and of a part (N,) of the superpixels."""
+        return float(np.mean(unsure & part[labels]))
+
+    if unmatched(run):
         # what the little flow suggests (no parallax, a wrong camera) is no cause
         return ["two frames of the same scene, closer in time: hardly anything is in both"]
     if any(map(interlaced, (run.pair.image_ref, run.pair.image_next))):
         out.append("frames that are not interlaced (ffmpeg -i FILE -vf yadif)")
-    if shares.get("fixed", 0.0) >= LEAST or standing_edges(run.pair) > STANDING:
+    if share(start.tie == FIXED) >= LEAST or standing_edges(run.pair) > STANDING:
         out.append(
             "frames without what stands still in the image while the camera moves (a watermark, a"
             " logo, the bonnet of its car)"
@@ -200,21 +178,22 @@ def hints(run: Run, shares: Mapping[str, float]) -> list[str]:
     if usable.mean() < USABLE:
         fast = length > FAST * uv.shape[1]
         out.append("frames closer in time" if fast else "a better flow (--flow)")
-    elif length < SAME_PX and shares["guess"] > 0.5:
+    elif length < SAME_PX and drawn > 0.5:
         out.append("frames farther apart in time: these two are nearly the same")
-    if shares["rest"] > 0.5 or shares["flat"] > 0.5:
+    flat = share(sure.evidence.guess[start.component])
+    if flat > 0.5 or start.at_rest:
         out.append("frames between which the camera moves aside, not only turns or zooms")
-    elif shares["flat"] >= SHARE:
+    elif flat >= SHARE:
         out.append("frames farther apart in time")
     if camera is not None:
         said = f"undistorted images and exact intrinsics: the flow suggests an error of {camera}"
         # for the images as they were given
         size = run.pair.size if run.full is None else run.full.depth_ref.shape
         K = scaled_camera(run.pair.K_ref, run.pair.size, size)
-        fits = better_camera(K, camera, run.confidence.evidence.errors[camera].mean)
+        fits = better_camera(K, camera, sure.evidence.errors[camera].mean)
         out.append(said if fits is None else f"{said}, and --intrinsics {written(fits)} would fit")
-    if run.pair.focal_sigma > UNSURE_FOCAL and shares["weak"] >= SHARE:
+    if run.pair.focal_sigma > UNSURE_FOCAL and unsure.mean() >= SHARE:
         out.append("the focal length of the camera (--fov or --intrinsics)")
-    if shares["scale"] + shares.get("unexplained", 0.0) >= SHARE:
+    if share((start.component != SCENE) | start.unexplained) >= SHARE:
         out.append("a depth from elsewhere (--depth-prior) for what moves")
     return ["; ".join(out)] if out else []

@@ -27,7 +27,7 @@ CONVENTIONS = {
     "rotation_deg": "axis times angle, degrees",
     "label": "value in components/of_superpixel of result.h5; 0 is the background",
     "residual_px": "median distance in the next image from the motions of the superpixels",
-    "borrowed": "share of its pixels whose depth is a guess from neighbours",
+    "borrowed": "share of its pixels whose depth is that of neighbours",
     "scale": "of a component that moves by itself, no flow determines it",
 }
 """Meaning of the entries of motions.json."""

@@ -107,12 +107,13 @@ depth/sigma_next          1     H,W     the same of the next frame, NaN where no
 confidence/plane          1     N,3,3   marginal covariance of relative inverse depth at the \
 anchor and of its slopes over the radius, not calibrated
 confidence/spread         1     H,W     standard deviation of log z by the marginals, not calibrated
+confidence/kind           1     H,W     by what z is known: 0 measured, 1 inferred, 2 drawn
 confidence/component_sigma  1   C       standard deviation of a rigid component's log scale
 
 components/of_superpixel  1     N       what moves as one in the solution; 0 is the background
 components/motion         soup  C,4,4   next_from_ref, the camera's motion included
 components/residual_px    px    C       median distance from where the superpixels' motions lead
-components/borrowed       1     C       share of the pixels whose depth is a guess
+components/borrowed       1     C       share of the pixels whose depth is that of neighbours
 
 truth/depth_ref           truth  H,W    true z of the reference frame, NaN where unknown
 truth/depth_next          truth  H,W    true z of the next frame, NaN where unknown

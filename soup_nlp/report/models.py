@@ -100,7 +100,7 @@ def write_cloud(path: PathLike, chain: Chain, number: int) -> None:
         f"unit: {chain.unit}",
         "confidence: of the flow, 0 to 1; component: what moves as one, 0 is the background",
         f"{keep.mean():.1%} of the pixels: without hidden ones, those at jumps of the depth, and"
-        " guesses (output.min_confidence=0 keeps them)",
+        " those of less confidence than output.min_confidence",
     ]
     write_ply(
         path,
@@ -119,14 +119,14 @@ def write_fused(path: PathLike, chain: Chain) -> None:
         f"{chain.name}: static scene of {len(chain)} frames, one point per voxel",
         f"frame: the first frame's camera, {AXES}",
         f"unit: {chain.unit}",
-        "sigma_log_depth: of the frame that the point is from; guesses are left out",
+        "sigma_log_depth: of the frame that the point is from, at most 0.25",
     ]
     scalars = {"sigma_log_depth": cloud["sigma"], "frame": cloud["frame"]}
     write_ply(path, cloud["points"], cloud["colours"], None, scalars, comments)
 
 
 def fuse(chain: Chain, most: int = MOST) -> Cloud:
-    """The static scene of all frames: guesses left out, conflicts resolved, one point per voxel.
+    """The static scene of all frames: sure points without conflicts, one per voxel.
 
     A point in front of the static surface of a neighbouring frame is removed if that frame is more
     certain there. A voxel keeps its most certain point. Of more than `most` points each k-th one is

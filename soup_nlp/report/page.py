@@ -22,7 +22,7 @@ from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, whole_cells
 from soup_nlp.report.chain import STILL, Chain
 from soup_nlp.report.figures import Legend, Picture, component_colours
-from soup_nlp.report.findings import ORIGINS, guess_line
+from soup_nlp.report.findings import ORIGINS, SAID, drawn_line
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import Result
 from soup_nlp.start.components import TIES
@@ -168,12 +168,12 @@ def _summary(result: Result) -> str:
     whole = sum(v for k, v in s["seconds"].items() if not k.startswith("nlp_"))
     if whole:
         words.append(f"{whole:.1f} s")
-    return headline(guess_line(s["certainty"]), words)
+    return headline(drawn_line(s["certainty"]), words)
 
 
-def headline(guess: str, words: Sequence[str]) -> str:
-    """Figures in one line of HTML; the sentence on the guess is first."""
-    strong = [f"<strong>{escape(guess)}</strong>"] if guess else []
+def headline(drawn: str, words: Sequence[str]) -> str:
+    """Figures in one line of HTML; the sentence on what is drawn is first."""
+    strong = [f"<strong>{escape(drawn)}</strong>"] if drawn else []
     return " &middot; ".join([*strong, *map(escape, words)])
 
 
@@ -232,7 +232,7 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "cameras": (4, 4) world_from_camera of every frame; of a pair whose surfaces bend, the
         identity. "paths": colour and points of what moves and of the camera. "middle", "far",
         "deepest": median depth, depth beyond which points are hidden at first, largest depth.
-        "origins": words for what gives a component its scale.
+        "origins": words for what gives a component its scale. "kinds": words for kinds of depth.
     """
     metre, pairs, depths = chain.metre or 1.0, [], []
     most = min(PIXELS[0], PIXELS[1] / len(chain.pairs))
@@ -262,7 +262,8 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "far": far,
         "deepest": deepest,
         "unit": chain.length,
-        "origins": [ORIGINS[name][1] for name in TIES],
+        "origins": [ORIGINS[name] for name in TIES],
+        "kinds": [*SAID.values()],
     }
 
 
@@ -277,12 +278,12 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
         "motion": (N, 9) motion of every superpixel relative to the background: rotation vector w,
             pivot p and shift s; at time t a point X is at exp(t w) (X - p) + p + t s.
         "motionCamera": (N, 9) the same relative to the camera.
-        "borrowed": (N,) the depth comes from neighbours.
         "component": (N,) what moves as one, by track. "tie": (N,) index in "origins".
         "seen": (h, w) pixels that are visible in the next frame.
         "sigma": (h, w) standard deviation of log depth, 0 to 254 for 0 to 0.5; 255 where unknown.
         "surface": bits of the (h - 1, w - 1) cells of four pixels without a jump of the depth.
-        "guess": share of the pixels whose depth is a guess.
+        "kind": (h, w) by what the depth is known, an index of "kinds".
+        "drawn": share of the pixels whose depth is drawn.
     """
     result, scale = chain.pairs[k], chain.metre or 1.0
     rec, soup, start = result.reconstruction, result.soup, result.tree["start"]
@@ -299,9 +300,9 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
         "planes": _single(inverse_depth(soup.n, scale * soup.distance)),
         "motion": _single(_motion(camera.R @ R, home, pivot)),
         "motionCamera": _single(_motion(R, T, pivot)),
-        "borrowed": (np.asarray(start["borrowed"], bool) & ~result.bends).astype(np.uint8),
         "seen": (~hidden(rec)[every]).astype(np.uint8),
         "sigma": byte.round().astype(np.uint8),
+        "kind": result.kind[every].astype(np.uint8),
         "component": chain.of_track(k)[result.components.of_superpixel].astype(np.uint16),
         "tie": np.asarray(start["tie"], np.uint8),
         "surface": np.packbits(surface_cells(result, step), bitorder="little"),
@@ -312,7 +313,7 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
         "sizeNext": rec.depth_next.shape[::-1],
         "K": result.K.tolist(),
         "KNext": result.K_next.tolist(),
-        "guess": float(chain[k].guess.mean()),
+        "drawn": float(result.drawn.mean()),
     }
 
 

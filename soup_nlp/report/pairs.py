@@ -34,7 +34,7 @@ class Stored(TypedDict, total=False):
     reason: str
     mre: float | None
     constant: float | None
-    guess: float | None
+    drawn: float | None
     seconds: float
     cpu_seconds: float
     peak_bytes: float
@@ -94,7 +94,7 @@ def solve_into(problem: Problem, folder: Path) -> Row:
         "components": len(solved.components),
         "mre": scores.get("solution"),
         "constant": scores.get("constant"),
-        "guess": solved.confidence.guessed,
+        "drawn": solved.confidence.share("drawn"),
         "superpixels": len(solved),
         "result": _result(place),
         "warnings": [*dict.fromkeys(texts)],

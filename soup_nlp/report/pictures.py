@@ -9,7 +9,6 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.arrays import AnyFloat, Image, Mask
-from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import (
     Legend,
@@ -62,14 +61,14 @@ def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
     if error is not None:
         title = "depth error relative to the truth; grey = no truth"
         drawn.append(_shares("error", title, _enlarged(error), "inferno", ERROR_TICKS))
-    title = "expected depth error (1 sigma); bright = a guess"
+    title = "expected depth error (1 sigma)"
     drawn.append(_shares("confidence", title, result.sigma, "viridis", SIGMA_TICKS))
     drawn.append(_normals(result))
     return {picture.name: picture for picture in drawn}
 
 
 def _components(chain: Chain, k: int) -> Picture:
-    """The image in the colours of the components; striped where most of the depth is a guess."""
+    """The image in the colours of the components; striped where most of the depth is drawn."""
     result, track = chain.pairs[k], chain.of_track(k)
     part = result.components.of_pixel
     count = len(track)
@@ -80,12 +79,12 @@ def _components(chain: Chain, k: int) -> Picture:
     word = f"one {kind}" if count == 1 else f"{count} {kind}s, share of the image"
     grey = result.images[0].astype(float).mean(axis=2, keepdims=True)
     shaded = colours[part] * (0.6 + 0.4 * grey / 255)
-    guess = np.bincount(part.ravel(), ~(result.sigma.ravel() <= MOST_SIGMA), minlength=count)
-    unsure = guess / part.size > 0.5 * pixels
+    drawn = np.bincount(part.ravel(), result.drawn.ravel(), minlength=count)
+    striped = drawn / part.size > 0.5 * pixels
     stripe = np.add.outer(np.arange(part.shape[0]), np.arange(part.shape[1])) % 8 < 3
-    shaded[unsure[part] & stripe] = 255
-    if unsure.any():
-        word += "; striped: most of its depth is a guess"
+    shaded[striped[part] & stripe] = 255
+    if striped.any():
+        word += "; striped: most of its depth is drawn"
     return Picture(
         "components", word, shaded.astype(np.uint8), Legend(colours[None, :6], tuple(texts))
     )
@@ -116,18 +115,18 @@ def _depths(chain: Chain, k: int) -> list[Picture]:
     truth, (near, far) = result.true_depth, chain.depth_range
     bar, out = depth_legend(near, far, f" {chain.length}"), []
 
-    def add(name: str, title: str, z: AnyFloat, scored: str, guess: Mask | None = None) -> None:
+    def add(name: str, title: str, z: AnyFloat, scored: str, drawn: Mask | None = None) -> None:
         mre = scores.get(scored, {}).get("mre")
         title += "" if mre is None else f", MRE {mre:.3f}"
         title += "; grey = unseen" * (name == "depth_next")
-        if guess is not None and guess.mean() >= LEAST:
-            title += "; pale = a guess" + f" ({guess.mean():.0%})" * (name == "depth_ref")
-        colours = colourise_depth(z, near, far, False if guess is None else guess)
+        if drawn is not None and drawn.mean() >= LEAST:
+            title += "; pale = drawn" + f" ({drawn.mean():.0%})" * (name == "depth_ref")
+        colours = colourise_depth(z, near, far, False if drawn is None else drawn)
         out.append(Picture(name, title, colours, bar))
 
-    metre, guess = chain.metre or 1.0, ~(result.sigma <= MOST_SIGMA)
-    add("depth_ref", "depth of the reference frame", metre * result.depths[0], "solution", guess)
-    seen = result.in_next(guess, False)
+    metre, drawn = chain.metre or 1.0, result.drawn
+    add("depth_ref", "depth of the reference frame", metre * result.depths[0], "solution", drawn)
+    seen = result.in_next(drawn, False)
     add("depth_next", "depth of the next frame", metre * result.depths[1], "solution_next", seen)
     if (start := result.depth_maps.get("start")) is not None:
         scale = float(scores.get("start", {}).get("scale") or 1.0)

@@ -13,7 +13,7 @@ from PIL.Image import fromarray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError
-from soup_nlp.evaluation.confidence import MIN_CONFIDENCE, NO_CONFIDENCE
+from soup_nlp.evaluation.confidence import KINDS, MIN_CONFIDENCE, MOST_SIGMA, NO_CONFIDENCE
 from soup_nlp.evaluation.metrics import DepthMetrics
 from soup_nlp.evaluation.scoring import DEPTHS
 from soup_nlp.geometry.components import Components, find_components
@@ -25,10 +25,10 @@ from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.chain import UNIT, Chain
 from soup_nlp.report.figures import shown
-from soup_nlp.report.findings import guess_line
+from soup_nlp.report.findings import drawn_line
 from soup_nlp.report.layout import require_layout, result_tree
 from soup_nlp.report.pictures import overview, pictures
-from soup_nlp.report.summary import Summary
+from soup_nlp.report.summary import Summary, by_kind
 from soup_nlp.storage.files import as_path, plain, read_json
 from soup_nlp.storage.store import ReadTree, read_h5, require
 
@@ -48,6 +48,7 @@ class Result:
         reconstruction: Dense 3D of both frames.
         components: Rigid components with their motions.
         metrics: Scores against the truth, as those of a `Run`.
+        kind: (H, W) by what the depth of the reference frame is known, an index of `KINDS`.
         min_confidence: Smallest confidence of points in clouds.
     """
 
@@ -56,6 +57,7 @@ class Result:
     reconstruction: Reconstruction
     components: Components
     metrics: Mapping[str, DepthMetrics]
+    kind: Image
     min_confidence: float = MIN_CONFIDENCE
 
     def __str__(self) -> str:
@@ -73,8 +75,8 @@ class Result:
 
     @property
     def title(self) -> str:
-        """The name, and the share that is a guess."""
-        return ": ".join(filter(None, [self.name, guess_line(self.summary["certainty"])]))
+        """The name, and the share that is drawn."""
+        return ": ".join(filter(None, [self.name, drawn_line(self.summary["certainty"])]))
 
     @property
     def name(self) -> str:
@@ -149,6 +151,11 @@ class Result:
         """(H, W) standard deviation of log depth of the reference frame."""
         assert self.reconstruction.sigma_ref is not None
         return self.reconstruction.sigma_ref
+
+    @property
+    def drawn(self) -> Mask:
+        """(H, W) True where nothing tells the depth of the reference frame."""
+        return np.asarray(self.kind == KINDS.index("drawn"))
 
     @property
     def confidence(self) -> Float:
@@ -239,6 +246,7 @@ def result_of(run: Run, summary: Mapping[str, Any]) -> Result:
         reconstruction=run.reconstruction,
         components=run.components,
         metrics=run.metrics,
+        kind=run.confidence.kind,
         min_confidence=run.problem.output.min_confidence,
     )
 
@@ -261,16 +269,20 @@ def load(folder: str | Path) -> Result:
         planes = np.isfinite(soup.lam * soup.d).all()
         if not planes or not (np.abs(np.linalg.det(soup.R) - 1) < 1e-3).all():
             raise ValueError("planes or rotations of the solution are none")
+        sigma = require(tree, "depth/sigma_ref")
+        # older results know no kinds of depth
+        kind = tree.get("confidence", {}).get("kind", np.where(sigma > MOST_SIGMA, 2, 0))
         given = {f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)}
         seg, (height, width) = Segmentation(**given), tree["depth"]["next"].shape
         rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
         group, borrowed = tree["start"]["component"], tree["start"]["borrowed"].astype(bool)
         return Result(
             tree=tree,
-            summary=summary,
-            reconstruction=replace(rec, sigma_ref=require(tree, "depth/sigma_ref")),
+            summary={**summary, "certainty": by_kind(summary["certainty"])},
+            reconstruction=replace(rec, sigma_ref=sigma),
             components=find_components(soup, seg, group, K_ref, K_next, borrowed),
             metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
+            kind=kind,
         )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise DataError("result does not hold together", where=folder, found=error) from error

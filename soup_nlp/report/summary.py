@@ -1,19 +1,16 @@
 """What a run found and how sure that is, as numbers: summary.json and the shares of the verdict."""
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, Literal, NotRequired
 
 import numpy as np
 from typing_extensions import TypedDict
 
-from soup_nlp.arrays import Mask
-from soup_nlp.evaluation.confidence import MOST_SIGMA
+from soup_nlp.evaluation.confidence import KINDS
 from soup_nlp.evaluation.metrics import DepthMetrics, component_overlaps, skill
 from soup_nlp.geometry.constraints import constraints
-from soup_nlp.geometry.surface import hidden
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import DETERMINED, GUESSES, ORIGINS
-from soup_nlp.start.components import FIXED, TIES
 from soup_nlp.storage.versions import versions
 
 _ROUND = (
@@ -25,18 +22,30 @@ _ROUND = (
 Number = float | None
 """A number in JSON, where null stands for one that is not finite."""
 _OTHERS = {"scale_rule": str, "n_pixels": int}
-_SHARES = "determined", *DETERMINED, "guess", *GUESSES
 Scores: Any = TypedDict(  # type: ignore[misc]
     "Scores",
     {f.name: _OTHERS.get(f.name, Number) for f in fields(DepthMetrics)}
     | {"skill": NotRequired[Number]},
 )
 """Scores of a depth map, a `DepthMetrics`, and its skill."""
-Shares: Any = TypedDict(  # type: ignore[misc]
-    "Shares",
-    {k: NotRequired[float] if k == "given" else float for k in _SHARES} | {"median_sigma": Number},
-)
-"""Shares of the image, see `certainty`."""
+
+
+class Shares(TypedDict):
+    """Shares of the image, see `certainty`."""
+
+    measured: float
+    inferred: float
+    drawn: float
+    median_sigma: Number
+
+
+class OldShares(TypedDict):
+    """Shares of a result that knows no kinds of depth, see `by_kind`."""
+
+    determined: float
+    flow: float
+    guess: float
+    median_sigma: Number
 
 
 class Sizes(TypedDict):
@@ -60,7 +69,7 @@ class Summary(TypedDict):
     truth_unit: str | None
     seconds: dict[str, float]
     sizes: Sizes
-    certainty: Shares
+    certainty: Shares | OldShares
     verdict: list[str]
 
 
@@ -70,7 +79,6 @@ def summary(run: Run) -> dict[str, Any]:
     constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
     facing = run.problem.formulation.min_facing
     components: dict[str, Any] = {"count": len(run.components)}
-    shares = certainty(run)
     if truth is not None and truth.components is not None:
         overlaps = component_overlaps(run.components.of_pixel, truth.components)
         components["truth"] = {
@@ -129,7 +137,7 @@ def summary(run: Run) -> dict[str, Any]:
             "borrowed": int(run.start.borrowed.sum()),
             "median_error_px": float(np.median(run.start.error)),
         },
-        "certainty": shares,
+        "certainty": certainty(run),
         "evidence": run.confidence.evidence.rows(),
         **({} if run.given is None else {"depth_prior": run.given.as_dict()}),
         "flow": str(run.pair.flow),
@@ -141,57 +149,17 @@ def summary(run: Run) -> dict[str, Any]:
 
 
 def certainty(run: Run) -> dict[str, float]:
-    """Shares of the image for summary.json and the verdict.
+    """Shares of the image by `KINDS` of its depth, and "median_sigma" of what is measured."""
+    sure = run.confidence
+    sigma = sure.sigma[sure.kind == KINDS.index("measured")]
+    middle = float(np.median(sigma)) if sigma.size else float("nan")
+    return {**{kind: sure.share(kind) for kind in KINDS}, "median_sigma": middle}
 
-    Returns:
-        "determined": share with a sigma of log depth of at most `MOST_SIGMA`; the sum of "flow"
-        (pixels of the largest component), the shares in `ORIGINS` of what gives the other
-        components their scales, and with a depth prior "given" (depth or scale are the prior's).
-        "guess": the rest; the sum of "rest" (the camera is at rest or only turns), "fixed" (stands
-        still in the image though the camera moves, such as the bonnet of its car), "unseen" (no
-        usable flow, or hidden in the next frame), "unexplained" (`Start`), "flat"
-        (of a component without evidence of depth, see `Evidence.guess`), "scale" (of a component
-        whose scale alone is as uncertain as that) and "weak" (anything else). "median_sigma":
-        median of the determined pixels.
-    """
-    sigma = run.confidence.sigma
-    labels, start = run.segmentation.labels, run.start
-    sure = sigma <= MOST_SIGMA
-    tie = start.tie[labels]
-    assert run.pair.flow is not None
-    unseen = (run.pair.flow.confidence <= 0) | hidden(run.reconstruction)
-    rest, fixed = np.full(labels.shape, start.at_rest), tie == FIXED
-    flat = run.confidence.evidence.guess[start.component][labels]
-    by_scale = [run.confidence.terms[name] for name in ("scale", "pace")]
-    loose = np.hypot(*by_scale) > MOST_SIGMA
-    guess, left = {}, ~sure
-    reasons = {
-        "rest": rest,
-        "fixed": fixed,
-        "unseen": unseen,
-        "unexplained": start.unexplained[labels],
-        "flat": flat,
-        "scale": loose,
-    }
-    for name, mask in reasons.items():
-        guess[name] = left & mask
-        left = left & ~mask
 
-    def share(mask: Mask) -> float:
-        return float(mask.mean())
-
-    given = np.zeros(len(start.soup), bool) if run.given is None else run.given.from_prior
-    origin = np.array([DETERMINED.index(ORIGINS[name][0]) for name in TIES])[tie]
-    # the prior's pixels, whatever gives their component its scale
-    origin = np.where(given[labels], DETERMINED.index("given"), origin)
-    parts = {name: share(sure & (origin == k)) for k, name in enumerate(DETERMINED)}
-    if run.given is None:
-        del parts["given"]
-    return {
-        "determined": share(sure),
-        **parts,
-        "guess": share(~sure),
-        **{name: share(mask) for name, mask in guess.items()},
-        "weak": share(left),
-        "median_sigma": float(np.median(sigma[sure])) if sure.any() else float("nan"),
-    }
+def by_kind(shares: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The shares of a summary.json by kind; older ones have other names."""
+    if "drawn" in shares:
+        return shares
+    flow, rest = shares["flow"], shares["determined"] - shares["flow"]
+    old = {"measured": flow, "inferred": rest, "drawn": shares["guess"]}
+    return {**old, "median_sigma": shares["median_sigma"]}

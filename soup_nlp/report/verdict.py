@@ -9,7 +9,7 @@ import numpy as np
 from soup_nlp.evaluation.metrics import DepthMetrics, skill
 from soup_nlp.evaluation.scoring import SURE
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import certainty_lines, flow_words, found_words, guess_line, hints
+from soup_nlp.report.findings import certainty_lines, drawn_line, flow_words, found_words, hints
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.summary import certainty
 from soup_nlp.solve.stages import Solution
@@ -70,10 +70,10 @@ def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
     if not run.solved:
         return 1, f"the NLP did not converge ({run.solution.status}); the best iterate is written"
     if not run.good:
-        return 1, guess_line(certainty(run))
+        return 1, drawn_line(certainty(run))
     if mre_at_most is not None and missed(run):
         return 1, f"the MRE is above the expected {mre_at_most:g}"
-    return 0, "solved, and at most half of the image is a guess"
+    return 0, "solved, and at most half of the image is drawn"
 
 
 def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
@@ -82,14 +82,13 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
     `limit` is the largest MRE that the problem file expects; `details` adds what concerns the flow
     and the solver: iterations, energies, residuals.
     """
-    shares = certainty(run)
     whole = {k: v for k, v in run.seconds.items() if not k.startswith("nlp_")}
     inner = {k[4:]: v for k, v in run.seconds.items() if k.startswith("nlp_")}
     sections = {
         "status": _status(run),
         "found": found_words(run),
-        "certainty": certainty_lines(shares),
-        "try": hints(run, shares),
+        "certainty": certainty_lines(certainty(run)),
+        "try": hints(run),
         "accuracy": accuracy(run.metrics),
         "expected": [f"MRE at most {limit:g}: {'missed' if missed(run) else 'met'}"]
         if limit is not None and "solution" in run.metrics

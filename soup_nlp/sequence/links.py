@@ -18,9 +18,9 @@ from soup_nlp.report.result import Result, load
 
 MIN_PIXELS = 200
 """Links with fewer pixels are flagged."""
-MAX_GUESSED = 0.5
-"""A pair has no parallax if the depth of a larger share of its background is a guess, and a chain
-is not good if that of a larger share of all its images is."""
+MOST_DRAWN = 0.5
+"""A pair has no parallax if a larger share of its background has the depth of neighbours, and a
+chain is not good if a larger share of all its images is drawn."""
 MADE_BY = "soup_nlp.load(...) of the folder of each pair"
 """Where pairs of a chain come from, for messages."""
 SAME = 0.3
@@ -36,8 +36,8 @@ def read_pair(folder: Path) -> Result:
 
 
 def still(result: Result) -> bool:
-    """Whether most of the background has no parallax, so that its depth is a guess."""
-    return result.components.background.borrowed > MAX_GUESSED
+    """Whether most of the background has no parallax."""
+    return result.components.background.borrowed > MOST_DRAWN
 
 
 def link(
@@ -76,13 +76,13 @@ def bridge(pairs: Sequence[Result], a: int) -> Link | None:
 def near_link(pairs: Sequence[Result], a: int) -> Link | None:
     """The link of a pair and the next one, from static pixels that are confident in both.
 
-    It is flagged where the depth of a pair without parallax is a guess, or where no pixel is
+    It is flagged where a pair has no parallax, or where no pixel is
     confident in both.
     """
     first, second = pairs[a], pairs[a + 1]
     z, keep = first.depths[1], first.in_next(first.static, False)
-    guess, every = still(first) or still(second), np.ones_like(keep)
-    near = link((a, a + 1), z, second.depths[0], keep & second.static, guess)
+    flagged, every = still(first) or still(second), np.ones_like(keep)
+    near = link((a, a + 1), z, second.depths[0], keep & second.static, flagged)
     return near or link((a, a + 1), z, second.depths[0], every, flagged=True)
 
 

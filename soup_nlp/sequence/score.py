@@ -13,11 +13,11 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluation.metrics import MEDIAN, UNSCALED, Convention, depth_metrics
 from soup_nlp.geometry.rotation import log
 from soup_nlp.report.chain import Chain
-from soup_nlp.report.findings import certainty_lines, guess_line
+from soup_nlp.report.findings import certainty_lines, drawn_line
 from soup_nlp.report.page import headline, page, path_table, preformatted, table
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import sectioned
-from soup_nlp.sequence.links import MAX_GUESSED
+from soup_nlp.sequence.links import MOST_DRAWN
 from soup_nlp.storage.files import read_text
 
 AFFINE = Convention("affine")
@@ -111,7 +111,7 @@ def link_table(contents: Mapping[str, Any]) -> list[list[str]]:
     for k in contents["links"]:
         a, b = k["pairs"]
         true_ratio = f"{true[a, b]:.3f}" if (a, b) in true else ""
-        note = "bridge" if k["bridge"] else "a guess" if k["flagged"] else ""
+        note = "bridge" if k["bridge"] else "doubtful" if k["flagged"] else ""
         numbers = [f"{k['ratio']:.3f}", f"{k['spread']:.3f}", true_ratio, str(k["pixels"])]
         rows.append([f"{a}, {b}", *numbers, note])
     # columns without a text are left out, and so is the table of a chain without links
@@ -140,7 +140,7 @@ def chain_lines(chain: Chain) -> list[str]:
     lines += ["".join(f"{c:<{w}}" for c, w in zip(row, widths)).rstrip() for row in rows]
     long = [track for track in contents["tracks"] if len(track["path"]) > 2]
     lines.append(f"tracks      {len(long)} components followed over two pairs or more")
-    lines.append(sectioned({"certainty": certainty_lines(chain.certainty)}))
+    lines.append(sectioned({"certainty": certainty_lines(chain.certainty, "all images")}))
     if contents["score"]:
         lines.append(f"accuracy    {score_text(contents['score'])}")
     return lines
@@ -149,9 +149,9 @@ def chain_lines(chain: Chain) -> list[str]:
 def chain_exit_code(chain: Chain) -> tuple[int, str]:
     """Exit code of `soup-nlp chain`, and its reason."""
     shares = chain.certainty
-    if shares["guess"] > MAX_GUESSED:
-        return 1, guess_line(shares, "all images")
-    return 0, "solved, and at most half of all images is a guess"
+    if shares["drawn"] > MOST_DRAWN:
+        return 1, drawn_line(shares, "all images")
+    return 0, "solved, and at most half of all images is drawn"
 
 
 def score_lines(scores: Mapping[str, Any] | None) -> list[str]:
@@ -263,7 +263,7 @@ def chain_page(chain: Chain, name: str = PAGE) -> str:
         f"{a} to {b}" if other == name else f'<a href="{other}">{a} to {b}</a>'
         for other, (a, b) in names.items()
     )
-    top = headline(guess_line(chain.certainty, "all images"), words)
+    top = headline(drawn_line(chain.certainty, "all images"), words)
     parts = {
         "summary": top + f"<br>frames {others}" * (len(names) > 1),
         "Paths": path_table(shown),

@@ -77,13 +77,13 @@ def test_sigma_is_scored_by_what_it_says():
     # half of the pixels are exact and sure, half are off by a factor of 2
     error = np.repeat([0.0, np.log(2.0)], 50)
     honest = sigma_scores(error, np.where(error > 0, 1.0, 0.05))
-    assert honest["sure_wrong"] == honest["wrong_sure"] == honest["right_guess"] == 0.0
+    assert honest["sure_wrong"] == honest["wrong_sure"] == honest["right_unsure"] == 0.0
     assert honest["nll"] == pytest.approx(0.25 * np.log(2) ** 2 + 0.5 * np.log(0.05))
     assert honest["nll"] < honest["flat"] == pytest.approx(0.5 + 0.5 * np.log(np.log(2) ** 2 / 2))
     assert honest["ause"] == pytest.approx(0.0, abs=1e-9)
     assert [len(honest["reliability"]), honest["reliability"][-1][0]] == [10, 1.0]
     false = sigma_scores(error, np.where(error > 0, 0.05, 1.0))
-    assert (false["sure_wrong"], false["wrong_sure"], false["right_guess"]) == (1.0, 1.0, 1.0)
+    assert (false["sure_wrong"], false["wrong_sure"], false["right_unsure"]) == (1.0, 1.0, 1.0)
     assert false["nll"] > honest["flat"]
     flat = sigma_scores(error, np.full(100, np.sqrt(np.mean(error**2))))
     assert flat["nll"] == pytest.approx(flat["flat"])
@@ -145,7 +145,7 @@ def test_one_rigid_motion_is_compared_on_its_own_pixels():
 
 
 def test_sigma_has_columns_and_a_picture_of_its_curves(tmp_path):
-    rows = [solved("shared", p) | {"family": p, "guess": 0.1} for p in ("a", "b")]
+    rows = [solved("shared", p) | {"family": p, "drawn": 0.1} for p in ("a", "b")]
     write_suite(tmp_path / "without.md", frame_of(rows))
     assert not (tmp_path / "without.png").exists()
     error = np.linspace(0, 0.3, 40)

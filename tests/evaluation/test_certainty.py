@@ -1,4 +1,4 @@
-"""Shares of the image whose depth is determined, and the reasons for guesses."""
+"""By what the depth of every pixel is known: measured, inferred or drawn."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -6,119 +6,99 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soup_nlp.evaluation.confidence import MOST_SIGMA, PRIOR
+from soup_nlp.evaluation.confidence import DRAWN, KINDS, PRIOR, confidence, kinds
 from soup_nlp.geometry.surface import hidden
-from soup_nlp.report.findings import (
-    DETERMINED,
-    GUESSES,
-    ORIGINS,
-    SHARES,
-    certainty_lines,
-    guess_line,
-)
-from soup_nlp.report.summary import certainty
-from soup_nlp.start.components import FIXED, SCENE, TIES
+from soup_nlp.report.findings import LEAST, ORIGINS, SAID, certainty_lines, drawn_line
+from soup_nlp.report.summary import by_kind, certainty
+from soup_nlp.start.components import SCENE, TIES
 
 
-def unsure(run, scale=None):
-    """The same run where every pixel is a guess, though the flow is evidence of depth."""
-    sure = run.confidence
-    far = np.full(int(run.start.component.max()) + 1, 9.0)
-    evidence = replace(sure.evidence, turn=far, constant=far, solution=np.zeros_like(far))
-    terms = dict(sure.terms)
-    if scale is not None:
-        other = (run.start.component != SCENE)[run.segmentation.labels]
-        terms["scale"] = np.where(other, scale, 0.0)
-        terms["pace"] = np.zeros_like(terms["pace"])
-    sigma = np.full_like(sure.sigma, PRIOR)
-    return replace(run, confidence=replace(sure, sigma=sigma, terms=terms, evidence=evidence))
+def sure_of(run, start, given=None):
+    """The uncertainty of a run with another start."""
+    energy = run.data, run.weights, run.problem.formulation
+    return confidence(run.reconstruction, run.pair, start, *energy, given)
 
 
-def test_shares_add_up(small_run):
-    shares = certainty(small_run)
-    assert shares["determined"] + shares["guess"] == pytest.approx(1.0)
-    parts = [shares[k] for k in DETERMINED if k in shares]
-    assert sum(parts) == pytest.approx(shares["determined"])
-    assert sum(shares[k] for k in GUESSES) == pytest.approx(shares["guess"])
-    assert shares["median_sigma"] < MOST_SIGMA
+def shares(**known):
+    """Shares of the kinds; those that are not given are 0."""
+    return {**dict.fromkeys(KINDS, 0.0), "median_sigma": 0.05, **known}
 
 
-def test_every_guess_has_one_reason(small_run):
-    shares = certainty(unsure(small_run))
-    assert shares["determined"] == 0
-    assert np.isnan(shares["median_sigma"])
-    assert sum(shares[k] for k in GUESSES) == pytest.approx(1.0)
+def test_every_pixel_is_of_one_kind(small_run):
+    found, sure = certainty(small_run), small_run.confidence
+    assert sum(found[kind] for kind in KINDS) == pytest.approx(1.0)
+    assert found["measured"] > 0.5
+    measured = sure.kind == KINDS.index("measured")
+    assert found["median_sigma"] == pytest.approx(np.median(sure.sigma[measured]))
+    seen = (small_run.pair.flow.confidence > 0) & ~hidden(small_run.reconstruction)
+    static = (small_run.start.component == SCENE)[small_run.segmentation.labels]
+    assert (seen & static)[measured].all()
+    # what moves by itself has the scale of a contact
+    assert (sure.kind[~static] > 0).all()
 
 
-def test_a_scale_that_contact_hardly_determines_is_named(small_run):
-    start, labels = small_run.start, small_run.segmentation.labels
-    two = (np.arange(len(start.soup)) < 9).astype(int)
-    tie = np.where(two, TIES.index("contact below"), TIES.index("reference"))
-    start = replace(start, component=two, tie=tie)
-    small_run = replace(small_run, start=start)
-    loose = certainty(unsure(small_run, 1.0))
-    firm = certainty(unsure(small_run, 1e-6))
-    tied_share = (start.component != SCENE)[labels].mean()
-    # without evidence of depth the scale is not the reason
-    assert 0 <= firm["scale"] < loose["scale"] <= tied_share
-    assert loose["scale"] + loose["weak"] == pytest.approx(firm["scale"] + firm["weak"])
-    (line,) = certainty_lines(loose)
-    assert "with a scale that contact hardly determines" in line
+@pytest.mark.parametrize("name", ["bends", "borrowed", "given"])
+def test_what_parallax_does_not_tell_is_inferred(name, small_run):
+    start, rec = small_run.start, small_run.reconstruction
+    half = np.arange(len(start.soup)) % 2 == 0
+    none, given = np.zeros(rec.labels.shape, bool), np.zeros_like(half)
+    if name == "given":
+        given = half
+    else:
+        start = replace(start, **{name: half})
+    kind = kinds(rec, small_run.pair.flow, start, none, given)
+    assert (kind[half[rec.labels]] == KINDS.index("inferred")).all()
+    assert (kind == KINDS.index("measured")).any()
+    assert (kinds(rec, small_run.pair.flow, start, ~none, given) == KINDS.index("drawn")).all()
 
 
-SAID = {
-    "reference": "by flow and parallax",
-    "contact below": "with the scale of a contact",
-    "outline": "with the scale of an outline",
-    "nothing": "without contact to anything that has a scale",
-    "ground": "with the scale of a contact",
-    "fixed in the image": "with the scale of an outline",
-    "given depth": "by the given depth",
-    "occlusion": "in front of what it covers",
-    "too fast": "nearer than its contact, at which it would move too far",
-}
+def test_before_a_camera_at_rest_all_is_drawn_but_what_is_given(small_run):
+    at_rest = replace(small_run.start, at_rest=True)
+    assert sure_of(small_run, at_rest).share("drawn") == 1.0
+    one = np.arange(len(at_rest.soup)) == 3
+    sigma = np.where(one, 0.3, np.inf)
+    given = SimpleNamespace(sigma=sigma, from_prior=one)
+    kind = sure_of(small_run, at_rest, given).kind
+    inside = one[small_run.segmentation.labels]
+    assert (kind[inside] == KINDS.index("inferred")).all()
+    assert (kind[~inside] == KINDS.index("drawn")).all()
 
 
-@pytest.mark.parametrize("name", TIES)
-def test_what_gives_a_component_its_scale_is_said(name, small_run):
-    start, sure = small_run.start, small_run.confidence
-    certain = replace(sure, sigma=np.full_like(sure.sigma, 0.1))
-    tied = replace(start, tie=np.full_like(start.tie, TIES.index(name)))
-    given = None
-    if name == "given depth":
-        given = SimpleNamespace(from_prior=np.ones(len(tied.soup), bool))
-    (line,) = certainty_lines(
-        certainty(replace(small_run, start=tied, confidence=certain, given=given))
-    )
-    assert line.startswith("100% of the image is determined, half of it to 10.0% (1 sigma): 100% ")
-    assert SAID[name] in line
-    # the page has words for every component, too
+def test_what_is_as_uncertain_as_a_drawing_is_one(small_run):
+    sure = small_run.confidence
+    assert (sure.kind[sure.sigma >= DRAWN] == KINDS.index("drawn")).all()
+    alone = dict.fromkeys(("proj", "cont", "orient", "prior"), 0.0)
+    blind = replace(small_run, weights=small_run.weights.replace(**alone))
+    nothing = sure_of(blind, blind.start)
+    assert np.median(nothing.sigma) == pytest.approx(PRIOR, rel=0.05)
+    assert nothing.share("drawn") > 0.95
+
+
+def test_every_kind_has_one_sentence():
+    lines = certainty_lines(shares(measured=0.7, inferred=0.2, drawn=0.1))
+    assert lines == [
+        "70% of the image is measured by parallax, half of it to 5.0% (1 sigma)",
+        "20% of the image is inferred from contact, order, bending, a continued surface or a given"
+        " depth",
+        "10% of the image is drawn: nothing tells its depth",
+    ]
+    assert SAID.keys() == set(KINDS)
+    # next to nothing is not worth a word
+    assert certainty_lines(shares(measured=1.0, drawn=LEAST / 2)) == [
+        "100% of the image is measured by parallax, half of it to 5.0% (1 sigma)"
+    ]
+    assert drawn_line(shares(measured=1.0)) == ""
+    said = drawn_line(shares(measured=0.7, drawn=0.3), "all images")
+    assert said == "30% of all images is drawn: nothing tells its depth"
+
+
+def test_older_results_have_kinds_too():
+    old = {"determined": 0.9, "flow": 0.6, "contact": 0.3, "guess": 0.1, "median_sigma": 0.05}
+    known = shares(measured=0.6, inferred=0.3, drawn=0.1)
+    assert by_kind(old) == pytest.approx(known)
+    assert by_kind(known) is known
+
+
+def test_the_page_has_words_for_what_gives_a_component_its_scale():
     assert ORIGINS.keys() == set(TIES)
-    assert ORIGINS[name][1] != name
-
-
-def test_a_camera_at_rest_is_the_reason_of_every_guess(small_run):
-    at_rest = replace(small_run, start=replace(small_run.start, at_rest=True))
-    shares = certainty(unsure(at_rest))
-    assert shares["rest"] == 1.0
-    assert guess_line(shares) == f"100% of the image is a guess: {SHARES['rest']}"
-
-
-def test_what_no_motion_explains_is_named(small_run):
-    half = np.arange(len(small_run.start.soup)) % 2 == 0
-    doubtful = replace(small_run, start=replace(small_run.start, unexplained=half))
-    shares = certainty(unsure(doubtful))
-    # but for what has no flow, or is hidden in the next frame
-    known = (small_run.pair.flow.confidence > 0) & ~hidden(small_run.reconstruction)
-    expected = np.mean(half[small_run.segmentation.labels] & known)
-    assert shares["unexplained"] == pytest.approx(expected)
-    assert "no motion that was found explains its flow" in certainty_lines(shares)[0]
-
-
-def test_what_is_fixed_in_the_image_is_named(small_run):
-    start = small_run.start
-    tie = np.where(start.component == start.component[0], FIXED, start.tie)
-    shares = certainty(unsure(replace(small_run, start=replace(start, tie=tie))))
-    fixed = (tie == FIXED)[small_run.segmentation.labels]
-    assert shares["fixed"] == pytest.approx(fixed.mean())
-    assert "stands still in the image while the camera moves" in certainty_lines(shares)[0]
+    assert not set(ORIGINS.values()) & set(TIES)

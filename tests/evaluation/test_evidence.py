@@ -15,7 +15,6 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.report.findings import hints
-from soup_nlp.report.summary import certainty
 from soup_nlp.start.bending import ANY_TURN, PLAIN_TURN, fit_robustly, turned
 from soup_nlp.start.camera_error import (
     KINDS,
@@ -203,7 +202,7 @@ def started(pair: Pair):
     raw = {"input": ORBIT, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
     case = prepare(make_problem(raw), pair=pair)
     done = make_run(case, skipped(case))
-    return done, "; ".join(hints(done, certainty(done)))
+    return done, "; ".join(hints(done))
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +228,7 @@ def test_a_wrong_principal_point_makes_depth_unsure(orbit):
 
 
 @pytest.mark.slow
-def test_two_scenes_are_a_guess():
+def test_two_scenes_are_drawn():
     one, other = (
         make_problem({"input": {**ORBIT, "scene": name}}).load_pair() for name in ("room", "street")
     )
@@ -239,8 +238,8 @@ def test_two_scenes_are_a_guess():
 
 
 @pytest.mark.slow
-def test_a_repeated_frame_is_a_guess(orbit):
+def test_a_repeated_frame_is_drawn(orbit):
     done, told = started(replace(orbit, flow=None, image_next=orbit.image_ref))
     assert not done.good
-    assert done.confidence.guessed == 1
+    assert done.confidence.share("drawn") == 1
     assert "nearly the same" in told

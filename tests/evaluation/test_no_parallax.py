@@ -55,10 +55,10 @@ def test_a_start_without_parallax_borrows_depth_but_fits_flow(tiles, angle):
         # vehicles that are taken to bend, although the flow jumps between them
         ("jam", 25, 320, True),
         ("sheet", 0, 768, False),
-        # smaller ones are called a guess: a constant depth explains them to half a pixel
+        # a constant depth explains smaller ones to half a pixel
     ],
 )
-def test_the_verdict_warns_where_depth_is_a_guess(scene, seed, width, said, tmp_path):
+def test_the_verdict_warns_where_depth_is_drawn(scene, seed, width, said, tmp_path):
     height = width * 109 // 256
     raw = {
         "input": {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height},
@@ -69,7 +69,7 @@ def test_the_verdict_warns_where_depth_is_a_guess(scene, seed, width, said, tmp_
     case = prepare(make_problem(raw))
     done = make_run(case, skipped(case))
     assert done.good != said
-    share = re.search(r"(\d+)% is a guess", verdict(done, tmp_path, []))
+    share = re.search(r"(\d+)% of the image is drawn", verdict(done, tmp_path, []))
     assert (share is not None and int(share[1]) > 50) == said
 
 

@@ -18,8 +18,8 @@ CAMERA = RigidMotion(exp([0.0, 0.01, 0.0]), np.array([0.05, 0.02, -0.1]))
 BOARD = RigidMotion(exp([0.0, 0.0, 0.05]), np.array([-0.1, 0.0, -0.1]))
 """next_from_ref."""
 WALL_Z, BOARD_Z = 4.0, 2.0
-CERTAINTY = {"determined": 1.0, "flow": 1.0, "guess": 0.0, "flat": 0.0, "median_sigma": 0.07}
-"""Some of the shares of `report.summary.certainty`."""
+CERTAINTY = {"measured": 1.0, "inferred": 0.0, "drawn": 0.0, "median_sigma": 0.07}
+"""The shares of `report.summary.certainty`."""
 START = {"bends": np.zeros(12), "borrowed": np.zeros(12), "parallax": np.full(12, 5.0)}
 START |= {"tie": np.where(np.isin(np.arange(12), (5, 6)), 1, 0)}
 
@@ -49,6 +49,7 @@ def small_result() -> Result:
         reconstruction=replace(reconstruct(soup, labels, K, K), sigma_ref=0.001 * (u + v)),
         components=find_components(soup, seg, mine.astype(int), K, K),
         metrics={"solution": depth_metrics(1.0, 10.0)},
+        kind=np.zeros((60, 80), np.uint8),
     )
 
 

@@ -15,7 +15,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.chain import Chain
-from soup_nlp.report.findings import SHARES
+from soup_nlp.report.findings import drawn_line
 from soup_nlp.report.folder import write_folder
 from soup_nlp.report.page import MODES, make_pair, make_scene, pair_page, surface_cells
 from soup_nlp.report.pictures import _enlarged, pictures
@@ -162,38 +162,38 @@ def test_the_page_can_be_left_out(small_run, folder):
     assert "overview.png" in files
 
 
-def test_a_component_whose_depth_is_a_guess_is_striped(shown):
-    def stripes(sigma):
-        rec = replace(shown.reconstruction, sigma_ref=sigma)
-        own = pictures(Chain.of(replace(shown, reconstruction=rec)))["components"]
+def test_a_component_whose_depth_is_drawn_is_striped(shown):
+    def stripes(kind):
+        own = pictures(Chain.of(replace(shown, kind=kind)))["components"]
         return (own.image == 255).all(axis=2), own.title
 
-    sigma = np.full(shown.labels.shape, 0.02)
-    white, title = stripes(sigma)
+    kind = np.ones(shown.labels.shape, np.uint8)
+    white, title = stripes(kind)
     assert "striped" not in title
     assert white.mean() < 0.01
-    sigma[shown.components.of_superpixel[shown.labels] == 0] = 0.4
-    white, title = stripes(sigma)
-    assert "striped: most of its depth is a guess" in title
+    kind[shown.components.of_superpixel[shown.labels] == 0] = 2
+    white, title = stripes(kind)
+    assert "striped: most of its depth is drawn" in title
     assert 0.3 < white[shown.components.of_superpixel[shown.labels] == 0].mean() < 0.45
 
 
-@pytest.mark.parametrize(("guess", "said"), [(0.004, None), (0.3, "30%"), (1.0, "100%")])
-def test_page_pictures_and_overview_begin_with_the_guess(guess, said, shown):
-    shares = {**shown.summary["certainty"], "guess": guess, "flat": guess}
-    sigma = np.full(shown.labels.size, 0.02)
-    sigma[: round(guess * sigma.size)] = 0.4
-    rec = replace(shown.reconstruction, sigma_ref=sigma.reshape(shown.labels.shape))
-    one = replace(shown, summary={**shown.summary, "certainty": shares}, reconstruction=rec)
+@pytest.mark.parametrize(("share", "said"), [(0.004, None), (0.3, "30%"), (1.0, "100%")])
+def test_page_pictures_and_overview_begin_with_what_is_drawn(share, said, shown):
+    shares = {**shown.summary["certainty"], "drawn": share}
+    kind = np.zeros(shown.labels.size, np.uint8)
+    kind[: round(share * kind.size)] = 2
+    kind = kind.reshape(shown.labels.shape)
+    one = replace(shown, summary={**shown.summary, "certainty": shares}, kind=kind)
     drawn = pictures(Chain.of(one))
     depth, header = drawn["depth_ref"].title, pair_page(one, drawn).partition("</header>")[0]
-    sentence = f"{said} of the image is a guess: {SHARES['flat']}"
-    assert depth.endswith(f"; pale = a guess ({said})") == bool(said)
-    # two frames show the same guess, where both see it
+    sentence = drawn_line(shares)
+    assert sentence.startswith(f"{said} of the image is drawn") == bool(said)
+    assert depth.endswith(f"; pale = drawn ({said})") == bool(said)
+    # two frames show the same, where both see it
     pale = [drawn[name].image.min(axis=2) >= 165 for name in ("depth_ref", "depth_next")]
     for mask, frame in zip(pale, Chain.of(one), strict=True):
-        assert mask[frame.guess].all()
-    assert pale[0].mean() == pytest.approx(guess, abs=0.05)
+        assert mask[frame.drawn].all()
+    assert pale[0].mean() == pytest.approx(share, abs=0.05)
     assert (f"<p><strong>{sentence}</strong> &middot; " in header) == bool(said)
     assert one.title == (f"{one.name}: {sentence}" if said else one.name)
 

@@ -175,14 +175,14 @@ def test_the_least_confidence_hides_points(browser, small_run):
     browser.value("soupView.setLeast(0.98)")
     assert browser.value(size) < whole
     assert drawn(canvas(browser)) < drawn(before)
-    # without guesses means from a confidence of a half
-    click = "document.getElementById('guesses').click()"
-    browser.value(f"soupView.setLeast(0.5); {click}")
+    browser.value("soupView.setLeast(0)")
     assert browser.value(size) == whole
+    click = "document.getElementById('drawn').click()"
     browser.value(click)
-    half = browser.value(size)
-    browser.value("soupView.setLeast(0.5)")
-    assert half == browser.value(size) < whole
+    share = small_run.confidence.share("drawn")
+    assert (browser.value(size) < whole) == (share > 0)
+    browser.value(click)
+    assert browser.value(size) == whole
     browser.value("document.querySelectorAll('#modes button')[1].click()")
     browser.wait("location.hash.startsWith('#mode=')")
 

@@ -7,13 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.geometry.constraints import DEFINITIONS, constraints
 from soup_nlp.pipeline.record import FullSize
 from soup_nlp.report import findings
 from soup_nlp.report.check import _constraints
-from soup_nlp.report.summary import certainty
 from soup_nlp.report.verdict import exit_code, facts
 from soup_nlp.start.camera_error import CameraError
+from soup_nlp.start.components import FIXED, SCENE
 
 
 def titles(text):
@@ -81,28 +82,50 @@ def seen(run, confidence=None, focal=0.0, camera=None):
     return replace(run, pair=pair, confidence=replace(sure, evidence=evidence))
 
 
+def unsure(run, sigma=1.2, **start):
+    """A run with another start whose depth is drawn where sigma (H, W) or a number is large."""
+    sure = run.confidence
+    sigma = np.broadcast_to(sigma, sure.sigma.shape).astype(float)
+    kind = np.where(sigma > MOST_SIGMA, 2, 0).astype(np.uint8)
+    sure = replace(sure, sigma=sigma, kind=kind)
+    return replace(run, confidence=sure, start=replace(run.start, **start))
+
+
+def without_gap(run):
+    """A run whose flow a turn alone explains as well."""
+    none = np.zeros_like(run.confidence.evidence.turn)
+    evidence = replace(run.confidence.evidence, turn=none, constant=none, solution=none)
+    return replace(run, confidence=replace(run.confidence, evidence=evidence))
+
+
+def told(run):
+    """The line of hints, or "" for none."""
+    return "".join(findings.hints(run))
+
+
 def test_hints_name_what_would_help(small_run):
-    shares = {**certainty(small_run), "rest": 0.0, "flat": 0.1, "scale": 0.1}
-    (told,) = findings.hints(small_run, shares)
-    assert "frames farther apart in time" in told
-    assert "--depth-prior" in told
-    (told,) = findings.hints(small_run, {**shares, "rest": 0.9})
-    assert "moves aside" in told
-    assert findings.hints(small_run, dict.fromkeys(shares, 0.0)) == []
-    (told,) = findings.hints(small_run, {**dict.fromkeys(shares, 0.0), "fixed": 0.02})
-    assert "a watermark" in told
+    start, labels = small_run.start, small_run.segmentation.labels
+    sure = unsure(small_run, 0.05)
+    assert told(sure) == ""
+    flat = without_gap(small_run)
+    assert "moves aside" in told(unsure(flat))
+    assert told(unsure(flat, 0.05)) == ""
+    tenth = np.where(np.arange(labels.size).reshape(labels.shape) < labels.size // 10, 1.2, 0.05)
+    assert "frames farther apart in time" in told(unsure(flat, tenth))
+    assert "moves aside" in told(unsure(small_run, 0.05, at_rest=True))
+    moving = (start.component != SCENE)[labels]
+    assert "--depth-prior" in told(unsure(small_run, np.where(moving, 1.2, 0.05)))
+    whole = np.ones_like(start.unexplained)
+    assert "--depth-prior" in told(unsure(small_run, tenth, unexplained=whole))
+    assert "a watermark" in told(unsure(small_run, tie=np.full_like(start.tie, FIXED)))
     combed = np.random.default_rng(0).integers(0, 40, small_run.pair.image_ref.shape, np.uint8)
     combed[::2] += 100
     pair = replace(small_run.pair, image_ref=combed)
-    (told,) = findings.hints(replace(small_run, pair=pair), dict.fromkeys(shares, 0.0))
-    assert "not interlaced" in told
-    # a small guess of many small parts has a reason, too
-    small = {**dict.fromkeys(shares, 0.0), "guess": 0.006, "unseen": 0.004, "weak": 0.002}
-    assert findings.guess_words(small).endswith(": mostly no usable flow")
-    weak = {**dict.fromkeys(shares, 0.0), "weak": 0.4}
-    assert findings.hints(seen(small_run, focal=0.1), weak) == []
-    (told,) = findings.hints(seen(small_run, focal=0.3), weak)
-    assert "--fov" in told
+    assert "not interlaced" in told(replace(sure, pair=pair))
+    assert "--fov" not in told(seen(unsure(small_run), focal=0.1))
+    assert "--fov" in told(seen(unsure(small_run), focal=0.3))
+    blind = seen(sure, np.zeros_like(small_run.pair.flow.confidence))
+    assert told(blind) == "a better flow (--flow)"
 
 
 def test_proposed_intrinsics_are_those_of_the_images_as_given(small_run):
@@ -122,31 +145,16 @@ def test_proposed_intrinsics_are_those_of_the_images_as_given(small_run):
 
 def test_frames_without_a_common_scene_are_told_nothing_else(small_run):
     """Where hardly any flow is usable, its parallax, camera and motion are no evidence."""
-    guess = {**certainty(small_run), "guess": 1.0, "flat": 0.1, "scale": 0.1}
     few = np.zeros_like(small_run.pair.flow.confidence)
     few[:5] = 1.0
+    nothing = without_gap(unsure(small_run))
     for camera in (None, "zoom between the frames"):
-        (told,) = findings.hints(seen(small_run, few, 0.4, camera), guess)
-        assert told.endswith("closer in time: hardly anything is in both")
-    assert "farther apart" in findings.hints(seen(small_run, np.ones_like(few)), guess)[0]
-    unsure = np.full_like(small_run.confidence.sigma, 1.2)
+        found = told(seen(nothing, few, 0.4, camera))
+        assert found.endswith("closer in time: hardly anything is in both")
+    assert "moves aside" in told(seen(nothing, np.ones_like(few)))
     for confidence, expected in ((few, True), (np.ones_like(few), False)):
-        run = seen(small_run, confidence)
-        run = replace(run, confidence=replace(run.confidence, sigma=unsure))
-        camera = findings.found_words(run)[0]
-        assert camera.endswith("(a guess: hardly any flow is usable)") == expected
-
-
-def test_guesses_and_hints_name_what_is_wrong(small_run):
-    shares = {"guess": 0.3, "unseen": 0.2, "rest": 0.004, "flat": 0.06, "weak": 0.036, "scale": 0}
-    assert findings.guess_words(shares) == (
-        "30% is a guess (sigma above 25%): 20% no usable flow, 6% a turn alone or a constant depth"
-        " explains the flow nearly as well, 4% little information"
-    )
-    unseen = seen(small_run, np.zeros_like(small_run.pair.flow.confidence))
-    assert findings.hints(unseen, shares) == [
-        "a better flow (--flow); frames farther apart in time"
-    ]
+        camera = findings.found_words(seen(nothing, confidence))[0]
+        assert camera.endswith("(hardly any flow is usable)") == expected
 
 
 @pytest.mark.parametrize(
@@ -155,21 +163,20 @@ def test_guesses_and_hints_name_what_is_wrong(small_run):
         ({}, 0, "solved"),
         ({"status": "Interrupted", "solved": False}, 1, "interrupted"),
         ({"status": "Time_Limit", "solved": False}, 1, "did not converge (Time_Limit)"),
-        ({"guessed": 0.51}, 1, "51% of the image is a guess"),
+        ({"drawn": 0.51}, 1, "51% of the image is drawn: nothing tells its depth"),
         ({"mre": 0.3}, 1, "above the expected 0.2"),
     ],
 )
 def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
-    shares = {"guess": 0.51, "weak": 0.51}
+    outcome = {"status": "Solve_Succeeded", "solved": True, "drawn": 0.1, "mre": 0.1} | changes
+    shares = {"measured": 0.0, "inferred": 0.0, "drawn": outcome["drawn"], "median_sigma": 0.1}
     monkeypatch.setattr("soup_nlp.report.verdict.certainty", lambda run: shares)
-    outcome = {"status": "Solve_Succeeded", "solved": True, "guessed": 0.1, "mre": 0.1} | changes
     expected = SimpleNamespace(mre_at_most=0.2)
     fake = SimpleNamespace(
         refined=None,
         solution=SimpleNamespace(status=outcome["status"]),
         solved=outcome["solved"],
-        good=outcome["solved"] and outcome["guessed"] <= 0.5,
-        confidence=SimpleNamespace(guessed=outcome["guessed"]),
+        good=outcome["solved"] and outcome["drawn"] <= 0.5,
         metrics={"solution": SimpleNamespace(mre=outcome["mre"])},
         problem=SimpleNamespace(expected=expected),
     )

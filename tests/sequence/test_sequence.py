@@ -62,33 +62,33 @@ def test_a_chain_is_written(tmp_path):
     np.testing.assert_allclose(poses[1, 1:4], CAMERA.centre, atol=1e-8)
 
 
-def test_a_chain_says_which_depth_is_a_guess(tmp_path):
-    shares = CERTAINTY | {"determined": 0.0, "guess": 1.0, "flat": 1.0, "median_sigma": None}
+def test_a_chain_says_which_depth_is_drawn(tmp_path):
+    shares = CERTAINTY | {"measured": 0.0, "drawn": 1.0, "median_sigma": None}
     sure = toy_pairs()
 
     def unsure(pair):
         rec = replace(pair.reconstruction, sigma_ref=np.full((60, 80), 1.2))
         summary = {**pair.summary, "certainty": shares}
-        return replace(pair, reconstruction=rec, summary=summary)
+        return replace(pair, reconstruction=rec, summary=summary, kind=np.full_like(pair.kind, 2))
 
     half, none = make_chain([sure[0], unsure(sure[1])]), make_chain([*map(unsure, sure)])
     for chain, share, code in ((make_chain(sure), 0, 0), (half, 50, 0), (none, 100, 1)):
         chain = write_chain(tmp_path, chain, "toy", ["a.png", "b.png", "c.png"])
         told = json.loads((tmp_path / "chain.json").read_text())
-        assert told["certainty"]["guess"] == pytest.approx(share / 100)
-        said = f"{share}% of all images is a guess: a turn alone or a constant depth"
+        assert told["certainty"]["drawn"] == pytest.approx(share / 100)
+        said = f"{share}% of all images is drawn: nothing tells its depth"
         text = (tmp_path / "report.html").read_text()
         assert (f"<strong>{said}" in text) == bool(share)
         assert "<strong></strong>" not in text
-        assert f", {share}% a guess)" in str(chain)
+        assert f", {share}% drawn)" in str(chain)
         lines = "\n".join(chain_lines(chain))
-        assert (f"{share}% is a guess" in lines) == bool(share)
+        assert (said in lines) == bool(share)
         assert ("half of it to 7.0%" in lines) == (share < 100)
         assert chain_exit_code(chain)[0] == code
     assert chain_exit_code(none)[1].startswith(said)
     # of the last frame, the next one of an unsure pair, what no other frame shows is unknown
-    assert [half[k].guess.mean() for k in range(2)] == [0, 1]
-    np.testing.assert_array_equal(half[2].guess, np.isfinite(half.depth(2)))
+    assert [half[k].drawn.mean() for k in range(2)] == [0, 1]
+    np.testing.assert_array_equal(half[2].drawn, np.isfinite(half.depth(2)))
     first, second = (pictures(half, k)["depth_ref"].image for k in range(2))
     # what is unknown is grey
     assert second[np.isfinite(half.depth(1))].min() >= 165 > first.min()
@@ -111,7 +111,7 @@ def test_the_page_of_a_chain_opens(tmp_path):
             assert browser.value("document.querySelector('#gallery img').naturalWidth") == 80
         assert all((a != b).mean() > 0.01 for a, b in pairwise(shots))
         now = "document.getElementById('now').textContent"
-        assert browser.value(now) == "<b>c.png, time 2 of 2; 0 % a guess"
+        assert browser.value(now) == "<b>c.png, time 2 of 2; 0 % drawn"
         # the other pair adds its static points to what is shown and saved
         size, alone = "soupView.ply().size", browser.value("soupView.ply().size")
         browser.value("document.getElementById('all').click()")
@@ -137,7 +137,7 @@ def test_duplicate_frames_are_bridged(order, workers, tmp_path, capfd):
         cv2.imwrite(str(tmp_path / f"{k}.png"), deep)
     np.savetxt(tmp_path / "K.txt", render_scene("orbit", 0, 128, 86).K_ref)
     call = ["chain", str(tmp_path), "-o", str(tmp_path / "out"), "-q", "--workers", str(workers)]
-    # most of it is a guess
+    # most of it is drawn
     assert main([*call, "--superpixels", "16", "--neighbours", "5", *START_ALONE]) == 1
     told = json.loads((tmp_path / "out" / "chain.json").read_text())
     links = {tuple(link["pairs"]): link for link in told["links"]}

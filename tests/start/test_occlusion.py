@@ -182,7 +182,7 @@ def made(covers: bool, *options: str):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("covers", [True, False])
-def test_the_nlp_keeps_the_order_and_marks_it_a_guess(covers):
+def test_the_nlp_keeps_the_order_and_is_unsure_of_it(covers):
     problem, pair = made(covers)
     done = run(problem, pair=pair)
     assert (done.start.tie == TIES.index("occlusion")).any()

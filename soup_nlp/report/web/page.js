@@ -102,12 +102,12 @@ function frustum(colour) {
 /* --- the points and the surface of a pair -------------------------------------------------------- */
 
 const VERTEX = `
-  in float label, seen, sigma;
+  in float label, seen, sigma, kind;
   uniform sampler2D motion, raw;
   uniform float time, pixel, focal, size;
   uniform vec2 grid, sizeNext;
   uniform mat3 cameraNext;
-  uniform bool fromNext, still;
+  uniform bool fromNext, still, withDrawn;
   out vec2 place;
   out float depth, hidden, unsure;
   vec3 turned(vec3 w, vec3 x) {
@@ -125,8 +125,9 @@ const VERTEX = `
     int p = gl_VertexID, w = int(grid.x), i = int(label + 0.5);
     vec3 x = position;
     depth = x.z;
-    /* the static scene alone: what moves is left out */
-    unsure = still && texelFetch(motion, ivec2(0, i), 0).w > 0.5 ? 2.0 : sigma;
+    /* left out: what moves, of the static scene alone, and what is drawn, if so wanted */
+    bool left = still && texelFetch(motion, ivec2(0, i), 0).w > 0.5 || !withDrawn && kind > 1.5;
+    unsure = left ? 2.0 : sigma;
     hidden = 0.0;
     place = (vec2(p % w, p / w) + 0.5) / grid;
     if (fromNext) {
@@ -153,6 +154,7 @@ const FRAGMENT = `
   }`;
 const shared = {
   focal: { value: 1 }, size: { value: 1 }, most: { value: 1 }, far: { value: data.far }, fromNext: { value: false },
+  withDrawn: { value: true },
 };
 
 /* numbers that were deflated and written as base64 */
@@ -203,8 +205,8 @@ function motionTexture(values, component) {
 
 async function makePart(k) {
   const pair = pairs[k], [w, h] = pair.grid, kinds = {
-    labels: Uint16Array, planes: Float32Array, motion: Float32Array, motionCamera: Float32Array, borrowed: Uint8Array,
-    seen: Uint8Array, surface: Uint8Array, sigma: Uint8Array, component: Uint16Array, tie: Uint8Array,
+    labels: Uint16Array, planes: Float32Array, motion: Float32Array, motionCamera: Float32Array,
+    seen: Uint8Array, surface: Uint8Array, sigma: Uint8Array, kind: Uint8Array, component: Uint16Array, tie: Uint8Array,
   };
   const part = { k, w, h, step: pair.step, pictures: pair.pictures, textures: {}, group: new THREE.Group() };
   await Promise.all(Object.keys(kinds).map(async (name) => { part[name] = await unpack(pair[name], kinds[name]); }));
@@ -224,6 +226,7 @@ async function makePart(k) {
   const own = {
     position: [points(pair, part.labels, part.planes), 3], label: [Float32Array.from(part.labels), 1],
     seen: [Float32Array.from(part.seen), 1], sigma: [Float32Array.from(part.sigma, (x) => x / 255), 1],
+    kind: [Float32Array.from(part.kind), 1],
   };
   for (const name of Object.keys(own)) own[name] = new THREE.BufferAttribute(...own[name]);
   const geometry = (index) => {
@@ -304,9 +307,9 @@ function arrange() {
 async function setTime(value) {
   const t = Math.min(Math.max(Number(value) || 0, 0), last), k = Math.min(Math.floor(t), last - 1);
   $("time").value = t;
-  const guess = Math.round(100 * pairs[k].guess);
+  const share = Math.round(100 * pairs[k].drawn);
   const names = data.names.slice(Math.floor(t), Math.ceil(t) + 1).join(" to ");
-  $("now").textContent = `${names}, time ${Math.round(100 * t) / 100} of ${last}; ${guess} % a guess`;
+  $("now").textContent = `${names}, time ${Math.round(100 * t) / 100} of ${last}; ${share} % drawn`;
   if (now?.k !== k) {
     const part = await load(k);
     if (Math.min(Math.floor(Number($("time").value)), last - 1) !== k) return;
@@ -376,11 +379,10 @@ function buttons(id, entries, act) {
 }
 buttons("modes", data.modes, (name) => { setMode(name); remember({ mode: name }); });
 buttons("views", Object.keys(VIEWS).map((name) => [name, name]), (view) => { setView(view); remember({ view }); });
-/* confidence is 1 - sigma / 0.5, of a guess below 0.5; bytes hold sigma up to 0.5 */
+/* confidence is 1 - sigma / 0.5; bytes hold sigma up to 0.5 */
 function setLeast(value) {
   $("least").value = value;
   $("least-text").textContent = Number(value).toFixed(2);
-  $("guesses").checked = value < 0.5;
   shared.most.value = 1 - Number(value);
   draw();
 }
@@ -398,7 +400,7 @@ $("time").oninput = () => setTime($("time").value);
 $("time").onchange = () => remember({});
 $("size").oninput = () => { shared.size.value = Number($("size").value); draw(); };
 $("least").oninput = () => setLeast($("least").value);
-$("guesses").onchange = () => setLeast($("guesses").checked ? 0 : 0.5);
+$("drawn").onchange = () => { shared.withDrawn.value = $("drawn").checked; draw(); };
 $("far").oninput = () => setFar(near * (deepest / near) ** $("far").value);
 for (const id of ["points", "cameras", "paths"]) $(id).onchange = arrange;
 /* held: both cameras stand in one place, and everything moves as they see it */
@@ -435,7 +437,8 @@ function moved(part, p) {
   if (angle > 1e-9) x.applyAxisAngle(turn.divideScalar(angle), t * angle);
   return x.add(pivot).addScaledVector(at(6), t).applyMatrix4(part.group.matrix);
 }
-const drawn = (part, p) => part.position.getZ(p) < shared.far.value && part.sigma[p] / 255 <= shared.most.value
+const visible = (part, p) => part.position.getZ(p) < shared.far.value && part.sigma[p] / 255 <= shared.most.value
+  && (shared.withDrawn.value || part.kind[p] < 2)
   && (part === now || (p % part.every === 0 && !part.component[part.labels[p]]));
 
 /* the point of the pair nearest to the eye within a few pixels of a place of the canvas; -1 for none */
@@ -445,7 +448,7 @@ function pick(x, y) {
   const e = new THREE.Matrix4().multiplyMatrices(eye.projectionMatrix, eye.matrixWorldInverse).multiply(body.matrix).elements;
   let best = -1, nearest = Infinity;
   for (let p = 0; p < now.w * now.h; p++) {
-    if (!drawn(now, p)) continue;
+    if (!visible(now, p)) continue;
     const q = moved(now, p), depth = e[3] * q.x + e[7] * q.y + e[11] * q.z + e[15];
     if (!(depth > 0) || depth >= nearest) continue;
     const u = (0.5 + 0.5 * (e[0] * q.x + e[4] * q.y + e[8] * q.z + e[12]) / depth) * clientWidth;
@@ -459,11 +462,9 @@ function tell(p) {
   const i = now.labels[p], sigma = now.sigma[p], own = now.component[i];
   const spread = sigma < 255 ? `${(sigma / 5.1).toFixed(sigma < 26 ? 1 : 0)} %` : "50 % or unknown";
   const part = own ? `component ${own}, ${data.origins[now.tie[i]]}` : "the static scene";
-  const guess = sigma > 127, known = guess ? "little information" : "flow and parallax";
-  const source = (guess ? "a guess: " : "") + (now.borrowed[i] ? "depth taken from neighbours" : known);
   $("picked").textContent = (last > 1 ? `${data.names[now.k]}, ` : "")
     + `pixel (${(p % now.w) * now.step}, ${Math.floor(p / now.w) * now.step}): depth`
-    + ` ${now.position.getZ(p).toPrecision(4)} ${data.unit}, sigma ${spread}; superpixel ${i}, ${part}; ${source}`;
+    + ` ${now.position.getZ(p).toPrecision(4)} ${data.unit}, sigma ${spread}; superpixel ${i}, ${part}; ${data.kinds[now.kind[p]]}`;
 }
 let pressed = null;
 $("canvas").addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; });
@@ -484,7 +485,7 @@ function shownPoints() {
     pen.drawImage(texture.image, 0, 0, part.w, part.h);
     const pixels = pen.getImageData(0, 0, part.w, part.h).data;
     for (let p = 0; p < part.w * part.h; p++) {
-      if (!drawn(part, p)) continue;
+      if (!visible(part, p)) continue;
       if (part === now) number.set(p, places.length);
       places.push(moved(part, p));
       colours.push(pixels.subarray(4 * p, 4 * p + 3));
