@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -133,17 +133,18 @@ def batch(
             }
             tell()
             left = []
-            for name, result in each(works, workers, cluster=cluster, fresh=True):
-                if result.get("claimed"):
-                    left.append(name)
-                    continue
-                rows[name] = {**heads[name], **result}
-                append_row(folder / ROWS, rows[name])
-                # only now, so that another run that takes the mark finds the row
-                _mark(folder, name).unlink(missing_ok=True)
-                tell()
-                if say:
-                    say(len(rows), len(problems), rows[name])
+            with closing(each(works, workers, cluster=cluster, fresh=True)) as ended:
+                for name, result in ended:
+                    if result.get("claimed"):
+                        left.append(name)
+                        continue
+                    rows[name] = {**heads[name], **result}
+                    append_row(folder / ROWS, rows[name])
+                    # only now, so that another run that takes the mark finds the row
+                    _mark(folder, name).unlink(missing_ok=True)
+                    tell()
+                    if say:
+                        say(len(rows), len(problems), rows[name])
             # a failed pair is not tried again by the same call
             retry_failed = False
             time.sleep(PAUSE * bool(left))

@@ -3,7 +3,7 @@
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -227,14 +227,15 @@ def solve_pairs(
     }
     if workers > 1 and todo:
         workers = fitting(workers, needed_bytes(problems[next(iter(todo))]))
-    for name, result in each(todo, workers):
-        row = done[name] = {**heads[name], **result}
-        append_row(folder / ROWS, row)
-        # those of a worker process would be printed as Python prints them
-        for text in row.get("warnings", ()):
-            warnings.warn(text, DataWarning, stacklevel=2)
-        if say:
-            say(len(done), len(problems), row)
+    with closing(each(todo, workers)) as ended:
+        for name, result in ended:
+            row = done[name] = {**heads[name], **result}
+            append_row(folder / ROWS, row)
+            # those of a worker process would be printed as Python prints them
+            for text in row.get("warnings", ()):
+                warnings.warn(text, DataWarning, stacklevel=2)
+            if say:
+                say(len(done), len(problems), row)
     failures = [done[name] for name in problems if failed(done[name])]
     if failures:
         raise SolverError(

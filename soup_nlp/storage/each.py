@@ -7,10 +7,11 @@ import resource
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -19,7 +20,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 
 from soup_nlp.errors import DataError, optional
 from soup_nlp.storage.files import plain
-from soup_nlp.storage.system import end_with_parent
+from soup_nlp.storage.system import deferred_signals, end_with_parent
 
 Row = dict[str, Any]
 Work = Callable[[], Row]
@@ -29,6 +30,8 @@ ONE_THREAD = dict.fromkeys(
      "OPENCV_FOR_THREADS_NUM"), "1",
 )  # fmt: skip
 """Environment of a worker process; libraries read it when they are loaded."""
+GRACE = 2.0
+"""Seconds in which a worker that is interrupted can remove its temporary files."""
 
 
 def each(
@@ -38,13 +41,13 @@ def each(
     cluster: str | None = None,
     fresh: bool = False,
     seconds: float | None = None,
-) -> Iterator[tuple[str, Row]]:
+) -> Generator[tuple[str, Row]]:
     """Names and rows of jobs, in the order in which they end.
 
     A job that raises, or whose process dies, is a row with `ok` false and the reason; the others go
     on. Functions travel by cloudpickle and workers do not import `__main__`, so that this works
     from a script without a guard, from stdin and in a notebook. When the iteration ends early, as
-    by Ctrl-C, the workers are killed.
+    by Ctrl-C, the workers are interrupted, and killed if they go on.
 
     Args:
         jobs: Functions by name.
@@ -102,19 +105,34 @@ def peak_bytes() -> int:
 
 def _prepare_worker(parent: int) -> None:
     end_with_parent(parent)
-    # the parent handles Ctrl-C and ends its workers
+    # the parent handles Ctrl-C, and interrupts its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _in_processes(
     jobs: Mapping[str, Work], workers: int, fresh: bool, seconds: float | None
-) -> Iterator[tuple[str, Row]]:
+) -> Generator[tuple[str, Row]]:
     """Rows by threads that have a pool of one process each: if it dies, its job is known."""
     todo, done = SimpleQueue[tuple[str, Work]](), SimpleQueue[tuple[str, Row]]()
     for job in jobs.items():
         todo.put(job)
-    pools: dict[int, Any] = {}
+    pools, processes = dict[int, Any](), dict[int, int]()
     stop = threading.Event()
+
+    def call(number: int, work: Work) -> Row:
+        if number not in pools:
+            pools[number] = ProcessPoolExecutor(
+                1, initializer=_prepare_worker, initargs=(os.getpid(),), env=ONE_THREAD
+            )
+            processes[number] = pools[number].submit(os.getpid).result()
+        # a stop sees the process, or is seen here
+        return {} if stop.is_set() else dict(pools[number].submit(attempt, work).result(seconds))
+
+    def end(number: int) -> None:
+        processes.pop(number, None)
+        if pool := pools.pop(number, None):
+            pool.shutdown(kill_workers=True)
 
     def drive(number: int) -> None:
         while not stop.is_set():
@@ -122,16 +140,11 @@ def _in_processes(
                 name, work = todo.get_nowait()
             except Empty:
                 break
-            if number not in pools:
-                pools[number] = ProcessPoolExecutor(
-                    1, initializer=_prepare_worker, initargs=(os.getpid(),), env=ONE_THREAD
-                )
-            row = _row(pools[number], work, seconds)
+            row = _row(partial(call, number, work), seconds)
             if row.pop("ended", False) or fresh:
-                pools.pop(number).shutdown(kill_workers=True)
+                end(number)
             done.put((name, row))
-        if number in pools:
-            pools.pop(number).shutdown(kill_workers=True)
+        end(number)
 
     threads = [threading.Thread(target=drive, args=(k,), daemon=True) for k in range(workers)]
     try:
@@ -140,25 +153,32 @@ def _in_processes(
         for _ in jobs:
             yield done.get()
     finally:
-        stop.set()
-        for pool in list(pools.values()):
-            pool.shutdown(kill_workers=True)
-        for thread in threads:
-            thread.join()
+        # a second Ctrl-C waits as well
+        with deferred_signals():
+            stop.set()
+            for process in list(processes.values()):
+                with suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGTERM)
+            until = time.monotonic() + GRACE
+            for thread in threads:
+                thread.join(max(0.0, until - time.monotonic()))
+            for number, thread in enumerate(threads):
+                end(number)
+                thread.join()
 
 
-def _row(pool: Any, work: Work, seconds: float | None) -> Row:
-    """The row of a job that a pool of one process makes; "ended" says that the process is gone."""
+def _row(call: Work, seconds: float | None) -> Row:
+    """The row of a job in a process of its own; "ended" says that this process is gone."""
     try:
-        return dict(pool.submit(attempt, work).result(seconds))
+        return call()
     except TimeoutError:
         return failure(f"wall time limit of {seconds:g} s reached") | {"ended": True}
     except BrokenProcessPool as error:
         code = re.search(r"\{([A-Z]+)\(", str(error))
         signal_name = code[1] if code and code[1] != "EXIT" else None
         return failure(died(signal_name)) | {"ended": True}
-    except Exception as error:
-        # the job or its row cannot be sent to another process, or the pool is shut down
+    except (Exception, KeyboardInterrupt) as error:
+        # it or its row cannot be sent to another process, or the pool is stopped
         return failure(f"{type(error).__name__}: {error}")
 
 
@@ -173,7 +193,7 @@ def _alone(work: Work) -> Row:
     return next(_in_processes({"": work}, 1, True, None))[1]
 
 
-def _on_cluster(jobs: Mapping[str, Work], address: str) -> Iterator[tuple[str, Row]]:
+def _on_cluster(jobs: Mapping[str, Work], address: str) -> Generator[tuple[str, Row]]:
     """Rows from the workers of a Dask cluster, which solves the job of a lost worker elsewhere."""
     distributed = optional("distributed", "cluster")
     # it would print the traceback of every lost connection

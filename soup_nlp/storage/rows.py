@@ -4,6 +4,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,13 +109,14 @@ def measure_all(
     def so_far() -> list[Row]:
         return [row_of[name] for name in names if name in row_of]
 
-    for name, result in each({k: j.work for k, j in todo.items()}, workers, **options):
-        row_of[name] = {**plain(todo[name].name), "code": code, **result}
-        append_row(path, row_of[name])
-        if say:
-            say(len(row_of), len(set(names)), row_of[name])
-        if after:
-            after(so_far())
+    with closing(each({k: j.work for k, j in todo.items()}, workers, **options)) as ended:
+        for name, result in ended:
+            row_of[name] = {**plain(todo[name].name), "code": code, **result}
+            append_row(path, row_of[name])
+            if say:
+                say(len(row_of), len(set(names)), row_of[name])
+            if after:
+                after(so_far())
     if after and not todo:
         after(so_far())
     return so_far()

@@ -92,20 +92,31 @@ def test_a_script_needs_no_guard(tmp_path):
 
 
 INTERRUPTED = """
-import os, signal, time
+import os, signal, sys, time
 from functools import partial
+from pathlib import Path
 from soup_nlp.storage.each import each
+from soup_nlp.storage.folders import staged
 
-def wait(number):
-    time.sleep(60 * number)
+place = Path(sys.argv[1])
+
+def write(place, number):
+    with staged(place / str(number)) as new:
+        (new / "begun").touch()
+        time.sleep(60 * number)
     return {"process": os.getpid()}
+
+def begun():
+    return len([*place.glob("unfinished-*/new/begun")])
 
 # a shell lets its background jobs ignore the signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-rows = each({"0": partial(wait, 0), "1": partial(wait, 1), "2": partial(wait, 2)}, 2)
+rows = each({str(k): partial(write, place, k) for k in range(3)}, 2)
 try:
     for name, row in rows:
         print(name, row["process"], flush=True)
+        while begun() < 2:
+            time.sleep(0.01)
         os.kill(os.getpid(), signal.SIGINT)
 except KeyboardInterrupt:
     rows.close()
@@ -114,12 +125,12 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.slow
-def test_after_ctrl_c_no_worker_is_left():
-    ended = subprocess.run(
-        [sys.executable, "-"], input=INTERRUPTED, capture_output=True, text=True, check=True
-    )
+def test_after_ctrl_c_no_worker_and_no_temporary_folder_is_left(tmp_path):
+    words = [sys.executable, "-", str(tmp_path)]
+    ended = subprocess.run(words, input=INTERRUPTED, capture_output=True, text=True, check=True)
     first, kept = ended.stdout.splitlines()
     assert kept == "kept"
+    assert [path.name for path in tmp_path.iterdir()] == ["0"]
     with pytest.raises(ProcessLookupError):
         os.kill(int(first.split()[1]), 0)
 
