@@ -81,7 +81,7 @@ class interruptible:  # noqa: N801
         self._handling = handling(self.handle, numbers)
         self.event = threading.Event()
         self.at_once = at_once
-        self.deferred = self.aborted = False
+        self.deferred = self.aborted = self._heard = False
         self._say = say
 
     def __enter__(self) -> threading.Event:
@@ -89,21 +89,24 @@ class interruptible:  # noqa: N801
         return self.event
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Handle a signal."""
+        """Handle a signal, also while an earlier one is being handled."""
+        again, self._heard = self._heard, True
+        at_once = (self.at_once or again) and not self.deferred
+        self.aborted = self.aborted or at_once
         if self.deferred:
             self._say("interrupt received: the files are being written, this ends then")
-        elif self.at_once or self.event.is_set():
-            if not self.event.is_set():
-                self._say("interrupt received before there was a start: this ends at once")
-            self.event.set()
-            self.aborted = True
-            raise KeyboardInterrupt
-        else:
+        elif not at_once:
             self._say(
                 "interrupt received: the best iterate so far will be written with every file; a"
                 " second interrupt aborts at once"
             )
-        self.event.set()
+        elif not again:
+            self._say("interrupt received before there was a start: this ends at once")
+        if not again:
+            # it would wait for ever within the `set` that the second signal interrupts
+            self.event.set()
+        if at_once:
+            raise KeyboardInterrupt
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         self._handling.__exit__(None, None, None)

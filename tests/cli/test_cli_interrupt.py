@@ -171,3 +171,16 @@ def test_a_run_of_python_says_it_too():
             run(problem, stop=stop)
         with pytest.raises(KeyboardInterrupt):
             ctrl_c()
+
+
+def test_a_second_signal_while_the_first_is_handled_ends_at_once(monkeypatch):
+    guard, calls = interruptible(), []
+
+    def second() -> None:
+        calls.append(1)
+        assert len(calls) == 1, "the real set would wait for itself"
+        guard.handle(signal.SIGINT, None)
+
+    monkeypatch.setattr(guard.event, "set", second)
+    with pytest.raises(KeyboardInterrupt):
+        guard.handle(signal.SIGINT, None)
