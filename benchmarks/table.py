@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from soup_nlp import Problem, make_problem
 from soup_nlp.storage.each import Row
-from soup_nlp.storage.rows import Job, measure_all, reason
+from soup_nlp.storage.rows import measure_all, reason
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -101,7 +101,7 @@ def measure(
 
     `workers` and `options` are those of `soup_nlp.storage.each.each`.
     """
-    jobs = [Job(cell.identity(), partial(work, cell)) for cell in cells]
+    jobs = [(cell.identity(), partial(work, cell)) for cell in cells]
     return frame_of(measure_all(jobs, rows, workers, say=say_row, **options))
 
 

@@ -163,20 +163,20 @@ def _solve(problem: Problem, folder: Path, own: Row, token: str, before: Row | N
     `own` is the head of its row, `before` its row when this run looked.
     """
     mark = _mark(folder, problem.name)
-    if not _claimed(mark, token):
-        return {"claimed": True}
-    if kept_rows(folder, {problem.name: own}).get(problem.name) != before:
+    if _claimed(mark, token):
+        if kept_rows(folder, {problem.name: own}).get(problem.name) == before:
+            return solve_into(problem, folder)
         mark.unlink(missing_ok=True)
-        return {"claimed": True}
-    return solve_into(problem, folder)
+    return {"claimed": True}
 
 
 def _claimed(mark: Path, token: str) -> bool:
     """Whether the run of a token now has a pair; one that gives no sign of life loses it."""
     mark.parent.mkdir(parents=True, exist_ok=True)
     with suppress(OSError):
-        host, process, _ = mark.read_text().split()
-        dead = host == socket.gethostname() and not psutil.pid_exists(int(process))
+        # another run may have made it, and not yet written the token
+        host, _, rest = mark.read_text().partition(" ")
+        dead = host == socket.gethostname() and not psutil.pid_exists(int(rest.split()[0]))
         if dead or time.time() - mark.stat().st_mtime > STALE:
             mark.unlink()
     try:

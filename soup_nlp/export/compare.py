@@ -20,8 +20,8 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
-from soup_nlp.storage.each import Row, peak_bytes
-from soup_nlp.storage.rows import Job, measure_all, reason
+from soup_nlp.storage.each import Row, cpu_seconds, peak_bytes
+from soup_nlp.storage.rows import measure_all, reason
 from soup_nlp.storage.system import scratch
 from soup_nlp.storage.versions import versions
 
@@ -108,7 +108,7 @@ def compare(
         name = {k: label[k] for k in KEY} | {"limits": asdict(limits)}
         for solver in dict.fromkeys(solvers):
             work = partial(run_row, make, label, solver, limits)
-            jobs.append(Job({**name, "solver": solver}, work))
+            jobs.append(({**name, "solver": solver}, work))
     wall = BUILDING + WALL_PER_CPU * limits.seconds
     told: dict[str, Any] = {"say": lambda done, total, row: say(one_line(row)), "after": after}
     return measure_all(jobs, path, fresh=True, seconds=wall, **told)
@@ -127,7 +127,7 @@ def run_row(make: Callable[[Limits], Task], label: Label, solver: str, limits: L
         "versions": versions(),
         "energy_start": oracle.energy(task.soup, task.data, task.weights)["total"],
     }
-    begin = clock()
+    begin = cpu_seconds()
     limit_process(limits, begin)
     solve = find_solver(solver)
     with scratch() as folder:
@@ -138,15 +138,7 @@ def run_row(make: Callable[[Limits], Task], label: Label, solver: str, limits: L
             os.chdir("/")
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     row["peak_bytes"] = max(peak_bytes(), children)
-    return row | verified(task, answer, clock() - begin, float(label["energy_limit"]))
-
-
-def clock() -> float:
-    """CPU seconds of this process and of its children that have ended.
-
-    Limits and comparisons use CPU time, since wall time depends on other work of the machine.
-    """
-    return sum(os.times()[:4])
+    return row | verified(task, answer, cpu_seconds() - begin, float(label["energy_limit"]))
 
 
 def limit_process(limits: Limits, spent: float) -> None:

@@ -13,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Any
 
 from joblib.externals.loky import ProcessPoolExecutor
@@ -30,7 +30,7 @@ ONE_THREAD = dict.fromkeys(
      "OPENCV_FOR_THREADS_NUM"), "1",
 )  # fmt: skip
 """Environment of a worker process; libraries read it when they are loaded."""
-GRACE = 2.0
+GRACE = 5.0
 """Seconds in which a worker that is interrupted can remove its temporary files."""
 
 
@@ -77,18 +77,18 @@ def attempt(work: Work) -> Row:
     with suppress(OSError):
         # resets the largest resident size of this process
         Path("/proc/self/clear_refs").write_text("5")
-    begin, cpu = time.perf_counter(), _cpu_seconds()
+    begin, cpu = time.perf_counter(), cpu_seconds()
     try:
         row = {"ok": True, "error": None, **work()}
         row.setdefault("peak_bytes", peak_bytes())
     except Exception as error:
         row = failure(f"{type(error).__name__}: {error}")
     row["seconds"] = time.perf_counter() - begin
-    row["cpu_seconds"] = _cpu_seconds() - cpu
+    row["cpu_seconds"] = cpu_seconds() - cpu
     return dict(plain(row))
 
 
-def _cpu_seconds() -> float:
+def cpu_seconds() -> float:
     """CPU seconds of this process and of its children that have ended."""
     return sum(os.times()[:4])
 
@@ -114,9 +114,9 @@ def _in_processes(
     jobs: Mapping[str, Work], workers: int, fresh: bool, seconds: float | None
 ) -> Generator[tuple[str, Row]]:
     """Rows by threads that have a pool of one process each: if it dies, its job is known."""
-    todo, done = SimpleQueue[tuple[str, Work]](), SimpleQueue[tuple[str, Row]]()
-    for job in jobs.items():
-        todo.put(job)
+    # threads may share it, as a step of it is atomic
+    todo = iter([*jobs.items()])
+    done = SimpleQueue[tuple[str, Row]]()
     pools, processes = dict[int, Any](), dict[int, int]()
     stop = threading.Event()
 
@@ -135,10 +135,8 @@ def _in_processes(
             pool.shutdown(kill_workers=True)
 
     def drive(number: int) -> None:
-        while not stop.is_set():
-            try:
-                name, work = todo.get_nowait()
-            except Empty:
+        for name, work in todo:
+            if stop.is_set():
                 break
             row = _row(partial(call, number, work), seconds)
             if row.pop("ended", False) or fresh:
@@ -174,18 +172,13 @@ def _row(call: Work, seconds: float | None) -> Row:
     except TimeoutError:
         return failure(f"wall time limit of {seconds:g} s reached") | {"ended": True}
     except BrokenProcessPool as error:
-        code = re.search(r"\{([A-Z]+)\(", str(error))
-        signal_name = code[1] if code and code[1] != "EXIT" else None
-        return failure(died(signal_name)) | {"ended": True}
+        code = re.search(r"\{(?!EXIT)([A-Z]+)\(", str(error))
+        what = f"the process died{f' by {code[1]}' if code else ''}"
+        why = "out of memory, a time limit, or a crash of native code"
+        return failure(f"{what} ({why})") | {"ended": True}
     except (Exception, KeyboardInterrupt) as error:
         # it or its row cannot be sent to another process, or the pool is stopped
         return failure(f"{type(error).__name__}: {error}")
-
-
-def died(signal_name: str | None) -> str:
-    """Reason of a row whose process ended without one."""
-    by = f" by {signal_name}" if signal_name else ""
-    return f"the process died{by} (out of memory, a time limit, or a crash of native code)"
 
 
 def _alone(work: Work) -> Row:

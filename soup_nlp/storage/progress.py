@@ -91,21 +91,21 @@ class interruptible:  # noqa: N801
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal, also while an earlier one is being handled."""
         again, self._heard = self._heard, True
-        at_once = (self.at_once or again) and not self.deferred
-        self.aborted = self.aborted or at_once
         if self.deferred:
             self._say("interrupt received: the files are being written, this ends then")
-        elif not at_once:
+        elif self.at_once or again:
+            self.aborted = True
+            if not again:
+                self._say("interrupt received before there was a start: this ends at once")
+        else:
             self._say(
                 "interrupt received: the best iterate so far will be written with every file; a"
                 " second interrupt aborts at once"
             )
-        elif not again:
-            self._say("interrupt received before there was a start: this ends at once")
         if not again:
-            # it would wait for ever within the `set` that the second signal interrupts
+            # within the `set` that a second signal interrupts, it would wait for ever
             self.event.set()
-        if at_once:
+        if self.aborted and not self.deferred:
             raise KeyboardInterrupt
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:

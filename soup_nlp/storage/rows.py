@@ -3,31 +3,19 @@
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.each import Row, each
+from soup_nlp.storage.each import Row, Work, each
 from soup_nlp.storage.files import is_file, parse_json, plain, read_bytes
 from soup_nlp.storage.versions import code_version
 
 Say = Callable[[int, int, Row], None]
-
-
-@dataclass(frozen=True)
-class Job:
-    """A row to be measured.
-
-    Attributes:
-        name: Entries that identify the row together with the code version; part of the row.
-        work: Measures the row.
-    """
-
-    name: Mapping[str, Any]
-    work: Callable[[], Row]
+Job = tuple[Mapping[str, Any], Work]
+"""Entries of a row that identify it together with the code version, and what measures the row."""
 
 
 def reason(row: Mapping[str, Any]) -> str:
@@ -97,24 +85,24 @@ def measure_all(
         options: Further options of `each`.
     """
     code = code_version()
-    names = [_identity(job.name) for job in jobs]
+    job_of = {_identity(entries, entries): (entries, work) for entries, work in jobs}
     row_of: dict[str, Row] = {}
-    stored = [r for r in read_rows(path) if r.get("code") == code]
-    for job, name in zip(jobs, names, strict=True):
-        rows = [r for r in stored if not failed(r) and _identity(r, job.name) == name]
-        if rows:
-            row_of[name] = rows[-1]
-    todo = {name: job for name, job in zip(names, jobs, strict=True) if name not in row_of}
+    stored = [r for r in read_rows(path) if r.get("code") == code and not failed(r)]
+    for name, (entries, _) in job_of.items():
+        for row in stored:
+            if _identity(row, entries) == name:
+                row_of[name] = row
+    todo = {name: work for name, (_, work) in job_of.items() if name not in row_of}
 
     def so_far() -> list[Row]:
-        return [row_of[name] for name in names if name in row_of]
+        return [row_of[name] for name in job_of if name in row_of]
 
-    with closing(each({k: j.work for k, j in todo.items()}, workers, **options)) as ended:
+    with closing(each(todo, workers, **options)) as ended:
         for name, result in ended:
-            row_of[name] = {**plain(todo[name].name), "code": code, **result}
+            row_of[name] = {**plain(job_of[name][0]), "code": code, **result}
             append_row(path, row_of[name])
             if say:
-                say(len(row_of), len(set(names)), row_of[name])
+                say(len(row_of), len(job_of), row_of[name])
             if after:
                 after(so_far())
     if after and not todo:
@@ -122,6 +110,5 @@ def measure_all(
     return so_far()
 
 
-def _identity(row: Mapping[str, Any], keys: Mapping[str, Any] | None = None) -> str:
-    named = row if keys is None else {k: row.get(k) for k in keys}
-    return json.dumps(plain(named), sort_keys=True)
+def _identity(row: Mapping[str, Any], keys: Iterable[str]) -> str:
+    return json.dumps(plain({k: row.get(k) for k in keys}), sort_keys=True)

@@ -160,12 +160,8 @@ def read_h5(path: PathLike) -> ReadTree:
         with h5py.File(path, "r", locking=False) as file:
             return _read_group(file, set())
     except BROKEN as error:
-        raise DataError(
-            "file is not a readable HDF5 file",
-            where=path,
-            found=error,
-            expected="a result file written by soup_nlp",
-        ) from error
+        what, expected = "file is not a readable HDF5 file", "a result file written by soup_nlp"
+        raise DataError(what, where=path, found=error, expected=expected) from error
 
 
 def _read_group(group: h5py.Group, seen: set[object], level: int = 0) -> ReadTree:

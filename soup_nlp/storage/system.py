@@ -122,9 +122,7 @@ def scratch() -> Iterator[Path]:
     try:
         folder = tempfile.TemporaryDirectory(prefix="soup_nlp-", ignore_cleanup_errors=True)
     except OSError as error:
-        what, found = "no temporary folder can be made", error.strerror
-        raise DataError(
-            what, where=tempfile.gettempdir(), found=found, hint="set TMPDIR"
-        ) from error
+        what, where = "no temporary folder can be made", tempfile.gettempdir()
+        raise DataError(what, where=where, found=error.strerror, hint="set TMPDIR") from error
     with folder as name:
         yield Path(name)

@@ -232,6 +232,9 @@ def test_a_pair_of_a_run_that_lives_is_not_taken(tmp_path):
     mark = tmp_path / "pairs" / "a.claim"
     assert _claimed(mark, f"elsewhere {os.getpid()} 1")
     assert not _claimed(mark, "here 1 2")
+    # made, but not yet written
+    mark.write_text("")
+    assert not _claimed(mark, "here 1 2")
     # without a sign of life, or if its process ended on this machine, it is free
     os.utime(mark, (0, 0))
     assert _claimed(mark, "here 1 2")

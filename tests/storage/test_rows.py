@@ -18,7 +18,7 @@ def fake_row(scene: str) -> dict:
 
 def fake_jobs(seed: int = 0, function=fake_row) -> list[Job]:
     scenes = ("orbit", "street", "sheet", "room")
-    return [Job({"key": s, "seed": seed}, partial(function, s)) for s in scenes]
+    return [({"key": s, "seed": seed}, partial(function, s)) for s in scenes]
 
 
 def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
