@@ -93,7 +93,8 @@ def batch(
     for name, problem in problems.items():
         try:
             heads[name] = head(problem)
-            needs = max(needs, needed_bytes(problem))
+            # the estimate reads both images
+            needs = max(needs, needed_bytes(problem) if workers > 1 else 0.0)
         except SoupError as error:
             rows[name] = {"key": name, "pair": name, "seed": problem.seed}
             rows[name] |= failure(f"{type(error).__name__}: {error}")
@@ -121,7 +122,7 @@ def batch(
         # tables of many pairs are not written all the time
         told[0] = time.monotonic() + 10 * (time.monotonic() - begin)
 
-    with _alive(folder, left, token):
+    with _alive(folder, token):
         while left:
             known = kept_rows(folder, {name: heads[name] for name in left})
             rows |= {k: row for k, row in known.items() if not (retry_failed and failed(row))}
@@ -188,14 +189,13 @@ def _claimed(mark: Path, token: str) -> bool:
 
 
 @contextmanager
-def _alive(folder: Path, names: Sequence[str], token: str) -> Iterator[None]:
+def _alive(folder: Path, token: str) -> Iterator[None]:
     """Context in which the marks of a run show that it lives; its last ones are removed."""
     stop = threading.Event()
 
     def marks() -> Iterator[Path]:
-        for name in names:
+        for mark in (folder / PAIRS).glob("*.claim"):
             with suppress(OSError):
-                mark = _mark(folder, name)
                 if mark.read_text() == token:
                     yield mark
 
