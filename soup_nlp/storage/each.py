@@ -11,7 +11,6 @@ from collections.abc import Callable, Generator, Mapping
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -20,7 +19,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 
 from soup_nlp.errors import DataError, optional
 from soup_nlp.storage.files import plain
-from soup_nlp.storage.system import deferred_signals, end_with_parent
+from soup_nlp.storage.system import deferred_signals, end_with_parent, handling
 
 Row = dict[str, Any]
 Work = Callable[[], Row]
@@ -107,7 +106,11 @@ def _prepare_worker(parent: int) -> None:
     end_with_parent(parent)
     # the parent handles Ctrl-C, and interrupts its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+def _in_worker(work: Work) -> Row:
+    with handling(signal.default_int_handler, [signal.SIGTERM]):
+        return attempt(work)
 
 
 def _in_processes(
@@ -120,14 +123,27 @@ def _in_processes(
     pools, processes = dict[int, Any](), dict[int, int]()
     stop = threading.Event()
 
-    def call(number: int, work: Work) -> Row:
-        if number not in pools:
-            pools[number] = ProcessPoolExecutor(
-                1, initializer=_prepare_worker, initargs=(os.getpid(),), env=ONE_THREAD
-            )
-            processes[number] = pools[number].submit(os.getpid).result()
-        # a stop sees the process, or is seen here
-        return {} if stop.is_set() else dict(pools[number].submit(attempt, work).result(seconds))
+    def row_of(number: int, work: Work) -> Row:
+        """The row of a job; "ended" says that the process is gone."""
+        try:
+            if number not in pools:
+                pools[number] = ProcessPoolExecutor(
+                    1, initializer=_prepare_worker, initargs=(os.getpid(),), env=ONE_THREAD
+                )
+                processes[number] = pools[number].submit(os.getpid).result()
+            # a stop sees the process, or is seen here
+            ended = None if stop.is_set() else pools[number].submit(_in_worker, work)
+            return dict(ended.result(seconds)) if ended else {}
+        except TimeoutError:
+            return failure(f"wall time limit of {seconds:g} s reached") | {"ended": True}
+        except BrokenProcessPool as error:
+            code = re.search(r"\{(?!EXIT)([A-Z]+)\(", str(error))
+            what = f"the process died{f' by {code[1]}' if code else ''}"
+            why = "out of memory, a time limit, or a crash of native code"
+            return failure(f"{what} ({why})") | {"ended": True}
+        except (Exception, KeyboardInterrupt) as error:
+            # it or its row cannot be sent to another process, or the pool is stopped
+            return failure(f"{type(error).__name__}: {error}")
 
     def end(number: int) -> None:
         processes.pop(number, None)
@@ -138,7 +154,7 @@ def _in_processes(
         for name, work in todo:
             if stop.is_set():
                 break
-            row = _row(partial(call, number, work), seconds)
+            row = row_of(number, work)
             if row.pop("ended", False) or fresh:
                 end(number)
             done.put((name, row))
@@ -163,22 +179,6 @@ def _in_processes(
             for number, thread in enumerate(threads):
                 end(number)
                 thread.join()
-
-
-def _row(call: Work, seconds: float | None) -> Row:
-    """The row of a job in a process of its own; "ended" says that this process is gone."""
-    try:
-        return call()
-    except TimeoutError:
-        return failure(f"wall time limit of {seconds:g} s reached") | {"ended": True}
-    except BrokenProcessPool as error:
-        code = re.search(r"\{(?!EXIT)([A-Z]+)\(", str(error))
-        what = f"the process died{f' by {code[1]}' if code else ''}"
-        why = "out of memory, a time limit, or a crash of native code"
-        return failure(f"{what} ({why})") | {"ended": True}
-    except (Exception, KeyboardInterrupt) as error:
-        # it or its row cannot be sent to another process, or the pool is stopped
-        return failure(f"{type(error).__name__}: {error}")
 
 
 def _alone(work: Work) -> Row:
