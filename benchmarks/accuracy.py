@@ -46,7 +46,7 @@ SIGMA_COLUMNS = {
     "drawn": "drawn",
 }
 """Titles of the columns on sigma."""
-SIGMA_BY_PAIR = ("NLL", "within 1", "within 2", "sure and wrong", "AUSE", "guess")
+SIGMA_BY_PAIR = ("NLL", "within 1", "within 2", "sure and wrong", "AUSE", "drawn")
 """Those that the table of all pairs shows."""
 ABOUT_ERRORS = (
     "Means over the pairs. Seen: superpixels with usable flow (mean confidence above 0.5); moving:"

@@ -153,7 +153,7 @@ def test_sigma_has_columns_and_a_picture_of_its_curves(tmp_path):
         row["sigma"] = sigma_scores(error, error + 0.01)
     write_suite(tmp_path / "shared.md", frame_of(rows))
     text = (tmp_path / "shared.md").read_text()
-    assert "| pair, flow | NLL | within 1 | within 2 | sure and wrong | AUSE | guess |" in text
+    assert "| pair, flow | NLL | within 1 | within 2 | sure and wrong | AUSE | drawn |" in text
     assert "| NLL | flat | within 1 | within 2 | sure and wrong | wrong and sure |" in text
     assert "](shared.png)" in text
     assert (tmp_path / "shared.png").stat().st_size > 5000

@@ -132,10 +132,9 @@ def test_proposed_intrinsics_are_those_of_the_images_as_given(small_run):
     wrong = seen(small_run, camera="focal length")
     height, width = small_run.pair.size
     twice = FullSize(np.ones((2 * height, 2 * width)), np.ones((1, 1)), None)
-    shares = dict.fromkeys(certainty(small_run), 0.0)
     focal = []
     for run in (wrong, replace(wrong, full=twice)):
-        (told,) = findings.hints(run, shares)
+        (told,) = findings.hints(run)
         fx, fy = map(float, re.search(r"--intrinsics ([\d.]+),([\d.]+)", told).groups())
         assert fx == fy
         focal.append(fx)
