@@ -66,10 +66,10 @@ results: $(VENV)/.optional
 	$(BENCH) speed -o results/speed --scenes street,room,orbit,motorcycle --superpixels 1000,2000
 	$(BENCH) speed -o results/speed --name cost --scenes street --widths 512,1024,1792 \
 		--superpixels 250,1000,2000 --set refine.enabled=true
-	$(BENCH) family out/tangent --sizes 100,250 --starts hard --formulation tangent
+	$(BENCH) family out/tangent --sizes 100,250 --starts hard --formulation tangent/smooth
 	$(BENCH) family out/matrix --sizes 100 --starts hard
 	$(BENCH) solvers out/tangent out/matrix -o results/solvers --seconds 10 --iterations 500 \
-		--solvers ipopt,ipopt-lbfgs,sqpmethod,uno,pounce,soup-nlp
+		--solvers ipopt,ipopt-adaptive,ipopt-tuned,ipopt-lbfgs,pounce,pounce-tuned,soup-nlp
 
 clean:
 	rm -rf $(VENV) out site

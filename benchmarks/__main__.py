@@ -12,7 +12,15 @@ from benchmarks import chain as chains
 from benchmarks import paper as papers
 from benchmarks import speed as speeds
 from benchmarks.accuracy import comparison, read_pages, write_suite
-from benchmarks.family.instances import SCENES, SIZES, STARTS, VERSION, select
+from benchmarks.family.instances import (
+    FORMULATIONS,
+    SCENES,
+    SIZES,
+    STANDARD,
+    STARTS,
+    VERSION,
+    select,
+)
 from benchmarks.family.write import check_sol, family_tasks, write_family
 from benchmarks.scores import measure_pair
 from benchmarks.sigma import measure_terms, sigma_page
@@ -182,13 +190,13 @@ def family(
     out: Annotated[Path, typer.Argument(help="Folder of the set, new or of an earlier one.")],
     sizes: Annotated[str, typer.Option(help=f"Superpixels, of {SIZES}.")] = "100,250",
     scenes: str = ",".join(SCENES),
-    formulation: Annotated[Words, typer.Option(help="gauge/norm or tangent/norm.")] = None,
+    formulation: Annotated[Words, typer.Option(help=f"Of {', '.join(FORMULATIONS)}.")] = None,
     starts: Annotated[
         str, typer.Option(help="easy (presolved), hard (initialisation), cold (constant depth).")
     ] = ",".join(STARTS),
 ) -> int:
     """Write the SOUP problem set: .nl files, best known points, index, README, licence."""
-    chosen = select(numbers(sizes), listed(scenes), formulation or [""], listed(starts))
+    chosen = select(numbers(sizes), listed(scenes), formulation or [STANDARD], listed(starts))
     entries = write_family(out, chosen)
     differing = sum(e["published"] is False for e in entries)
     print(f"{len(entries)} instances in {out}/; {differing} are not the published bytes")

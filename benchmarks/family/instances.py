@@ -5,10 +5,9 @@ results are records (`frozen`). The rest is rendering and arithmetic, whose last
 depend on the processor. Every number of the NLP is therefore rounded to 20 significant bits.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from benchmarks.family.frozen import Frozen
 from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError
-from soup_nlp.export.artefact import CHOICES, form_label, parse_formulation
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
@@ -39,6 +37,12 @@ SIZES = (100, 250, 500, 1000, 2000)
 STARTS = ("easy", "hard", "cold")
 STANDARD = "unit-offset/smooth"
 """Default formulation of the family."""
+FORMULATIONS: Mapping[str, Mapping[str, str]] = {
+    STANDARD: {"gauge": "unit-offset"},
+    "unit-translation/smooth": {"gauge": "unit-translation"},
+    "tangent/smooth": {"coordinates": "tangent"},
+}
+"""What differs from the problem of a record."""
 BITS = 20
 """Significant bits of every number of an instance."""
 MIN_EXPONENT = -30
@@ -53,7 +57,7 @@ class Instance:
 
     Attributes:
         scene: One of SCENES.
-        formulation: gauge/norm, or tangent/norm.
+        formulation: One of FORMULATIONS.
         size: Wanted number of superpixels, one of SIZES; the actual number may differ a little.
         start: easy (Ipopt's answer), hard (the proposal) or cold (constant depth, true flow).
     """
@@ -92,14 +96,9 @@ def parse_name(name: str) -> Instance:
 
 @cache
 def _by_name() -> dict[str, Instance]:
-    every = select(SIZES, SCENES, formulations())
+    every = select(SIZES, SCENES, [*FORMULATIONS])
     first = {i.problem: i for i in every if i.start == STARTS[0]}
     return first | {i.name: i for i in every}
-
-
-def formulations() -> list[str]:
-    """Every formulation, as gauge/norm."""
-    return ["/".join(words) for words in product(*CHOICES.values())]
 
 
 def select(
@@ -110,12 +109,15 @@ def select(
 ) -> list[Instance]:
     """Instances of sizes, scenes, formulations and starts.
 
-    Missing parts of a formulation are those of STANDARD.
-
     Raises:
         ConfigError: one of them is not part of the family.
     """
-    known = {"sizes": (sizes, SIZES), "scenes": (scenes, SCENES), "starts": (starts, STARTS)}
+    known = {
+        "sizes": (sizes, SIZES),
+        "scenes": (scenes, SCENES),
+        "formulation": (forms, FORMULATIONS),
+        "starts": (starts, STARTS),
+    }
     for name, (asked, members) in known.items():
         wrong = ", ".join(str(a) for a in asked if a not in members)
         if wrong or not len(asked):
@@ -123,14 +125,10 @@ def select(
             raise ConfigError(
                 "not of the family", where=f"--{name}", found=found, expected=expected
             )
-    labels = {}
-    for form in forms:
-        words = dict(zip(CHOICES, STANDARD.split("/"))) | parse_formulation(form)
-        labels["/".join([words.pop("coordinates", words["gauge"]), words["norm"]])] = form
     return [
         Instance(scene, form, size, start)
         for scene in dict.fromkeys(scenes)
-        for form in labels
+        for form in dict.fromkeys(forms)
         for size in dict.fromkeys(sizes)
         for start in dict.fromkeys(starts)
     ]
@@ -187,11 +185,10 @@ def build_instance(
 ) -> tuple[NLP, Layout, Formulation]:
     """The NLP of a formulation at a start, its layout and its formulation.
 
-    The formulation is gauge/norm, the start one of STARTS, or "best": the best known point without
-    rounding.
+    The formulation is one of FORMULATIONS, the start one of STARTS, or "best": the best known point
+    without rounding.
     """
-    form = case.formulation(**parse_formulation(formulation), hessian="exact")
-    assert form_label(form) == formulation
+    form = case.formulation(**FORMULATIONS[formulation], hessian="exact")
     soups = {"easy": record.best, "hard": record.start, "best": record.best}
     soup = constant_depth(case.data) if start == "cold" else soups[start]
     nlp, layout = _program(case, record, soup, form)

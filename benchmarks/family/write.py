@@ -12,13 +12,14 @@ import pandas as pd
 
 from benchmarks.family.frozen import RECORDS, load_frozen
 from benchmarks.family.instances import VERSION, Instance, build_instance, case_of, parse_name
+from benchmarks.family.sol import write_sol
 from benchmarks.table import markdown
 from soup_nlp import Pair, __version__
 from soup_nlp.errors import DataError
 from soup_nlp.export.compare import Labelled, make_task
 from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.export.program import file_orders
-from soup_nlp.export.sol import read_sol, write_sol
+from soup_nlp.export.sol import read_sol
 from soup_nlp.export.solvers import Task
 from soup_nlp.export.verify import Limits, Residuals, examine
 from soup_nlp.model.nlp import NLP

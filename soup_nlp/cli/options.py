@@ -77,13 +77,8 @@ Overwrite = Annotated[bool, in_output(OTHERS, "--overwrite")]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
 Problem = Annotated[Path, typer.Argument(help=PROBLEM, autocompletion=starting(shipped_problems))]
 Folder = Annotated[Path, typer.Argument(help="Folder of a result or a chain.")]
-FORMULATIONS = "gauge/norm, e.g. unit-translation/epigraph; may be repeated."
-Formulations = Annotated[Words, option(FORMULATIONS, "--formulation")]
 COORDINATES = "tangent: nine per superpixel about the initialisation, without gauge."
 Coordinates = Annotated[Literal["matrix", "tangent"], option(COORDINATES)]
-Superpixels = Annotated[
-    list[int] | None, option("Number of superpixels, 50 to 2000; may be repeated.")
-]
 DEPTH_SCALE = "Values per unit of length of a true depth in .png (KITTI 256); default 1000."
 DepthScale = Annotated[float | None, option(DEPTH_SCALE)]
 Workers = Annotated[int, option("Processes of this machine.", min=1)]

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from soup_nlp.arrays import Float, Int, Labels
+from soup_nlp.evaluation.selected_inverse import BlockCholesky
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
@@ -18,7 +19,6 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation, FormulationOptions
 from soup_nlp.model.layout import TangentLayout
 from soup_nlp.model.programs import build_tangent_nlp, majorant
-from soup_nlp.solve.selected_inverse import BlockCholesky
 
 SMOOTHING = 0.03
 """Width in pixels within which a norm is treated as a square: no flow is more exact."""

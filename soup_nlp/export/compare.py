@@ -66,8 +66,7 @@ def make_task(case: Case, build: Build, limits: Limits) -> Task:
     soup = layout.unpack(nlp.x0).retracted()
     task = Task(nlp, layout, soup, case.data, case.weights, form, limits)
     # made here, so that the time of a solver does not include it
-    for program in (task.nlp, task.gauss_newton):
-        program.evaluated()
+    task.nlp.evaluated()
     return task
 
 
@@ -169,7 +168,7 @@ def verified(task: Task, answer: Answer, seconds: float, energy_limit: float) ->
     }
     if x is None:
         return row
-    x = task.point(x) if isinstance(x, Soup) else x
+    x = task.layout.pack(x) if isinstance(x, Soup) else x
     energy = np.inf
     with np.errstate(all="ignore"):
         value = task.nlp.value(x)

@@ -10,7 +10,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ExportError
-from soup_nlp.export.artefact import CHOICES, fingerprint, read_manifest
+from soup_nlp.export.artefact import fingerprint, read_manifest
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.sol import Sol, read_sol
 from soup_nlp.export.verify import ENERGY_SLACK, FEASIBLE, Residuals, examine, violations
@@ -78,7 +78,7 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
     folder = as_path(folder, "exported folder", error=ExportError)
     manifest = read_manifest(folder)
     case = prepare(load_problem(folder / "problem.yaml", solved=False))
-    form = case.formulation(**manifest["formulation"], **manifest["smoothing"], hessian="exact")
+    form = case.formulation(coordinates=manifest["coordinates"], hessian="exact")
     nlp, layout = case.nlp(form)
     stored: Any = manifest["fingerprint"]
     for key, now in fingerprint(case, nlp, layout).items():
@@ -152,6 +152,4 @@ def foreign_run(
         nlp=nlp.sizes(),
         description=str(nlp),
     )
-    chosen = {k: getattr(form, k) for k in CHOICES}
-    problem = case.problem.replace(formulation=case.problem.formulation.replace(**chosen))
-    return make_run(replace(case, problem=problem), solution)
+    return make_run(case, solution)

@@ -48,26 +48,10 @@ class NLFile:
     lifted: int
 
 
-@dataclass(frozen=True)
-class Suffix:
-    """Numbers of variables or rows that a solver may ask for by name; 0 is not written.
-
-    Attributes:
-        name: E.g. "scaling_factor", which Ipopt and POUNCE know.
-        of: "variables" or "rows".
-        values: (nx,) or (ng,), integers or reals, in the order of the NLP.
-    """
-
-    name: str
-    of: str
-    values: Float | Int
-
-
 def write_nl(
     path: str | Path,
     nlp: NLP,
     lam_g: Float | None = None,
-    suffixes: Sequence[Suffix] = (),
     lift: bool = False,
 ) -> NLFile:
     """Write an NLP of kernels and tables; names go to `.col` and `.row` beside the file.
@@ -76,7 +60,6 @@ def write_nl(
         path: The .nl file.
         nlp: The NLP; its Hessian does not matter.
         lam_g: (ng,) multipliers of the start in CasADi's sign, for the segment of initial duals.
-        suffixes: Suffixes of variables and rows.
         lift: Write shared expressions as variables with rows, not as defined variables, see `body`.
 
     Raises:
@@ -112,10 +95,8 @@ def write_nl(
         curved=after(True, program.curved, last),
     )
     longest = [max(map(len, n), default=0) for n in (g_names, x_names)]
-    places = {"variables": variables, "rows": rows}
     lines = chain(
         header(program, (lbg, ubg), longest, body.classes),
-        *(suffix_segment(replace(s, values=after(0, s.values, places[s.of]))) for s in suffixes),
         body.segments(),
         # AMPL's multipliers have the other sign
         [] if lam_g is None else start(-after(0.0, lam_g, rows), "d"),
@@ -181,16 +162,6 @@ def header(
     ]
 
 
-def suffix_segment(suffix: Suffix) -> Iterator[str]:
-    """`S` segment of a suffix, whose values are in the order of the file."""
-    values = np.asarray(suffix.values)
-    real = not np.issubdtype(values.dtype, np.integer)
-    nonzero = np.flatnonzero(values)
-    if len(nonzero):
-        yield f"S{(suffix.of == 'rows') + 4 * real} {len(nonzero)} {suffix.name}"
-        yield from (f"{k} {number(values[k]) if real else values[k]}" for k in nonzero.tolist())
-
-
 def start(values: Float, segment: str = "x") -> Iterator[str]:
     """`x` segment of the start, or `d` segment of its multipliers."""
     yield f"{segment}{len(values)}"
@@ -228,30 +199,3 @@ def linear(entries: sparse.csr_matrix) -> Iterator[str]:
         yield f"{f'J{k}' if k < count - 1 else 'G0'} {end - begin}"
         places, values = entries.indices[begin:end].tolist(), entries.data[begin:end].tolist()
         yield from (f"{c} {number(v)}" for c, v in zip(places, values))
-
-
-# --- suffixes ------------------------------------------------------------------------------------
-
-
-def suffixes_of(nlp: NLP) -> tuple[dict[str, list[str]], list[Suffix]]:
-    """Suffixes of variables and rows, for solvers that exploit structure.
-
-    "superpixel" is 1 + the first superpixel of a variable or row. "kind" is 1 + the place of its
-    name's stem (`R`, `so3`) in the lists that are returned beside. "scaling_factor" is the inverse
-    of a natural step of a variable at the start (Ipopt's `nlp_scaling_method=user-scaling`).
-    """
-    kinds: dict[str, list[str]] = {}
-    out = []
-    for of, axis in zip(("variables", "rows"), (nlp.x_names(), nlp.g_names())):
-        stems = [name.partition("[")[0] for name in axis]
-        kinds[of] = list(dict.fromkeys(stems))
-        kind_number = {stem: k + 1 for k, stem in enumerate(kinds[of])}
-        first = [name.partition("[")[2].strip("]").partition(",")[0] for name in axis]
-        out.append(Suffix("kind", of, np.array([kind_number[stem] for stem in stems])))
-        out.append(Suffix("superpixel", of, np.array([int(i) + 1 if i else 0 for i in first])))
-    for group in nlp.groups:
-        if group.kernel.name == "ridge":
-            factor = np.ones(nlp.nx)
-            factor[group.index[:, 0]] = np.sqrt(group.data[:, 0])
-            out.append(Suffix("scaling_factor", "variables", factor))
-    return kinds, out

@@ -1,4 +1,4 @@
-"""Solvers by name: CasADi's plug-ins, programs that read .nl, and this package."""
+"""Solvers by name: Ipopt, programs that read .nl, and this package."""
 
 import os
 import shlex
@@ -7,10 +7,10 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -24,12 +24,10 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.layout import Layout, TangentLayout
+from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp
-from soup_nlp.model.symbolic import Graph
 from soup_nlp.solve.functions import Functions
-from soup_nlp.solve.ipopt import DEFAULTS
+from soup_nlp.solve.ipopt import DEFAULTS, GOOD
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.system import end_with_parent
@@ -54,20 +52,6 @@ class Task:
     weights: Weights
     form: Formulation
     limits: Limits
-
-    @cached_property
-    def gauss_newton(self) -> NLP:
-        """The same NLP with the Gauss-Newton Hessian."""
-        return replace(self.nlp, hessian_kind="gauss-newton+constraints")
-
-    def point(self, soup: Soup) -> Float:
-        """(nx,) vector of a soup, slack variables and switches at their best values."""
-        energy = soup, self.data, self.weights, self.form
-        if isinstance(self.layout, TangentLayout):
-            nlp, _ = build_tangent_nlp(*energy, layout=self.layout)
-        else:
-            nlp, _ = build_matrix_nlp(*energy)
-        return np.concatenate([self.layout.pack(soup), nlp.x0[self.layout.size :]])
 
 
 @dataclass(frozen=True)
@@ -95,32 +79,8 @@ program that waits uses no CPU time."""
 Solver = Callable[[Task], Answer]
 
 
-# --- CasADi's plug-ins ---------------------------------------------------------------------------
+# --- Ipopt in this process ------------------------------------------------------------------------
 
-
-class Plugin(NamedTuple):
-    """A plug-in of nlpsol with its options.
-
-    Attributes:
-        library: Name of the plug-in in CasADi.
-        limits: Attribute of `Limits` by name of the plug-in's option.
-        options: Further options of the plug-in.
-        hessian: "exact" or "gauss-newton".
-    """
-
-    library: str
-    limits: Mapping[str, str]
-    options: Mapping[str, Any]
-    hessian: str = "exact"
-
-    def made_for(self, limits: Limits) -> dict[str, Any]:
-        """Options of `ca.nlpsol`, for some libraries nested under the name of the library."""
-        options = {**self.options, **{k: getattr(limits, name) for k, name in self.limits.items()}}
-        return {self.library: options} if self.library in NESTED else options
-
-
-CLAIMS = ("Solve_Succeeded", "Solved_To_Acceptable_Level", "SUCCESS", "success", "Converged")
-NESTED = ("ipopt", "uno", "bonmin")
 TOLERANCES = {
     **dict.fromkeys(("tol", "dual_inf_tol", "compl_inf_tol"), "tol"),
     "constr_viol_tol": "feasibility",
@@ -128,114 +88,31 @@ TOLERANCES = {
     "max_cpu_time": "seconds",
 }
 """Attribute of `Limits` by name of Ipopt's option."""
-SQP_LIMITS = {"max_iter": "iterations", "tol_du": "tol", "tol_pr": "feasibility"}
-UNO_LIMITS = {
-    "max_iterations": "iterations",
-    "dual_tolerance": "tol",
-    "primal_tolerance": "feasibility",
+COMMON = {"acceptable_iter": 0, "print_level": 0}
+TUNED = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
+"""Options with which Ipopt, and what has its options, solves these programs (docs/solving.md)."""
+IPOPT: Mapping[str, Mapping[str, Any]] = {
+    "ipopt": {},
+    "ipopt-adaptive": {"mu_strategy": "adaptive"},
+    "ipopt-tuned": TUNED,
+    "ipopt-lbfgs": {"hessian_approximation": "limited-memory"},
 }
-COMMON = {"acceptable_iter": 0, "print_level": 0, "sb": "yes"}
-NEAR_START = {k: v for k, v in DEFAULTS.items() if k.startswith(("mu_", "bound_", "nlp_scaling"))}
-"""Options for a start near the minimum, for solvers with the options of Ipopt."""
-SQP = {
-    "qpsol": "osqp",
-    "qpsol_options": {
-        "osqp": {"verbose": False, "eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000}
-    },
-    **dict.fromkeys(("print_header", "print_iteration", "print_status", "error_on_fail"), False),
-}
-PLUGINS: Mapping[str, Plugin] = {
-    "ipopt": Plugin("ipopt", TOLERANCES, COMMON),
-    "ipopt-adaptive": Plugin("ipopt", TOLERANCES, {**COMMON, "mu_strategy": "adaptive"}),
-    "ipopt-soup": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COMMON}, "gauss-newton"),
-    "ipopt-tuned": Plugin("ipopt", TOLERANCES, {**DEFAULTS, **COMMON}),
-    "ipopt-lbfgs": Plugin(
-        "ipopt", TOLERANCES, {**COMMON, "hessian_approximation": "limited-memory"}
-    ),
-    "sqpmethod": Plugin("sqpmethod", SQP_LIMITS, SQP, "gauss-newton"),
-    "uno": Plugin("uno", UNO_LIMITS, {"logger": "SILENT"}),
-    "bonmin-tuned": Plugin(
-        "bonmin", {"max_iter": "iterations", "tol": "tol"}, {"print_level": 0, **NEAR_START}
-    ),
-}
-""""ipopt" has the default options of Ipopt, "ipopt-adaptive" one other: the strategy of the
-barrier. "ipopt-soup" has the options of `solve` for a start that is no KKT point, and "ipopt-tuned"
-the same with the exact Hessian. Other names with "-tuned" have the options for a start near the
-minimum. blocksqp is left out: it needs a linear solver (ma27) that the wheel of CasADi lacks."""
-
-UPPER = ("triu_hess_gamma_x_x",)
-IPOPT = {"nlp_grad_f": ("f", "grad_f_x"), "nlp_jac_g": ("g", "jac_g_x"), "nlp_hess_l": UPPER}
-CACHED: Mapping[str, Mapping[str, tuple[str, ...]]] = {
-    "ipopt": IPOPT,
-    "bonmin": IPOPT,
-    "uno": {"nlp_grad_f": ("grad_f_x",), "nlp_jac_g": ("jac_g_x",), "nlp_hess_l": UPPER},
-    "sqpmethod": {
-        "nlp_jac_fg": ("f", "grad_f_x", "g", "jac_g_x"),
-        "nlp_hess_l": ("hess_gamma_x_x",),
-    },
-}
-"""Functions that a library requests from CasADi, with their outputs."""
-FIRST = ("nlp_grad_f", "nlp_jac")
-"""Beginnings of the names of functions without multipliers."""
+"""What differs from Ipopt's defaults, by name of the solver."""
 
 
-def plugin(name: str, task: Task) -> Answer:
-    """Solve with a plug-in of nlpsol and the derivatives of this package."""
-    chosen = PLUGINS[name]
-    library = chosen.library
-    nlp = task.gauss_newton if chosen.hessian == "gauss-newton" else task.nlp
-    # parameters are replaced by numbers, since bonmin has no parameters
-    x, functions = ca.MX.sym("x", nlp.nx), Functions(nlp)
-    # these libraries differentiate f and g at set-up, in spite of cached derivatives
-    symbolic = library in ("bonmin", "uno")
-    graph = Graph(nlp) if symbolic else None
-    f, g = graph.oracle(x, graph.p) if graph else functions.oracle(x, nlp.thetas())
-    common: dict[str, Any] = {
-        "print_time": False,
-        "show_eval_warnings": False,
-        "error_on_fail": False,
-        "no_nlp_grad": library in ("ipopt", "sqpmethod"),
-        "cache": _derivatives(nlp, functions, CACHED[library]),
-    }
-    problem = {"x": x, "f": f, "g": g}
-    solver = ca.nlpsol("solver", library, problem, common | chosen.made_for(task.limits))
-    out = solver(x0=nlp.x0, lbx=nlp.lbx, ubx=nlp.ubx, lbg=nlp.lbg, ubg=nlp.ubg)
-    stats = solver.stats()
-    status = str(stats.get("return_status", stats.get("unified_return_status", "?")))
-    return Answer(
-        np.asarray(out["x"]).ravel(),
-        np.asarray(out["lam_g"]).ravel(),
-        status,
-        bool(stats.get("success")) or status in CLAIMS,
-        int(stats.get("iter_count", -1)),
-    )
-
-
-def _derivatives(
-    nlp: NLP, functions: Functions, wanted: Mapping[str, tuple[str, ...]]
-) -> dict[str, ca.Function]:
-    """Derivatives of this package with the names and outputs that a library requests."""
-    x, q = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", 0)
-    lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", nlp.ng)
-    theta = nlp.thetas()
-    f, grad = functions.grad_f(x, theta)
-    g, jac = functions.jac_g(x, theta)
-    upper = functions.hess_lag(x, theta, lam_f, lam_g)
-    derivatives = {
-        "f": f,
-        "grad_f_x": grad,
-        "g": g,
-        "jac_g_x": jac,
-        "triu_hess_gamma_x_x": upper,
-        "hess_gamma_x_x": ca.triu2symm(upper),
-    }
-    inputs = {"x": x, "p": q, "lam_f": lam_f, "lam_g": lam_g}
-    out = {}
-    for name, outputs in wanted.items():
-        words = ["x", "p"] if name.startswith(FIRST) else list(inputs)
-        values = [derivatives[k] for k in outputs]
-        out[name] = ca.Function(name, [inputs[w] for w in words], values, words, list(outputs))
-    return out
+def ipopt(different: Mapping[str, Any], task: Task) -> Answer:
+    """Solve with Ipopt and the derivatives of this package."""
+    nlp, functions = task.nlp, Functions(task.nlp)
+    limits = {k: getattr(task.limits, name) for k, name in TOLERANCES.items()}
+    derivatives = {k: getattr(functions, k) for k in ("grad_f", "jac_g", "hess_lag")}
+    less = dict.fromkeys(("print_time", "show_eval_warnings", "calc_lam_p"), False)
+    options = {"ipopt": {**COMMON, "sb": "yes", **different, **limits}, **derivatives, **less}
+    solver = ca.nlpsol("solver", "ipopt", functions.oracle, options)
+    bounds = {k: getattr(nlp, k) for k in ("x0", "lbx", "ubx", "lbg", "ubg")}
+    out, stats = solver(p=nlp.thetas(), **bounds), solver.stats()
+    x, lam_g = (np.asarray(out[k]).ravel() for k in ("x", "lam_g"))
+    status = str(stats["return_status"])
+    return Answer(x, lam_g, status, status in GOOD, int(stats["iter_count"]))
 
 
 # --- programs that read .nl ----------------------------------------------------------------------
@@ -275,12 +152,11 @@ def find_program(name: str) -> str | None:
     return None if path is None else str(Path(path).absolute())
 
 
-def pounce(command: str, task: Task, near: bool = False) -> Answer:
-    """Solve with POUNCE, which has the options of Ipopt; `near` adds those for a near start."""
+def pounce(command: str, task: Task, tuned: bool = False) -> Answer:
+    """Solve with POUNCE, which has the options of Ipopt."""
     m = task.limits
     options = {option: getattr(m, name) for option, name in TOLERANCES.items()}
-    options |= {"acceptable_iter": 0, "max_cpu_time": 0.9 * m.seconds, "print_level": 0}
-    options |= NEAR_START if near else {}
+    options |= {**COMMON, "max_cpu_time": 0.9 * m.seconds, **(TUNED if tuned else {})}
     return executable(command, task, [f"{k}={v}" for k, v in options.items()])
 
 
@@ -306,12 +182,11 @@ def package(task: Task) -> Answer:
 
 def available() -> dict[str, Solver]:
     """Installed solvers by name."""
-    names = [name for name, row in PLUGINS.items() if ca.has_nlpsol(row.library)]
-    out: dict[str, Solver] = {name: partial(plugin, name) for name in names}
+    out: dict[str, Solver] = {name: partial(ipopt, options) for name, options in IPOPT.items()}
     command = find_program("pounce")
     if command:
         out["pounce"] = partial(pounce, command)
-        out["pounce-tuned"] = partial(pounce, command, near=True)
+        out["pounce-tuned"] = partial(pounce, command, tuned=True)
     out["soup-nlp"] = package
     return out
 
@@ -330,7 +205,7 @@ def find_solver(name: str) -> Solver:
     if command is None:
         program, *options = shlex.split(name) or [""]
         command = find_program(program)
-    if command is None or name in PLUGINS:
+    if command is None:
         raise SolverError(
             "solver is not here",
             where="--solvers",

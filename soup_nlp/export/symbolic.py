@@ -14,7 +14,7 @@ from soup_nlp.model.formulation import Coordinates
 from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.symbolic import Graph
+from soup_nlp.model.symbolic import make_oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
@@ -103,6 +103,6 @@ def nlp(
     case = prepare(problem, presolve)
     record, layout = case.nlp(case.formulation(hessian=hessian, coordinates=coordinates))
     x, p = ca.MX.sym("x", record.nx), ca.MX.sym("p", len(record.theta))
-    graph = Graph(record)
-    f, g = graph.oracle(x, ca.vertcat(p, graph.p[len(record.theta) :]))
+    oracle, values = make_oracle(record)
+    f, g = oracle(x, ca.vertcat(p, values[len(record.theta) :]))
     return SymbolicNLP(case, record, layout, x, p, f, g, Functions(record))

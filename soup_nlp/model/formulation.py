@@ -1,4 +1,4 @@
-"""How the energy is written for a solver: gauge, norm, Hessian, smoothing."""
+"""How the energy is written for a solver: gauge, Hessian, smoothing."""
 
 from typing import Annotated, Literal
 
@@ -6,7 +6,6 @@ from pydantic import Field
 
 from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Gauge
-from soup_nlp.model.norms import NormForm
 from soup_nlp.schema.section import MOST, NonNegative, Section, Share
 
 
@@ -15,10 +14,6 @@ class FormulationOptions(Section):
 
     gauge: Gauge = "unit-offset"
     """unit-offset or unit-translation."""
-    norm: NormForm = "smooth"
-    """smooth (sqrt(|v|^2 + eps^2) - eps) or epigraph (s - eps in the objective, with a slack
-    variable s and |v|^2 + eps^2 <= s^2). Both have the same minimum. With eps = 0 the epigraph is
-    the exact norm, but its constraint gradients vanish where the norm is 0."""
     hessian: Hessian = "exact"
     """exact, gauss-newton or gauss-newton+constraints."""
     theta: Share = 0.9

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from soup_nlp.arrays import Float, Int
+from soup_nlp.arrays import Float
 from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group, Hessian, Pattern, hessian_entries, jacobian_entries
 from soup_nlp.model.operations import Vectors
@@ -177,17 +177,6 @@ class NLP:
         for name in values.keys() - self.theta.keys():
             raise ModelError("unknown parameter", found=name, expected=", ".join(self.theta))
         return np.array(list({**self.theta, **values}.values()), float)
-
-    def slacks(self) -> tuple[Int, Int]:
-        """Slack variables s of epigraphs, and the row of each, `s^2 >= |v|^2 + eps^2`."""
-        pairs = [np.zeros((2, 0), int)]
-        for group in self.groups:
-            names = [group.kernel.x[k].name() for k in range(group.kernel.nx)]
-            local = [k for k, name in enumerate(names) if name.startswith("s_")]
-            if local:
-                pairs.append(np.array([group.index[:, local], group.rows]).reshape(2, -1))
-        variables, rows = np.concatenate(pairs, axis=1)
-        return variables, rows
 
     def sizes(self) -> dict[str, int]:
         """Sizes with stable keys."""

@@ -75,7 +75,7 @@ class View:
         """
         gap = X - Y
         change = self._turned_gap((self.R0 - ca.DM.eye(3)) + self.turn, X, other, Y)
-        # |X - Y| is smooth wherever two anchors differ, so it needs no slack of its own
+        # |X - Y| is smooth wherever two anchors differ, so it needs no smoothing of its own
         lengths = [ca.sqrt(ca.sumsqr(v) + 1e-12) for v in (gap, gap + change)]
         return -ca.dot(change, 2 * gap + change) / (lengths[0] + lengths[1])
 

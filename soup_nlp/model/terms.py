@@ -39,9 +39,9 @@ def arap(a: View, b: View, row: Row, eps: ca.SX, at_anchors: bool) -> list[Norm]
         translation = translation + a.turn_from(b) @ ((Xa + Xb) / 2)
     distance = a.stretch(Xa, b, Xb)
     return [
-        Norm("rotation", weight, rotation, angle_eps, sigma, leak=leak),
-        Norm("translation", weight, translation / unit, length_eps, sigma, leak=leak),
-        Norm("distance", weight, distance / unit, length_eps, sigma, leak=leak),
+        Norm(weight, rotation, angle_eps, sigma, leak=leak),
+        Norm(weight, translation / unit, length_eps, sigma, leak=leak),
+        Norm(weight, distance / unit, length_eps, sigma, leak=leak),
     ]
 
 
@@ -54,7 +54,7 @@ def reprojection(a: View, row: Row, eps: ca.SX, places: Sequence[tuple[int, int]
     y = a.transfer(row["ray"])
     K = ca.SX(ca.Sparsity.triplet(2, 3, *map(list, zip(*places))), row["K"])
     error = K @ (y / y[2]) - row["target"]
-    return [Norm("reprojection", row["weight"], error, eps, row.get("sigma"))]
+    return [Norm(row["weight"], error, eps, row.get("sigma"))]
 
 
 def continuity(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
@@ -68,8 +68,8 @@ def continuity(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     else:
         f = f * _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
     return [
-        Norm("gap_ref", row["weight"], f * before, eps, row.get("sigma_ref")),
-        Norm("gap_next", row["weight"], f * after, eps, row.get("sigma")),
+        Norm(row["weight"], f * before, eps, row.get("sigma_ref")),
+        Norm(row["weight"], f * after, eps, row.get("sigma")),
     ]
 
 
@@ -80,7 +80,7 @@ def orientation(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     difference `row["turn"]` costs nothing.
     """
     turn = a.n - b.n - row["turn"] if "turn" in row else a.n - b.n
-    return [Norm("turn", row["weight"], turn, eps, row.get("sigma"), kind="half_square")]
+    return [Norm(row["weight"], turn, eps, row.get("sigma"), kind="half_square")]
 
 
 def prior(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
@@ -91,13 +91,13 @@ def prior(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
     change = (1 / Xa[2] - 1 / Xb[2]) / _nearness(Xa, Xb)
     change = change - row["relief"] if "relief" in row else change
-    return [Norm("slope", row["weight"], change / row["reach"], eps)]
+    return [Norm(row["weight"], change / row["reach"], eps)]
 
 
 def depth(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     """E_depth of an edge: difference of the anchors' log depths from that of a depth prior."""
     Za, Zb = a.anchor(row["ray_i"])[2], b.anchor(row["ray_k"])[2]
-    return [Norm("given", row["weight"], ca.log(Za / Zb) - row["change"], eps)]
+    return [Norm(row["weight"], ca.log(Za / Zb) - row["change"], eps)]
 
 
 def order(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
@@ -109,7 +109,7 @@ def order(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     near = _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
     behind, front = 1 / a.point(row["ray"])[2], 1 / b.point(row["ray"])[2]
     lack = ((1 + row["step"]) * behind - front) / near
-    return [Norm("order", row["weight"], (lack + ca.sqrt(lack**2 + HINGE**2)) / 2, eps)]
+    return [Norm(row["weight"], (lack + ca.sqrt(lack**2 + HINGE**2)) / 2, eps)]
 
 
 def _nearness(Xa: ca.SX, Xb: ca.SX) -> ca.SX:

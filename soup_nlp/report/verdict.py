@@ -153,8 +153,7 @@ def _numbers(values: Mapping[str, float], form: str) -> str:
 def _status(run: Run) -> list[str]:
     s = run.solution
     words = STATUS.get(s.status, f"not converged: {s.status}, best iterate kept")
-    far = "the presolve ended before a minimum: solver.far_iterations limits Ipopt there"
-    return [f"{words} ({s.status})", *[far] * (s.far and not s.converged)]
+    return [f"{words} ({s.status})"]
 
 
 def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:

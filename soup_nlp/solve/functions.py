@@ -28,13 +28,7 @@ class Buffered(ca.Callback):
     """
 
     def __init__(self, name: str, inputs: Mapping[str, int], outputs: Mapping[str, Output]) -> None:
-        """Make the function.
-
-        Args:
-            name: Its name.
-            inputs: Lengths of its inputs, vectors.
-            outputs: Its outputs; only those that are asked for are computed.
-        """
+        """Inputs are vectors of these lengths; only outputs that are asked for are computed."""
         ca.Callback.__init__(self)
         self._inputs, self._outputs = list(inputs.items()), list(outputs.items())
         self.construct(name, {})

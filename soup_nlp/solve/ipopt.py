@@ -52,7 +52,6 @@ class Stage:
         iterations: Count.
         seconds: Wall time, set-up included.
         history: objective, inf_pr, inf_du, mu, alpha_pr, regularization by iteration.
-        evaluating: Of these seconds, those in f, g and their derivatives.
     """
 
     name: str
@@ -65,7 +64,6 @@ class Stage:
     iterations: int = 0
     seconds: float = 0.0
     history: Mapping[str, Float] = field(default_factory=dict, repr=False)
-    evaluating: float = 0.0
 
     def __str__(self) -> str:
         return (
@@ -154,7 +152,6 @@ class _Iterations:
             iterations=count,
             seconds=time.perf_counter() - self.begin,
             history=history,
-            evaluating=sum(float(t) for k, t in stats.items() if k.startswith("t_wall_nlp_")),
         )
 
 

@@ -72,9 +72,6 @@ def warm_start(nlp: NLP, data: EnergyData, soup: Soup, rim: Float) -> dict[str, 
     visible = next(g for g in nlp.groups if g.kernel.name == "visible").rows
     lam_g[visible[:, 1:]] = -rim / facing[:, None]
     gradient = nlp.gradient(nlp.x0)
-    slack, row = nlp.slacks()
-    # an epigraph's slack is in no other row
-    lam_g[row] = -gradient[slack] / (2 * nlp.x0[slack])
     J = nlp.jacobian(nlp.x0)
     force = gradient + J.T @ lam_g
     equal = np.flatnonzero(nlp.lbg == nlp.ubg)

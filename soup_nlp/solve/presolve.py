@@ -70,8 +70,6 @@ UNTRUNCATED: Mapping[float, float] = {1.0: 0.3, 0.3: 1.0, 0.1: 1.0}
 reweighted step brings a little, follows the curvature of the residuals at once."""
 EXACT = "exact"
 """Name of the last stage."""
-LEAST_SECONDS = 1.0
-"""Time that every stage has at least, whatever the limit of all stages."""
 STOPPED = ("Interrupted", "Time_Limit")
 """Statuses of a stage after which no further stage begins."""
 
@@ -207,7 +205,7 @@ class Presolve:
                 lam_g0=program.lam_g,
                 p=nlp.thetas(eps=planned.eps, eps_pixel=planned.eps, **planned.theta),
                 tol=o.presolve_tol,
-                seconds=max(LEAST_SECONDS, self.deadline - time.process_time()),
+                seconds=self.deadline - time.process_time(),
                 watch=self.watch,
                 max_iter=o.presolve_iterations if max_iter is None else max_iter,
                 stagnation=o.stagnation * planned.share,
@@ -220,14 +218,8 @@ class Presolve:
 
 
 class _Planned(NamedTuple):
-    """A stage to run.
-
-    Attributes:
-        name: For progress and reports.
-        eps: Smoothing width.
-        share: Share of `stagnation` that ends it.
-        theta: Further parameters of the NLP.
-    """
+    """A stage to run: its name, smoothing width, share of `stagnation` that ends it, and further
+    parameters of the NLP."""
 
     name: str
     eps: float
@@ -237,15 +229,7 @@ class _Planned(NamedTuple):
 
 @dataclass
 class _Program:
-    """A program of the presolve, and where its stages stand.
-
-    Attributes:
-        nlp: The program.
-        layout: Turns x into soups.
-        x: (nx,) where the last stage ended.
-        lam_x: (nx,) multipliers of the bounds there.
-        lam_g: (ng,) multipliers of the constraints there.
-    """
+    """A program of the presolve, with point and multipliers where its last stage ended."""
 
     nlp: NLP
     layout: Layout

@@ -25,13 +25,8 @@ def refuse_libraries(section: object, where: str) -> None:
 
 
 class SolverOptions(Section):
-    """Stages of a solve; eps are smoothing widths in the energy's units (pixels by default).
-
-    In the presolve, Ipopt minimises the energy in nine coordinates per superpixel
-    (`solve.presolve`): with the majorant Hessian while the smoothing narrows, with Gauss-Newton
-    Hessians, with the exact one. It then solves the constrained NLP from this point and its
-    multipliers.
-    """
+    """Stages of a solve (`solve.presolve`, then the constrained NLP); eps are smoothing widths in
+    the energy's units (pixels by default)."""
 
     coordinates: Coordinates = "tangent"
     """Variables of the presolve. matrix: those of the constrained NLP, on which Ipopt then iterates
@@ -59,11 +54,9 @@ class SolverOptions(Section):
     """Dual infeasibility that ends the stages before the constrained NLP."""
     eps: Tolerance = 0.01
     """Smoothing of the constrained NLP."""
-    max_iter: Count = 30
-    """Iteration limit of the constrained NLP."""
-    far_iterations: Count = 5
-    """Iteration limit of the constrained NLP if the stage with the exact Hessian ended before a
-    minimum: Ipopt does not find one from there either, and each of its iterations takes seconds."""
+    max_iter: Count = 10
+    """Iteration limit of the constrained NLP. From a minimum of the presolve it takes next to none;
+    from elsewhere it finds none, and each of them takes seconds."""
     tol: Tolerance = 1e-6
     """Tolerance of the constrained NLP."""
     max_seconds: Tolerance = 600.0

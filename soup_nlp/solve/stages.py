@@ -1,7 +1,7 @@
 """Solve from an initialisation: Ipopt in tangent coordinates, then on the constrained NLP."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +19,7 @@ from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import UNMET, WARM, residuals, warm_start
-from soup_nlp.solve.presolve import EXACT, LEAST_SECONDS, STOPPED, Presolve
+from soup_nlp.solve.presolve import Presolve
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.storage.progress import Watch
 
@@ -48,7 +48,6 @@ class Solution:
         seconds: Wall time of "presolve", "build" and "solve".
         cpu_seconds: CPU time of this process in the same.
         delivered: What `soup` is: "constrained NLP", "presolve" or "start".
-        far: Whether the presolve ended before a minimum, so that Ipopt had few iterations.
         ends: Exact energy where the "start", the "presolve" and the "constrained NLP" ended.
     """
 
@@ -65,7 +64,6 @@ class Solution:
     seconds: Mapping[str, float] = field(default_factory=dict)
     cpu_seconds: Mapping[str, float] = field(default_factory=dict)
     delivered: str = "constrained NLP"
-    far: bool = False
     ends: Mapping[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -126,14 +124,6 @@ def _near(stage: Stage) -> bool:
     return stage.converged or bool(dual[-1] < 1.0)
 
 
-def _far(stages: Sequence[Stage]) -> bool:
-    """Whether the exact Hessian ended, by itself or at its limit, before a minimum."""
-    last = stages[-1] if stages else None
-    if last is None or last.name != EXACT or last.status in STOPPED:
-        return False
-    return not last.converged
-
-
 @dataclass(frozen=True)
 class _Solve:
     """State of one solve: its inputs and the stages that have ended."""
@@ -150,7 +140,7 @@ class _Solve:
     def run(self) -> Solution:
         """Run all stages; the result is the best of their final points."""
         presolved, rim = self.presolve()
-        near, far = bool(self.stages) and _near(self.stages[-1]), _far(self.stages)
+        near = bool(self.stages) and _near(self.stages[-1])
         # far from its minimum the presolve may have raised the exact energy
         worse = not near and self.energy(presolved) > self.energy(self.start)
         soup = self.start if worse else presolved
@@ -161,7 +151,7 @@ class _Solve:
         # a presolve that was stopped before its last stage has no multipliers
         if rim is not None and near and not worse:
             first |= warm_start(nlp, self.data, soup, rim)
-        stage = self.ipopt(nlp, first, far)
+        stage = self.ipopt(nlp, first)
         candidates = {"start": self.start, "presolve": presolved}
         if not self.o.presolve:
             del candidates["presolve"]
@@ -193,7 +183,6 @@ class _Solve:
             seconds=self.laps.wall,
             cpu_seconds=self.laps.cpu,
             delivered=delivered,
-            far=far,
             ends={k: self.energy(s) for k, s in ends.items()},
         )
 
@@ -215,22 +204,16 @@ class _Solve:
         self.laps.end("presolve")
         return soup, rim
 
-    def ipopt(self, nlp: NLP, first: dict[str, Any], far: bool) -> Stage:
+    def ipopt(self, nlp: NLP, first: dict[str, Any]) -> Stage:
         """The last stage, from a point with multipliers if there are any."""
-        o, limit = self.o, self.o.max_iter
+        o = self.o
         solver = Ipopt(nlp, o.ipopt, WARM if "lam_g0" in first else {})
         self.laps.end("build")
-        if far:
-            limit = min(limit, o.far_iterations)
-            self.watch.say(
-                f"not at a minimum yet: Ipopt has {o.far_iterations} iterations"
-                " (solver.far_iterations)"
-            )
         stage = solver(
             **first,
-            max_iter=limit,
+            max_iter=o.max_iter,
             tol=o.tol,
-            seconds=max(LEAST_SECONDS, self.laps.begin + o.max_seconds - time.process_time()),
+            seconds=self.laps.begin + o.max_seconds - time.process_time(),
             stage="constrained NLP",
             watch=self.watch,
         )

@@ -10,7 +10,7 @@ from benchmarks.family.write import write_family
 from soup_nlp import make_problem
 from soup_nlp.pipeline.case import prepare
 
-EPIGRAPH = "unit-translation/epigraph"
+OTHER = "unit-translation/smooth"
 
 
 @pytest.fixture(scope="session")
@@ -25,7 +25,7 @@ def record() -> Frozen:
 def folder(record, tmp_path_factory):
     """The set of that record, under the names of a published size."""
     out, lines = tmp_path_factory.mktemp("set"), []
-    chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [EPIGRAPH], ["hard"])
+    chosen = select([100], ["room"], [STANDARD]) + select([100], ["room"], [OTHER], ["hard"])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(write, "load_frozen", lambda scene, size: record)
         write_family(out, chosen, lines.append)

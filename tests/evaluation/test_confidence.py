@@ -23,11 +23,11 @@ from soup_nlp.evaluation.confidence import (
     with_prior,
 )
 from soup_nlp.evaluation.information import information, marginals, spread_in_image
+from soup_nlp.evaluation.selected_inverse import BlockCholesky, layers
 from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.solve.selected_inverse import BlockCholesky, layers
 from soup_nlp.start.components import FIXED, SCENE, TIES
 
 FORM = Formulation()

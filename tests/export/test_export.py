@@ -6,29 +6,23 @@ from functools import cache
 from pathlib import Path
 
 import casadi as ca
-import h5py
 import numpy as np
 import pytest
 from helpers_files import sets
 from helpers_nl import ReadBack, close
-from scipy import sparse
 
+from benchmarks.family.sol import write_sol
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
-from soup_nlp.errors import ConfigError, ExportError
-from soup_nlp.evaluation.information import information
-from soup_nlp.export.artefact import parse_formulation
+from soup_nlp.errors import ExportError
 from soup_nlp.export.foreign import import_sol, sol_table
 from soup_nlp.export.program import file_orders
-from soup_nlp.export.sol import write_sol
 from soup_nlp.export.verify import Limits, examine, violations
 from soup_nlp.geometry.constraints import kind, table
 from soup_nlp.model import oracle
-from soup_nlp.model.symbolic import Graph
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.stages import solve_soup
 
-ENDS = {"variables": ".col", "rows": ".row"}
 TINY = sets(
     "input.width=96 input.height=64 flow.source=truth segmentation.neighbours=4"
     " energy.pixel_samples=4 output.page=false"
@@ -42,7 +36,7 @@ def write(out: Path, *words: str, scene: str = "orbit") -> int:
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("exported")
-    assert write(out, "--superpixels", "16", "--format", "h5", "--format", "casadi") == 0
+    assert write(out, "--superpixels", "16") == 0
     return out
 
 
@@ -51,63 +45,24 @@ def problem_of(folder: Path):
     """NLP, layout, names and order of the files of an exported folder."""
     manifest = json.loads((folder / "manifest.json").read_text())
     case = prepare(load_problem(folder / "problem.yaml"))
-    chosen = {**manifest["formulation"], **manifest["smoothing"]}
-    nlp, layout = case.nlp(case.formulation(**chosen, hessian="exact"))
+    nlp, layout = case.nlp(case.formulation(coordinates=manifest["coordinates"]))
     return case, nlp, layout, file_orders(nlp), manifest
 
 
-@pytest.mark.slow
-def test_several_sizes_and_formulations_are_exported_and_read_back(tmp_path):
-    forms = ["unit-translation/smooth", "unit-offset/epigraph"]
-    words = [w for f in forms for w in ("--formulation", f)]
-    sizes = ["--superpixels", "9", "--superpixels", "12"]
-    assert write(tmp_path, *words, *sizes, "-q", scene="street") == 0
-    folders = sorted(p.parent for p in tmp_path.rglob("soup.nl"))
-    assert len(folders) == 4
-    # one of each size and of each formulation
-    for folder in (folders[0], folders[3]):
-        case, nlp, _, (v, r), manifest = problem_of(folder)
-        back = ReadBack(folder / "soup.nl")
-        assert manifest["sizes"]["variables"] == len(back.x0) == nlp.nx
-        assert manifest["sizes"]["jacobian_nonzeros"] == nlp.nnzj
-        close(back.x0, nlp.x0[v])
-        rng = np.random.default_rng(0)
-        x = np.clip(nlp.x0 + 0.05 * rng.normal(size=nlp.nx), nlp.lbx, nlp.ubx)
-        close(back.values(x[v])[0], nlp.value(x))
-        close(back.values(x[v])[1], nlp.constraints(x)[r])
-        close(back.values(x[v])[2], nlp.gradient(x)[v])
-        assert manifest["objective_at_start"] == nlp.value(nlp.x0)
-        exact = oracle.energy(case.soup, case.data, case.weights)["total"]
-        assert manifest["exact_energy_at_start"]["total"] == pytest.approx(exact, rel=1e-12)
-    hashes = {json.loads((f / "manifest.json").read_text())["nl"]["sha256"] for f in folders}
-    assert len(hashes) == 4
-
-
-@pytest.mark.slow
-def test_casadi_and_hdf5_agree_with_the_nlp(exported):
-    case, nlp, _, _, _ = problem_of(exported)
-    oracle = ca.Function.load(str(exported / "oracle.casadi"))
-    hess = ca.Function.load(str(exported / "hess_lag.casadi"))
-    with h5py.File(exported / "soup.h5") as file:
-        p, x0 = file["p"][:], file["x0"][:]
-        close(oracle(x0, p)[0], file["at_start/f"][()])
-        close(oracle(x0, p)[1], file["at_start/g"][:])
-        stored = file["at_start/hess_lag/value"][:]
-        assert file["x_names"].asstr()[0] == "lam[0]"
-        assert np.array_equal(p, Graph(nlp).p)
-        for name in ("x0", "lbx", "ubx", "lbg", "ubg"):
-            assert np.array_equal(file[name][:], getattr(nlp, name))
-        row, column, value, shape = (
-            file[f"at_start/information/{name}"][:] for name in ("row", "column", "value", "shape")
-        )
-    close(np.array(hess(x0, p, 1, np.ones(nlp.ng)).nonzeros()), stored)
-    listed = json.loads((exported / "manifest.json").read_text())["files"]
-    assert all((exported / name).is_file() for name in listed)
-    found = sparse.coo_matrix((value, (row, column)), shape).toarray()
-    form = case.formulation(hessian="exact")
-    expected = information(case.soup, case.data, case.weights, form).matrix.toarray()
-    assert not np.tril(found, -1).any()
-    np.testing.assert_allclose(found, np.triu(expected), rtol=1e-9, atol=1e-9 * expected.max())
+def test_the_file_and_its_manifest_are_those_of_the_nlp(exported):
+    case, nlp, _, (v, r), manifest = problem_of(exported)
+    back = ReadBack(exported / "soup.nl")
+    assert manifest["sizes"]["variables"] == len(back.x0) == nlp.nx
+    assert manifest["sizes"]["jacobian_nonzeros"] == nlp.nnzj
+    close(back.x0, nlp.x0[v])
+    rng = np.random.default_rng(0)
+    x = np.clip(nlp.x0 + 0.05 * rng.normal(size=nlp.nx), nlp.lbx, nlp.ubx)
+    close(back.values(x[v])[0], nlp.value(x))
+    close(back.values(x[v])[1], nlp.constraints(x)[r])
+    close(back.values(x[v])[2], nlp.gradient(x)[v])
+    assert manifest["objective_at_start"] == nlp.value(nlp.x0)
+    exact = oracle.energy(case.soup, case.data, case.weights)["total"]
+    assert manifest["exact_energy_at_start"]["total"] == pytest.approx(exact, rel=1e-12)
 
 
 def answer(folder: Path, name: str, move: float = 0.0, code: int = 0) -> Path:
@@ -247,16 +202,8 @@ def test_a_changed_export_is_refused(exported, tmp_path):
     assert main(["import", str(tmp_path), str(sol)]) == 2
 
 
-def test_options_are_checked(tmp_path, capsys):
-    assert parse_formulation("unit-offset") == {"gauge": "unit-offset"}
-    both = {"gauge": "unit-translation", "norm": "epigraph"}
-    assert parse_formulation("unit-translation/epigraph") == both
-    for text in ("free", "unit-offset/smoth", "unit-offset/smooth/smooth"):
-        with pytest.raises(ConfigError, match="formulation"):
-            parse_formulation(text)
-    assert write(tmp_path, "--formulation", "nothing") == 2
-    assert write(tmp_path, "--superpixels", "12", "--format", "mps") == 2
-    assert "nl, casadi, h5" in capsys.readouterr().err
+def test_options_are_checked(tmp_path):
+    assert write(tmp_path, "--set", "formulation.gauge=nothing") == 2
     assert write(tmp_path, "--coordinates", "euler") == 2
     assert not list(tmp_path.rglob("manifest.json"))
 
@@ -291,29 +238,3 @@ def test_no_multipliers_where_the_start_is_not_stationary(exported):
     assert not manifest["initial_duals"]
     lines = (exported / "soup.nl").read_text().splitlines()
     assert not any(line[0] in "dS" for line in lines)
-
-
-def test_suffixes_say_kind_and_superpixel(tmp_path):
-    assert write(tmp_path, "--superpixels", "16", "--suffixes") == 0
-    manifest = json.loads((tmp_path / "manifest.json").read_text())
-    lines = (tmp_path / "soup.nl").read_text().splitlines()
-    heads = [line for line in lines if line[0] == "S"]
-    assert [line.split()[0] + " " + line.split()[2] for line in heads] == [
-        "S0 kind", "S0 superpixel", "S1 kind", "S1 superpixel", "S4 scaling_factor",
-    ]  # fmt: skip
-    names = {of: (tmp_path / f"soup{end}").read_text().split() for of, end in ENDS.items()}
-    for k, head in enumerate(heads[:4]):
-        own = names[("variables", "rows")[k // 2]]
-        at, count = lines.index(head) + 1, int(head.split()[1])
-        values = dict(tuple(map(int, line.split())) for line in lines[at : at + count])
-        stems = manifest["kinds"][("variables", "rows")[k // 2]]
-        for place, value in values.items():
-            stem, _, rest = own[place].partition("[")
-            if k % 2:
-                assert value - 1 == int(rest.strip("]").split(",")[0])
-            else:
-                assert stems[value - 1] == stem
-    at, count = lines.index(heads[4]) + 1, int(heads[4].split()[1])
-    factors = [float(line.split()[1]) for line in lines[at : at + count]]
-    assert count == len(names["variables"])
-    assert min(factors) > 0

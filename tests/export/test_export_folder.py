@@ -9,12 +9,11 @@ import pytest
 from helpers_nl import ReadBack, close
 from test_export import problem_of, write
 
+from benchmarks.family.sol import write_sol
 from soup_nlp.cli.main import main
-from soup_nlp.errors import ConfigError, ExportError
-from soup_nlp.export.artefact import parse_formulation
+from soup_nlp.errors import ExportError
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.program import file_orders
-from soup_nlp.export.sol import write_sol
 from soup_nlp.model import oracle
 from soup_nlp.model.layout import TangentLayout
 from soup_nlp.solve.stages import solve_soup
@@ -24,33 +23,15 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_second_export_removes_the_files_of_the_first(tmp_path):
-    assert write(tmp_path, "--superpixels", "9", "--format", "casadi", "-q") == 0
-    (tmp_path / "mine.casadi").write_text("not of the export")
-    manifest = json.loads((tmp_path / "manifest.json").read_text())
-    # what no export writes is not removed, even if a manifest lists it
+    assert write(tmp_path, "--superpixels", "9", "-q") == 0
     (tmp_path / "mine.txt").write_text("not of the export")
-    manifest["files"] += ["mine.txt", "../outside"]
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    (tmp_path / "manifest.json").write_text("{}")
     # it was changed, so it is the user's now
     assert write(tmp_path, "--superpixels", "12", "-q") == 2
     assert write(tmp_path, "--superpixels", "12", "-q", "--overwrite") == 0
     names = {p.name for p in tmp_path.iterdir()}
     own = {"soup.nl", "soup.col", "soup.row", "problem.yaml", "manifest.json"}
-    assert names == own | {"mine.casadi", "mine.txt", SUMS}
-
-
-def test_sizes_of_equal_number_have_their_own_folders(tmp_path, capsys):
-    words = [w for n in ("15", "16", "16") for w in ("--superpixels", n)]
-    assert write(tmp_path, *words) == 0
-    folders = {p.parent.name for p in tmp_path.rglob("soup.nl")}
-    assert folders == {f"orbit-{n}-unit-offset-smooth" for n in (15, 16)}
-    assert len(capsys.readouterr().out.splitlines()) == 2
-    # two ways to ask for the same formulation
-    words = [
-        w for f in ("unit-translation", "unit-translation/smooth") for w in ("--formulation", f)
-    ]
-    assert write(tmp_path / "f", "--superpixels", "9", *words) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 1
+    assert names == own | {"mine.txt", SUMS}
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +49,8 @@ def small(tmp_path_factory) -> Path:
         ("fingerprint", {}),
         ("fingerprint", {"objective": "many", "constraints": 0.0}),
         ("fingerprint", None),
-        ("formulation", {"gauge": "unit-offset"}),
-        ("formulation", {"gauge": ["unit-offset"], "norm": "smooth", "coordinates": "matrix"}),
-        ("formulation", {"gauge": "unit-offset", "norm": "rough", "coordinates": "matrix"}),
-        ("smoothing", {"eps": None, "eps_pixel": 1.0}),
+        ("coordinates", ["matrix"]),
+        ("coordinates", "euler"),
         ("exact_energy_at_start", {"total": None}),
     ],
 )
@@ -94,16 +73,14 @@ def test_a_broken_manifest_is_refused(key, value, small, tmp_path, capsys):
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     out = tmp_path_factory.mktemp("tangent")
-    assert write(out, "--superpixels", "16", "--coordinates", "tangent", "--format", "casadi") == 0
+    assert write(out, "--superpixels", "16", "--coordinates", "tangent") == 0
     return out
 
 
 def test_the_file_has_nine_coordinates(exported):
     case, nlp, layout, (v, r), manifest = problem_of(exported)
     assert isinstance(layout, TangentLayout)
-    assert manifest["formulation"]["coordinates"] == "tangent"
-    # the format casadi has the start too
-    assert {"soup.h5", "oracle.casadi"} <= set(manifest["files"])
+    assert manifest["coordinates"] == "tangent"
     n = len(case)
     # eight rim rays a superpixel and the length unit; SO(3) and unit normals hold by construction
     assert (nlp.nx, nlp.ng) == (9 * n, 8 * n + 1)
@@ -135,7 +112,7 @@ def test_an_answer_in_tangent_coordinates_becomes_a_result(exported, tmp_path, c
     assert main(["check", str(out)]) == 0
     # the same answer to the file with lifted variables
     lifted = tmp_path / "lifted"
-    words = ["--superpixels", "16", "--coordinates", "tangent", "--lift", "--suffixes"]
+    words = ["--superpixels", "16", "--coordinates", "tangent", "--lift"]
     assert write(lifted, *words) == 0
     _, nlp, *_ = problem_of(exported)
     write_sol(path, layout.pack(solved.soup), None, *file_orders(nlp, lift=True), "elsewhere", 0)
@@ -151,11 +128,3 @@ def test_an_answer_in_tangent_coordinates_becomes_a_result(exported, tmp_path, c
     bad[::9] *= 1.5
     write_sol(path, bad, None, *order, "elsewhere", 0)
     assert main(["check", str(path), "--export", str(exported)]) == 1
-
-
-def test_tangent_coordinates_have_no_gauge():
-    assert parse_formulation("", "tangent") == {"coordinates": "tangent"}
-    tangent = {"coordinates": "tangent", "norm": "epigraph"}
-    assert parse_formulation("tangent/epigraph") == tangent
-    with pytest.raises(ConfigError, match="gauge"):
-        parse_formulation("unit-offset", "tangent")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers_model import GAUGES, NORMS, PAPER, TRUNCATED, tiny, wiggle
+from helpers_model import GAUGES, PAPER, TRUNCATED, tiny, wiggle
 from helpers_nl import ReadBack, close, defined_variables
 
 from soup_nlp.config.problem import make_problem
@@ -23,11 +23,7 @@ from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 
-FORMS = [Formulation(gauge=g, norm=n) for g in GAUGES for n in NORMS]
-
-
-def form_id(form: Formulation) -> str:
-    return f"{form.gauge}-{form.norm}"
+FORMS = [Formulation(gauge=gauge) for gauge in GAUGES]
 
 
 def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> None:
@@ -54,13 +50,13 @@ def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", FORMS, ids=form_id)
+@pytest.mark.parametrize("form", FORMS, ids=GAUGES)
 def test_casadi_reads_back_every_formulation(form, tmp_path):
-    nlp, layout = tiny().nlp(TRUNCATED if form.norm == "epigraph" else PAPER, form)
+    nlp, _ = tiny().nlp(PAPER if form == FORMS[0] else TRUNCATED, form)
     file = write_nl(tmp_path / "soup.nl", nlp)
     back = ReadBack(file.path)
     for seed, size in ((0, 0.02), (1, 0.2)):
-        agrees(nlp, file, back, wiggle(nlp, layout.size, seed, size), seed)
+        agrees(nlp, file, back, wiggle(nlp, seed, size), seed)
     assert file.size == file.path.stat().st_size
     nonzeros = file.path.read_text().splitlines()[7]
     assert nonzeros.split()[:2] == [str(nlp.nnzj), str(file.counts["gradient_nonzeros"])]
@@ -79,10 +75,6 @@ def test_shared_expressions_are_written_once(tmp_path):
     depths = [t for t in texts if t.startswith("o3\nv") and int(t.split("\n")[1][1:]) in scales]
     # every anchor once, and one more for each end of each boundary point
     assert len(depths) == 12 + 2 * 2 * 17
-    epigraph, _ = tiny().nlp(TRUNCATED, Formulation(norm="epigraph"))
-    both, *others = defined_variables(write_nl(tmp_path / "e.nl", epigraph))
-    assert both == 0
-    assert all(others[k] > 0 for k in (0, 2, 3))
 
 
 def test_variables_and_rows_are_ordered_by_class(tmp_path):
@@ -99,10 +91,6 @@ def test_variables_and_rows_are_ordered_by_class(tmp_path):
     curved = file.counts["nonlinear_rows"]
     assert {n.partition("[")[0] for n in rows[:curved]} == {"so3", "normal"}
     assert {n.partition("[")[0] for n in rows[curved:]} == {"visible", "simplex", "E"}
-    slack, _ = tiny().nlp(PAPER, Formulation(norm="epigraph"))
-    file = write_nl(tmp_path / "e.nl", slack)
-    # slacks of untruncated norms are linear in the objective
-    assert file.counts["nonlinear_variables"]["both"] < file.counts["nonlinear_variables"]["rows"]
 
 
 # --- foreign readers -----------------------------------------------------------------------------
@@ -110,8 +98,7 @@ def test_variables_and_rows_are_ordered_by_class(tmp_path):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    form = Formulation(gauge="unit-translation", norm="epigraph")
-    nlp, layout = tiny().nlp(TRUNCATED, form)
+    nlp, layout = tiny().nlp(TRUNCATED, FORMS[-1])
     folder = tmp_path_factory.mktemp("foreign")
     lam_g = np.full(nlp.ng, -1.0)
     return nlp, layout, write_nl(folder / "soup.nl", nlp, lam_g)
@@ -198,8 +185,8 @@ def pounce_agrees(nlp: NLP, file: NLFile, x: np.ndarray) -> None:
 @pytest.mark.slow
 def test_pounce_agrees(written):
     pounce = pytest.importorskip("pounce", reason="pounce-solver is not installed")
-    nlp, layout, file = written
-    pounce_agrees(nlp, file, wiggle(nlp, layout.size, 3, 0.1))
+    nlp, _, file = written
+    pounce_agrees(nlp, file, wiggle(nlp, 3, 0.1))
     back = pounce.read_nl(str(file.path))
     x_names, g_names = nlp.x_names(), nlp.g_names()
     assert list(back.var_names) == [x_names[k] for k in file.variables]
@@ -232,10 +219,9 @@ def structure(path: Path) -> set[tuple[int, int]]:
     return found
 
 
-@pytest.mark.parametrize("norm", NORMS)
-def test_lifted_expressions_are_variables_with_rows(norm, tmp_path):
-    weights = TRUNCATED if norm == "epigraph" else PAPER
-    nlp, _ = tiny().nlp(weights, Formulation(norm=norm))
+@pytest.mark.parametrize("weights", [PAPER, TRUNCATED], ids=["paper", "truncated"])
+def test_lifted_expressions_are_variables_with_rows(weights, tmp_path):
+    nlp, _ = tiny().nlp(weights, FORMS[0])
     plain = write_nl(tmp_path / "plain.nl", nlp)
     file = write_nl(tmp_path / "soup.nl", nlp, np.ones(nlp.ng), lift=True)
     assert plain.lifted == 0
@@ -284,14 +270,13 @@ def swinging(tmp_path_factory) -> Case:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("norm", NORMS)
-def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, norm, tmp_path):
+def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, tmp_path):
     data, eps = swinging.data, 2e-5
-    form = swinging.formulation(norm=norm, hessian="exact", eps=eps, eps_pixel=eps)
-    nlp, layout = swinging.nlp(form)
+    form = swinging.formulation(hessian="exact", eps=eps, eps_pixel=eps)
+    nlp, _ = swinging.nlp(form)
     file = write_nl(tmp_path / "soup.nl", nlp)
     back = ReadBack(file.path)
-    x = wiggle(nlp, layout.size, 0, 0.02)
+    x = wiggle(nlp, 0, 0.02)
     agrees(nlp, file, back, x, 0)
     pounce_agrees(nlp, file, x)
     # at the start the file has both terms, up to their smoothing

@@ -8,10 +8,11 @@ import pytest
 from helpers_model import PAPER, Tiny
 from scipy import sparse
 
+from benchmarks.family.sol import write_sol
 from soup_nlp.errors import ExportError
 from soup_nlp.export import verify
 from soup_nlp.export.nl import write_nl
-from soup_nlp.export.sol import read_sol, write_sol
+from soup_nlp.export.sol import read_sol
 from soup_nlp.export.solvers import find_program
 from soup_nlp.export.verify import bound_multipliers, least_squares_multipliers
 from soup_nlp.model.formulation import Formulation

@@ -152,11 +152,10 @@ def directional(fun: Callable[[Float], Float], x: Float, v: Float, h: float = 1e
     return (4 * central(h / 2) - central(h)) / 3
 
 
-def wiggle(nlp: NLP, layout_size: int, seed: int, size: float) -> Float:
-    """A random point near x0, off the manifold; slack variables anywhere inside bounds."""
+def wiggle(nlp: NLP, seed: int, size: float) -> Float:
+    """A random point near x0, off the manifold."""
     rng = np.random.default_rng(seed)
     x = nlp.x0 * (1 + size * rng.uniform(-1, 1, nlp.nx)) + size * rng.uniform(-0.2, 0.2, nlp.nx)
-    x[layout_size:] = rng.uniform(0.1, 0.9, nlp.nx - layout_size)
     return np.clip(x, nlp.lbx + 1e-3, nlp.ubx - 1e-3)
 
 
@@ -291,7 +290,6 @@ def with_graph(data: EnergyData, edges: list[int], pairs: list[int]) -> EnergyDa
 # --- the tiny problem and rendered planes in their units -----------------------------------------
 
 UNITS = ("paper", "pixels")
-NORMS = ("smooth", "epigraph")
 
 
 @cache

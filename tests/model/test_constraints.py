@@ -10,12 +10,10 @@ vector counts scales as `N lam` and lengths in `1 / N`:
     simplex       1, sum lam = 1                all
     unit          1, sum c lam d = 1            unit-translation; else d = 1 / c is no variable
     translation   1 per superpixel, |t| = tau   unit-translation
-    epigraph      1 per norm, s^2 >= |v|^2 + eps^2
 
 `tests/tools/constraint_mutants.py` deletes each of these and each bound, and runs this file.
 """
 
-import re
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -24,7 +22,6 @@ import numpy as np
 import pytest
 from helpers_model import (
     GAUGES,
-    NORMS,
     PAPER,
     UNITS,
     disturbed,
@@ -54,9 +51,8 @@ BOUNDS = {
     "n": (-np.inf, np.inf),
     "R": (-np.inf, np.inf),
     "t": (-np.inf, np.inf),
-    "s": (0.0, np.inf),
 }
-"""Bounds of the variables; s are slack variables of norms."""
+"""Bounds of the variables."""
 RAW = 1e-8
 """Largest violation of the raw answer, by any kind. Ipopt's own tolerance is 1e-9."""
 
@@ -65,8 +61,8 @@ RAW = 1e-8
 
 
 def kind_of(name: str) -> str:
-    """`so3[17]` -> so3, `s_rotation[3]` -> s, `epigraph_gap_ref[0]` -> epigraph."""
-    return re.split(r"[\[_]", name)[0]
+    """`so3[17]` -> so3."""
+    return name.partition("[")[0]
 
 
 def numbers(nlp: NLP, x: np.ndarray) -> SimpleNamespace:
@@ -85,7 +81,7 @@ def numbers(nlp: NLP, x: np.ndarray) -> SimpleNamespace:
 
 
 def bodies(nlp: NLP, x: np.ndarray, data: EnergyData, depth_ratio: float) -> dict[str, np.ndarray]:
-    """What the rows of every kind but the epigraph have to be."""
+    """What the rows of every kind have to be."""
     v = numbers(nlp, x)
     gram = np.einsum("nji,njk->nik", v.R, v.R) - np.eye(3)
     anchor, rim = data.rim_ray[:, :1], data.rim_ray[:, 1:]
@@ -107,7 +103,6 @@ def limits(kind: str, min_facing: float) -> tuple[float, float]:
     """Bounds of the rows of a kind."""
     return {
         "visible": (min_facing, np.inf),
-        "epigraph": (0.0, np.inf),
         "simplex": (1.0, 1.0),
         "unit": (1.0, 1.0),
     }.get(kind, (0.0, 0.0))
@@ -122,7 +117,6 @@ def violations(nlp: NLP, x: np.ndarray, data: EnergyData, f: Formulation) -> dic
     """Largest violation by kind of a raw vector, bounds and the sign of det R among them."""
     out = {"det": float(np.abs(np.linalg.det(numbers(nlp, x).R) - 1).max())}
     found = bodies(nlp, x, data, f.depth_ratio)
-    found["epigraph"] = nlp.constraints(x)[rows(nlp, "epigraph")]
     for kind, body in found.items():
         lower, upper = limits(kind, f.min_facing)
         out[kind] = float(np.maximum(lower - body, body - upper).max(initial=0.0))
@@ -136,22 +130,21 @@ def violations(nlp: NLP, x: np.ndarray, data: EnergyData, f: Formulation) -> dic
 # --- every row and every bound, in every formulation --------------------------------------------
 
 
-@pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_every_row_and_every_bound_is_the_specified_one(gauge, norm):
+def test_every_row_and_every_bound_is_the_specified_one(gauge):
     problem, share = tiny("pixels"), np.linspace(1.0, 4.0, 12)
     data = replace(problem.data, share=share / share.sum())
-    f = form(gauge=gauge, norm=norm, depth_ratio=4.0, min_facing=0.02)
-    nlp, layout = build_matrix_nlp(problem.soup, data, weights_for("pixels"), f)
+    f = form(gauge=gauge, depth_ratio=4.0, min_facing=0.02)
+    nlp, _ = build_matrix_nlp(problem.soup, data, weights_for("pixels"), f)
     # the start is feasible
     assert np.isfinite(nlp.x0).all()
     found = violations(nlp, nlp.x0, data, f)
     assert max(found.values()) <= 1e-9, found
     # off the manifold, where no entry of any row is 0
-    x = wiggle(nlp, layout.size, 1, 0.3)
+    x = wiggle(nlp, 1, 0.3)
     spec, g = bodies(nlp, x, data, 4.0), nlp.constraints(x)
     kinds = {kind_of(name) for name in nlp.g_names()}
-    assert kinds == spec.keys() | ({"epigraph"} if norm == "epigraph" else set())
+    assert kinds == spec.keys()
     for kind, body in spec.items():
         np.testing.assert_allclose(g[rows(nlp, kind)], body, rtol=0, atol=1e-12, err_msg=kind)
         assert np.abs(body - limits(kind, 0.02)[0]).min() > 1e-6, kind
@@ -161,27 +154,6 @@ def test_every_row_and_every_bound_is_the_specified_one(gauge, norm):
         assert (nlp.ubg[rows(nlp, kind)] == upper).all(), kind
     for name, lower, upper in zip(nlp.x_names(), nlp.lbx, nlp.ubx):
         assert (lower, upper) == BOUNDS[kind_of(name)], name
-
-
-@pytest.mark.parametrize("gauge", GAUGES)
-def test_slack_variables_on_their_epigraph_are_the_smooth_norms(gauge):
-    problem, w = tiny("pixels"), weights_for("pixels")
-    smooth, layout = problem.nlp(w, form(gauge=gauge))
-    epigraph, _ = problem.nlp(w, form(gauge=gauge, norm="epigraph"))
-    x = wiggle(epigraph, layout.size, 2, 0.1)
-    names = epigraph.x_names()
-    slack = np.array([kind_of(name) == "s" for name in names])
-    # every slack has the row of its name
-    own = [name for name in epigraph.g_names() if kind_of(name) == "epigraph"]
-    bound = [names.index(name.replace("epigraph_", "s_")) for name in own]
-    assert sorted(bound) == list(np.flatnonzero(slack))
-    row = epigraph.constraints(x)[rows(epigraph, "epigraph")]
-    x[bound] = np.sqrt(x[bound] ** 2 - row)
-    np.testing.assert_allclose(epigraph.constraints(x)[rows(epigraph, "epigraph")], 0, atol=1e-9)
-    assert epigraph.value(x) == pytest.approx(smooth.value(x[~slack]), rel=1e-12)
-    # and they start on it
-    start = epigraph.constraints(epigraph.x0)[rows(epigraph, "epigraph")]
-    np.testing.assert_allclose(start, 0, atol=1e-9)
 
 
 @pytest.mark.parametrize("units", UNITS)
@@ -311,21 +283,6 @@ def test_the_raw_answer_keeps_every_constraint(gauge, name, ratio):
     kept = soup.normalised(data.share).retracted()
     np.testing.assert_allclose(kept.R, soup.R, atol=RAW)
     np.testing.assert_allclose(kept.n, soup.n, atol=RAW)
-
-
-@pytest.mark.parametrize(
-    "gauge", ["unit-offset", pytest.param("unit-translation", marks=pytest.mark.slow)]
-)
-def test_so_it_does_with_slack_variables(gauge):
-    _, layout, x = smooth_answer("slanted", gauge, 5.0)
-    _, data = world("slanted", "pixels", False)
-    f = form(gauge=gauge, norm="epigraph", **WIDE)
-    near = layout.unpack(x).normalised(data.share).retracted()
-    nlp, _ = build_matrix_nlp(near, data, WEIGHTS, f)
-    stage = Ipopt(nlp)(x0=nlp.x0, tol=1e-3)
-    assert stage.converged, stage
-    found = violations(nlp, stage.x, data, f)
-    assert max(found.values()) <= RAW, found
 
 
 @pytest.mark.parametrize("side", ["lbx", "ubx", "lbg", "ubg"])

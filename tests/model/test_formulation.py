@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers_model import (
     GAUGES,
-    NORMS,
     PAPER,
     UNITS,
     assert_same_soup,
@@ -26,7 +25,6 @@ from soup_nlp.model.elements import TERMS
 from soup_nlp.model.kernel import Pattern
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.programs import build_tangent_nlp, exact_chart
-from soup_nlp.model.symbolic import Graph
 
 # --- layouts -------------------------------------------------------------------------------------
 
@@ -91,11 +89,10 @@ def test_superpixels_of_one_plane_stay_on_one_while_it_turns():
 # --- names, sizes, print -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_names_are_unique_and_point_to_their_numbers(gauge, norm):
+def test_names_are_unique_and_point_to_their_numbers(gauge):
     problem = tiny()
-    nlp, layout = problem.nlp(weights_for("paper"), form(gauge=gauge, norm=norm))
+    nlp, layout = problem.nlp(weights_for("paper"), form(gauge=gauge))
     x, g = nlp.x_names(), nlp.g_names()
     assert len(x) == len(set(x)) == nlp.nx
     assert len(g) == len(set(g)) == nlp.ng
@@ -138,18 +135,11 @@ def test_sizes_are_those_of_the_formulation():
     other, _ = problem.nlp(PAPER, form(gauge="unit-translation"))
     assert other.sizes()["variables"] == 17 * n + 1
     assert other.sizes()["equalities"] == 8 * n + 2
-    slack, _ = problem.nlp(weights_for("paper"), form(norm="epigraph"))
-    e, p, pixels = len(problem.seg.edges), len(problem.seg.pairs), problem.data.pixel_weight
-    given = int((problem.data.depth_weight > 0).sum() + (problem.data.order_weight != 0).sum())
-    norms = 4 * e + given + 2 * p + int((pixels > 0).sum())
-    # orientation has no epigraph (a square is smooth)
-    assert slack.sizes()["variables"] == 16 * n + norms
-    assert slack.sizes()["inequalities"] == 9 * n + norms
-    assert sizes["jacobian_nonzeros"] == nlp.nnzj == Graph(nlp).jac_g.nnz_out(1)
+    assert sizes["jacobian_nonzeros"] == nlp.nnzj == nlp.jacobian(nlp.x0).nnz
 
 
 def test_the_print_shows_sizes_and_sparsity():
-    nlp, _ = tiny().nlp(PAPER, form(norm="epigraph"))
+    nlp, _ = tiny().nlp(PAPER, form())
     text = str(nlp)
     assert text.startswith(f"NLP soup: {nlp.nx} variables, {nlp.ng} constraints")
     for nonzeros, cells in ((nlp.nnzj, nlp.nx * nlp.ng), (nlp.nnzh, sum(range(nlp.nx + 1)))):
@@ -193,11 +183,10 @@ def test_a_pattern_is_the_union_of_its_sets(size):
 
 
 @pytest.mark.parametrize("units", UNITS)
-@pytest.mark.parametrize("norm", NORMS)
-def test_the_same_soup_has_the_same_objective_in_all_variables(norm, units):
+def test_the_same_soup_has_the_same_objective_in_all_variables(units):
     problem, weights = tiny(units), weights_for(units)
-    nlps = [problem.nlp(weights, form(gauge=gauge, norm=norm))[0] for gauge in GAUGES]
-    nlps.append(build_tangent_nlp(problem.soup, problem.data, weights, form(norm=norm))[0])
+    nlps = [problem.nlp(weights, form(gauge=gauge))[0] for gauge in GAUGES]
+    nlps.append(build_tangent_nlp(problem.soup, problem.data, weights, form())[0])
     found = [nlp.value(nlp.x0) for nlp in nlps]
     assert found[0] > 0
     np.testing.assert_allclose(found[:-1], found[0], rtol=1e-12)

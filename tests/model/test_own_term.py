@@ -27,7 +27,7 @@ class WiderWeights(Weights):
 def symbols(a, b, row, eps):
     """Step 3: the ratio of the depths of two neighbours, in symbols."""
     ratio = a.anchor(row["ray_i"])[2] / b.anchor(row["ray_k"])[2]
-    return [Norm("level", row["weight"], ca.log(ratio), eps)]
+    return [Norm(row["weight"], ca.log(ratio), eps)]
 
 
 def numbers(e, weights):

@@ -224,7 +224,7 @@ UNTRUSTING: dict[str, tuple[str, Any, tuple[int, ...]]] = {
     "manifest": ("check {x}/soup.sol", changed("exported", "manifest.json", _manifest), (1,)),
     "problem name": ("solve {x} -o {out}", _named("name: {}"), ANY),
     "problem name exported": (
-        "export {x} --superpixels 12 --superpixels 13 -o {out}", _named("name: {}"), (0, 2)
+        "export {x} --superpixels 12", _named("name: {}"), (0, 2)
     ),
     "unknown key": ("show {x}", _named("{}: 1"), (2,)),
     "wrong value": ("show {x}", _named("seed: {}"), (2,)),
@@ -232,7 +232,7 @@ UNTRUSTING: dict[str, tuple[str, Any, tuple[int, ...]]] = {
     "verb": ("{x}", None, (2,)),
     "override": ("show {p} --set {x}", None, (2,)),
     "solver": ("compare {p} --solvers {x} -o {out}", None, (2,)),
-    "formulation": ("export {p} --formulation {x} -o {out}", None, (2,)),
+    "coordinates": ("export {p} --coordinates {x} -o {out}", None, (2,)),
     "scale": ("evaluate {result} --depth {d} --scale {x}", None, (2,)),
     "flow": ("{solve} --flow {x}", None, (2,)),
     "summary": ("check {x}", changed("result", "summary.json", _status), (1, 2)),

@@ -13,7 +13,7 @@ from helpers_nl import plain_nlp
 from soup_nlp.errors import SolverError
 from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.symbolic import Graph
+from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import optimality
 from soup_nlp.storage.progress import Progress, Watch
@@ -117,7 +117,7 @@ def test_a_multiplier_of_the_wrong_sign_is_no_optimum():
 
 def test_hessian_of_an_unsorted_table_is_upper_triangular():
     nlp = rosenbrock(4)
-    assert Graph(nlp).hess_lag.sparsity_out(0).is_triu()
+    assert Functions(nlp).hess_lag.sparsity_out(0).is_triu()
     x = np.array([0.3, -0.5, 0.7, 1.2])
     H = nlp.hessian(x, np.zeros(0)).toarray()
     expected = np.zeros((4, 4))
@@ -157,7 +157,6 @@ def test_history_counts_and_call_times_are_kept():
     assert stage.history.keys() >= {"obj", "inf_pr", "inf_du", "mu"}
     assert all(len(v) == stage.iterations + 1 for v in stage.history.values())
     np.testing.assert_allclose(stage.history["obj"], [p.objective for p in seen])
-    assert 0 < stage.evaluating <= stage.seconds
 
 
 @pytest.mark.parametrize(

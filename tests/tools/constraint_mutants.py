@@ -1,7 +1,7 @@
-"""Delete each constraint row and each bound of the NLP: `python tests/tools/constraint_mutants.py`.
+"""Delete constraint rows and bounds, widen verdicts: `python tests/tools/constraint_mutants.py`.
 
-A mutant is one change in a copy of the package. The fast tests of `test_constraints.py` have to
-fail; the table says which test saw it. The exit code is the number of mutants that survive.
+A mutant is one change in a copy of the package. The fast tests of `ROWS_AND_BOUNDS` or `VERDICTS`
+have to fail; the table says which test saw it. The exit code is the number of mutants that survive.
 """
 
 import os
@@ -26,10 +26,11 @@ class Mutant(NamedTuple):
 
 
 PROGRAMS, TERMS = "model/programs.py", "model/terms.py"
-BUILDER, IPOPT, NORMS = "model/builder.py", "solve/ipopt.py", "model/norms.py"
+IPOPT = "solve/ipopt.py"
 FREE = "lower=-1e9, upper=1e9"
 ROWS = "for c in range(3) for r in range(c + 1)"
-MUTANTS = [
+ROWS_AND_BOUNDS = ("tests/model/test_constraints.py",)
+DELETED = [
     *[
         Mutant(f"so3 without ({r}, {c})", TERMS, ROWS, f"{ROWS} if (r, c) != ({r}, {c})")
         for c in range(3)
@@ -59,10 +60,6 @@ MUTANTS = [
     Mutant("lam > 0", PROGRAMS, "lbx[np.arange(n) * stride] = MIN_SCALE", "pass"),
     Mutant("d > 0", PROGRAMS, "lbx[np.arange(n) * stride + 4] = MIN_SCALE", "pass"),
     Mutant("tau > 0", PROGRAMS, "lbx[layout.tau] = 1e-8", "pass"),
-    Mutant("epigraph rows not held", BUILDER, 'f"epigraph_{norm}", 0.0,',
-           'f"epigraph_{norm}", -1e9,'),
-    Mutant("epigraph without eps", NORMS, "slack**2 - square - norm.eps**2", "slack**2 - square"),
-    Mutant("slack >= 0", BUILDER, 'Block(f"s_{norm}", 0.0,', 'Block(f"s_{norm}", -np.inf,'),
     Mutant("presolve: simplex", PROGRAMS, "value, index, lower=1.0, upper=1.0",
            f"value, index, {FREE}"),
     Mutant("presolve: visible", PROGRAMS, "        lower=0.0,\n        upper=np.inf",
@@ -78,6 +75,33 @@ MUTANTS = [
     ],
     Mutant("Ipopt stops at 1e-4", IPOPT, '"constr_viol_tol": 1e-9', '"constr_viol_tol": 1e-4'),
 ]  # fmt: skip
+KINDS, KKT = "geometry/constraints.py", "solve/kkt.py"
+VERDICTS = ("tests/geometry/test_soup_constraints.py", "tests/solve/test_verdicts.py")
+WIDENED = [
+    Mutant("limit of so3", KINDS, '"entry of R\'R", 1e-8', '"entry of R\'R", 1e-2'),
+    Mutant("limit of det", KINDS, '"det R", 1e-8', '"det R", 1e-2'),
+    Mutant("limit of the simplex", KINDS, '"sum of all lam", 1e-10', '"sum of all lam", 1e-3'),
+    Mutant("limit of visibility", KINDS, '"-n . r, rays with z = 1", 1e-6',
+           '"-n . r, rays with z = 1", 1e-3'),
+    Mutant("absolute determinant", KINDS, "np.abs(np.linalg.det(R) - 1)",
+           "np.abs(np.abs(np.linalg.det(R)) - 1)"),
+    Mutant("visibility at the anchor only", KINDS, "(min_facing - facing).max(axis=1)",
+           "(min_facing - facing)[:, 0]"),
+    Mutant("limits of a stored result", "report/check.py", "ABSOLUTE, k.limit, k.note",
+           "ABSOLUTE, 1e6 * k.limit, k.note"),
+    Mutant("no Constraints_Violated", "solve/stages.py", "status=UNMET if broken else stage.status",
+           "status=stage.status"),
+    Mutant("converged though violated", "solve/stages.py", "stage.converged and not broken",
+           "stage.converged"),
+    Mutant("complementarity of bounds only", KKT, ", (g, nlp.lbg, nlp.ubg, lam_g))", ",)"),
+    Mutant("sign of the rim's multipliers", KKT, "= -rim / facing", "= rim / facing"),
+    Mutant("slack of verification", "export/verify.py", "SLACK = 10.0", "SLACK = 1000.0"),
+    Mutant("feasible to 1e-3", "export/verify.py", "FEASIBLE = 1e-6", "FEASIBLE = 1e-3"),
+]  # fmt: skip
+MUTANTS = [
+    *((mutant, ROWS_AND_BOUNDS) for mutant in DELETED),
+    *((mutant, VERDICTS) for mutant in WIDENED),
+]
 
 
 def copied(place: Path) -> Path:
@@ -88,11 +112,11 @@ def copied(place: Path) -> Path:
     return place
 
 
-def killer(root: Path, module: Path, text: str, tests: str) -> str:
+def killer(root: Path, module: Path, text: str, *tests: str) -> str:
     """The first fast test that fails where a module of a copy has another text; "" if none does."""
     before = module.read_text()
     module.write_text(text)
-    words = ["-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", tests]
+    words = ["-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *tests]
     surroundings = {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
         done = subprocess.run(
@@ -117,13 +141,13 @@ def main() -> int:
     alive = 0
     with tempfile.TemporaryDirectory(prefix="soup_mutants_") as place:
         root = copied(Path(place))
-        for mutant in MUTANTS:
+        for mutant, tests in MUTANTS:
             module = root / "soup_nlp" / mutant.module
             text = module.read_text()
             if text.count(mutant.old) != 1:
                 raise SystemExit(f"{mutant.what}: {mutant.module} has not one {mutant.old!r}")
             text = text.replace(mutant.old, mutant.new)
-            found = killer(root, module, text, "tests/model/test_constraints.py")
+            found = killer(root, module, text, *tests)
             alive += not found
             print(f"{mutant.what:<34} {found or 'SURVIVES'}", flush=True)
     print(f"{len(MUTANTS) - alive} of {len(MUTANTS)} killed")

@@ -30,10 +30,10 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
+from benchmarks.family.sol import write_sol
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.export.program import file_orders
-from soup_nlp.export.sol import write_sol
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.storage.folders import SUMS, UNFINISHED, digest_of, read_sums
 
