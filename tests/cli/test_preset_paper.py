@@ -87,7 +87,6 @@ def test_the_documented_departures_that_the_preset_keeps():
         "flow.source",
         "energy.pixel_samples",
         "segmentation.boundary_samples",
-        "formulation.norm",
         "solver.eps",
         "solver.presolve",
     }
