@@ -207,4 +207,4 @@ def _task(instance: Instance, limits: Limits) -> Task:
     record = load_frozen(instance.scene, instance.size)
     case = case_of(record)
     parts = case, record, instance.formulation, instance.start
-    return make_task(case, lambda: build_instance(*parts), limits)
+    return make_task(case, *build_instance(*parts), limits)

@@ -1,15 +1,15 @@
 """Export of an NLP as a folder: .nl with names, problem and manifest."""
 
 from pathlib import Path
-from typing import Any, NotRequired
+from typing import Annotated, Any, NotRequired
 
 import numpy as np
-from pydantic import FiniteFloat
+from pydantic import Field, FiniteFloat
 from typing_extensions import TypedDict
 
 from soup_nlp.config.problem import dump_problem
 from soup_nlp.errors import ExportError
-from soup_nlp.export.nl import NLFile, write_nl
+from soup_nlp.export.nl import write_nl
 from soup_nlp.export.verify import examine
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Coordinates, Formulation
@@ -25,7 +25,7 @@ MANIFEST = "manifest.json"
 EXPORT_FILES = (f"{STUB}.nl", f"{STUB}.col", f"{STUB}.row", "problem.yaml", MANIFEST)
 """Files of an export."""
 STATIONARY = 1e-3
-"""Largest dual infeasibility of a start whose multipliers are written."""
+"""Largest dual infeasibility of a start whose multipliers are written: others mislead."""
 
 
 def form_label(form: Formulation) -> str:
@@ -62,62 +62,41 @@ def export_case(
     with staged(target, True, overwrite, case.problem.subject) as new:
         duals = examine(nlp, nlp.x0, None) if presolved else None
         if duals is not None and not duals.dual <= STATIONARY:
-            # multipliers of a point that is not stationary mislead
             duals = None
         lam_g = None if duals is None else duals.lam_g
         file = write_nl(new / f"{STUB}.nl", nlp, lam_g, lift)
         write_text(new / "problem.yaml", dump_problem(case.problem))
+        sizes = {
+            "superpixels": len(case),
+            "knn_edges": len(case.segmentation.edges),
+            "neighbour_pairs": len(case.segmentation.pairs),
+        }
         manifest = {
-            **_description(case, form, nlp, layout, file),
+            "name": case.problem.name,
+            "problem_hash": case.problem.digest(),
+            "versions": versions(),
+            "coordinates": form.coordinates,
+            "smoothing": form.eps,
+            "sizes": {**sizes, **nlp.sizes(), **file.counts},
+            "nl": {"file": f"{STUB}.nl", "bytes": file.size, "sha256": file.sha256},
             "start": "presolve" if presolved else "proposal",
             "initial_duals": duals is not None,
             "lifted": file.lifted,
+            "objective_at_start": nlp.value(nlp.x0),
+            "exact_energy_at_start": oracle.energy(case.soup, case.data, case.weights),
+            "fingerprint": fingerprint(case, nlp, layout),
         }
         write_json(new / MANIFEST, manifest)
     return manifest
 
 
-def _description(
-    case: Case, form: Formulation, nlp: NLP, layout: Layout, file: NLFile
-) -> dict[str, Any]:
-    """Entries of the manifest that follow from the problem and its .nl file."""
-    return {
-        "name": case.problem.name,
-        "problem_hash": case.problem.digest(),
-        "versions": versions(),
-        "coordinates": form.coordinates,
-        "smoothing": form.eps,
-        "sizes": {
-            "superpixels": len(case),
-            "knn_edges": len(case.segmentation.edges),
-            "neighbour_pairs": len(case.segmentation.pairs),
-            **nlp.sizes(),
-            **file.counts,
-        },
-        "nl": {"file": f"{STUB}.nl", "bytes": file.size, "sha256": file.sha256},
-        "objective_at_start": nlp.value(nlp.x0),
-        "exact_energy_at_start": oracle.energy(case.soup, case.data, case.weights),
-        "fingerprint": fingerprint(case, nlp, layout),
-    }
-
-
-def fingerprint(case: Case, nlp: NLP, layout: Layout) -> dict[str, float]:
+def fingerprint(case: Case, nlp: NLP, layout: Layout) -> list[float]:
     """f and |g| at the proposal."""
     x = layout.pack(case.start.soup)
-    return {
-        "objective": nlp.value(x),
-        "constraints": float(np.linalg.norm(nlp.constraints(x))),
-    }
+    return [nlp.value(x), float(np.linalg.norm(nlp.constraints(x)))]
 
 
 # --- the manifest --------------------------------------------------------------------------------
-
-
-class Fingerprint(TypedDict):
-    """See `fingerprint`."""
-
-    objective: FiniteFloat
-    constraints: FiniteFloat
 
 
 class Energy(TypedDict):
@@ -130,7 +109,7 @@ class Manifest(TypedDict):
     """Entries that an import needs."""
 
     coordinates: Coordinates
-    fingerprint: Fingerprint
+    fingerprint: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
     exact_energy_at_start: Energy
     lifted: NotRequired[int]
 

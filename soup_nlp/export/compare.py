@@ -26,7 +26,6 @@ from soup_nlp.storage.system import scratch
 from soup_nlp.storage.versions import versions
 
 Label = Mapping[str, Any]
-Build = Callable[[], tuple[NLP, Layout, Formulation]]
 Labelled = tuple[Label, Callable[[Limits], Task]]
 """Entries of the rows of a task, and what makes the task."""
 
@@ -60,18 +59,15 @@ LIMITS = (
 )
 
 
-def make_task(case: Case, build: Build, limits: Limits) -> Task:
-    """The task of a case, whose `build` makes the NLP with the exact Hessian."""
-    nlp, layout, form = build()
+def make_task(case: Case, nlp: NLP, layout: Layout, form: Formulation, limits: Limits) -> Task:
+    """The task of an NLP of a case, with the exact Hessian."""
     soup = layout.unpack(nlp.x0).retracted()
-    task = Task(nlp, layout, soup, case.data, case.weights, form, limits)
     # made here, so that the time of a solver does not include it
-    task.nlp.evaluated()
-    return task
+    return Task(nlp.evaluated(), layout, soup, case.data, case.weights, form, limits)
 
 
 def _of_case(case: Case, form: Formulation, limits: Limits) -> Task:
-    return make_task(case, lambda: (*case.nlp(form), form), limits)
+    return make_task(case, *case.nlp(form), form, limits)
 
 
 def problem_task(case: Case, coordinates: str) -> Labelled:

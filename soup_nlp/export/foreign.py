@@ -80,14 +80,12 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
     case = prepare(load_problem(folder / "problem.yaml", solved=False))
     form = case.formulation(coordinates=manifest["coordinates"], hessian="exact")
     nlp, layout = case.nlp(form)
-    stored: Any = manifest["fingerprint"]
-    for key, now in fingerprint(case, nlp, layout).items():
-        then = float(stored[key])
+    for then, now in zip(manifest["fingerprint"], fingerprint(case, nlp, layout), strict=True):
         if abs(now - then) > SAME * max(1.0, abs(then)):
             raise ExportError(
                 "problem is not the one that was exported",
                 where=folder,
-                found=f"{key} {now!r}",
+                found=f"f or |g| {now!r}",
                 expected=repr(then),
                 hint="its images, its problem.yaml or the program have changed; export again",
             )

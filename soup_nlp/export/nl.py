@@ -31,8 +31,7 @@ class NLFile:
 
     Attributes:
         path: The file; `.col` and `.row` are beside it if names were given.
-        sha256: SHA-256 of its bytes.
-        size: Number of bytes.
+        sha256, size: Of its bytes.
         variables: (nx,) variable of the NLP for each variable of the file.
         rows: (ng,) constraint of the NLP for each row of the file.
         counts: Nonzeros and nonlinear parts, for the manifest and the index of the family.

@@ -46,26 +46,27 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
     stamped = []
     linear: list[tuple[Float, Int, Int]] = []
     for group in groups:
-        parts = split(group, theta)
-        template = make_template(parts.nonlinear, group, theta)
-        for values in (*template.graph.number.values(), parts.coefficient):
+        nonlinear, row, column, is_linear, coefficient = split(group, theta)
+        template = make_template(nonlinear, group, theta)
+        for values in (*template.graph.number.values(), coefficient):
             if not np.isfinite(values).all():
                 raise ExportError(
                     "number of an expression is not finite",
                     where=group.kernel.name,
                     hint="a kernel divides by a column that is 0 somewhere",
                 )
-        goal = np.full((len(group), int(parts.objective)), ng)
+        objective = group.kernel.objective is not None
+        goal = np.full((len(group), int(objective)), ng)
         if group.kernel.nc:
             goal = np.concatenate([goal, group.rows], axis=1)
         stamped.append((template, group.index, goal))
-        row, column = goal[:, parts.row], group.index[:, parts.column]
-        linear.append((parts.coefficient.ravel(), row.ravel(), column.ravel()))
-        for k in range(parts.nonlinear.numel()):
-            variables = group.index[:, parts.column[(parts.row == k) & ~parts.is_linear]]
+        places = goal[:, row].ravel(), group.index[:, column].ravel()
+        linear.append((coefficient.ravel(), *places))
+        for k in range(nonlinear.numel()):
+            variables = group.index[:, column[(row == k) & ~is_linear]]
             curved[goal[:, k]] |= template.roots[k] is not None
             values = np.broadcast_to(template.constants[k], len(group))
-            if parts.objective and k == 0:
+            if objective and k == 0:
                 in_objective[variables] = True
                 constant[ng] += values.sum()
             else:
@@ -105,30 +106,14 @@ def file_orders(nlp: NLP, lift: bool = False) -> tuple[Int, Int]:
     return orders(lifted(program) if lift else program)
 
 
-@dataclass(frozen=True)
-class Split:
+def split(group: Group, theta: Float) -> tuple[ca.SX, Int, Int, Mask, Float]:
     """Linear and nonlinear part of the outputs of a kernel: objective, if any, then rows.
 
-    Attributes:
-        nonlinear: (m,) expressions without their linear variables.
-        row, column: (k,) output and local variable of every Jacobian nonzero.
-        is_linear: (k,) whether the nonzero is independent of the variables.
-        coefficient: (E, k) its value for every element if it is linear, else 0.
-        objective: Whether output 0 is an objective.
-    """
-
-    nonlinear: ca.SX
-    row: Int
-    column: Int
-    is_linear: Mask
-    coefficient: Float
-    objective: bool
-
-
-def split(group: Group, theta: Float) -> Split:
-    """Split the outputs of a kernel.
-
     A variable is linear in an output if that entry of the Jacobian depends on no variable.
+
+    Returns:
+        (m,) expressions without their linear variables; of every Jacobian nonzero (k,) output,
+        local variable and whether it is linear; (E, k) its value for every element, 0 if not.
 
     Raises:
         ExportError: an operation has no opcode.
@@ -157,4 +142,4 @@ def split(group: Group, theta: Float) -> Split:
             part = ca.substitute(part, removed, ca.SX.zeros(len(gone)))
         parts.append(part)
     nonlinear = ca.densify(ca.cse(ca.vertcat(*parts)))
-    return Split(nonlinear, row, column, linear, coefficient, kernel.objective is not None)
+    return nonlinear, row, column, linear, coefficient

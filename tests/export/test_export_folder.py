@@ -46,8 +46,8 @@ def small(tmp_path_factory) -> Path:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("fingerprint", {}),
-        ("fingerprint", {"objective": "many", "constraints": 0.0}),
+        ("fingerprint", []),
+        ("fingerprint", ["many", 0.0]),
         ("fingerprint", None),
         ("coordinates", ["matrix"]),
         ("coordinates", "euler"),
