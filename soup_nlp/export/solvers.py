@@ -105,8 +105,9 @@ def ipopt(different: Mapping[str, Any], task: Task) -> Answer:
     nlp, functions = task.nlp, Functions(task.nlp)
     limits = {k: getattr(task.limits, name) for k, name in TOLERANCES.items()}
     derivatives = {k: getattr(functions, k) for k in ("grad_f", "jac_g", "hess_lag")}
-    less = dict.fromkeys(("print_time", "show_eval_warnings", "calc_lam_p"), False)
-    options = {"ipopt": {**COMMON, "sb": "yes", **different, **limits}, **derivatives, **less}
+    # CasADi would differentiate them for its own multipliers
+    own = {"no_nlp_grad": True, "calc_lam_p": False, "print_time": False}
+    options = {"ipopt": {**COMMON, "sb": "yes", **different, **limits}, **derivatives, **own}
     solver = ca.nlpsol("solver", "ipopt", functions.oracle, options)
     bounds = {k: getattr(nlp, k) for k in ("x0", "lbx", "ubx", "lbg", "ubg")}
     out, stats = solver(p=nlp.thetas(), **bounds), solver.stats()
