@@ -135,7 +135,6 @@ def foreign_run(
         lam_g=r.lam_g,
         objective=nlp.value(answer.x),
     )
-    rest = residuals(nlp, soup, stage, case.data, form.min_facing)
     # a run holds its last iterate in matrices
     matrices = MatrixLayout(case.data.share, form.gauge).pack(point)
     solution = Solution(
@@ -145,7 +144,7 @@ def foreign_run(
         stages=(replace(stage, x=matrices),),
         energy_start=start,
         energy=energy,
-        residuals=rest,
+        residuals=residuals(nlp, soup, stage, case.data, form.min_facing),
         multipliers=multipliers(nlp, stage),
         nlp=nlp.sizes(),
         description=str(nlp),
