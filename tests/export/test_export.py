@@ -49,6 +49,7 @@ def problem_of(folder: Path):
     return case, nlp, layout, file_orders(nlp), manifest
 
 
+@pytest.mark.slow
 def test_the_file_and_its_manifest_are_those_of_the_nlp(exported):
     case, nlp, _, (v, r), manifest = problem_of(exported)
     back = ReadBack(exported / "soup.nl")
