@@ -63,7 +63,8 @@ def measure_chain(cell: Cell, frames: int = 10) -> Row:
         scores = score(solved)
     if scores is None:
         raise DataError("sequence has no truth", where=item.name)
-    errors = [abs(np.log(k["estimated"] / k["true"])) for k in scores["links"]]
+    # the scales of consecutive frames would be the same without an error of their link
+    errors = np.abs(np.diff(np.log([frame["own_scale"] for frame in scores["frames"]])))
     return {
         "frames": len(solved),
         **{key: scores[key] for key in ("mre_own_scale", "mre_one_scale", "cost")},

@@ -160,24 +160,19 @@ def resumable(kept: str, where: object) -> Iterator[None]:
 
 
 class RowProgress:
-    """Prints finished rows and time left: one updated line on a terminal, else a line per row."""
+    """Prints finished rows: one updated line on a terminal, else a line per row."""
 
     def __init__(self, quiet: bool, result_of: Callable[[Row], str] = lambda row: "done") -> None:
         """Make it; `result_of` makes a short text from a row that did not fail."""
         self.quiet, self.result_of = quiet, result_of
         self.live = sys.stderr.isatty()
-        self.spent: list[float] = []
 
     def __call__(self, done: int, total: int, row: Row) -> None:
         """Print a new row."""
         if self.quiet:
             return
-        self.spent.append(float(row.get("seconds") or 0.0))
-        left = sum(self.spent) / len(self.spent) * (total - done)
         result = f"failed: {reason(row)}" if failed(row) else self.result_of(row)
-        line = f"{done}/{total}  {row['key']}  {result}  {self.spent[-1]:.0f} s"
-        if total > done:
-            line += f"  (about {left:.0f} s of work left)"
+        line = f"{done}/{total}  {row['key']}  {result}  {row.get('seconds') or 0:.0f} s"
         start, end = ("\r\x1b[2K", "\n" if done == total else "") if self.live else ("", "\n")
         print(f"{start}{line}", end=end, file=sys.stderr, flush=True)
 

@@ -1,8 +1,6 @@
 """Commands check, evaluate, import, view and convert: results are verified, shown, written."""
 
 import webbrowser
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -13,7 +11,7 @@ import typer
 from soup_nlp.cli import options
 from soup_nlp.cli.options import option, out_option
 from soup_nlp.data.formats.map_files import read_depth
-from soup_nlp.errors import ConfigError, DataError, ExportError
+from soup_nlp.errors import ConfigError, ExportError
 from soup_nlp.evaluation.metrics import Scale
 from soup_nlp.evaluation.scoring import evaluate as evaluate_folder
 from soup_nlp.export.foreign import Imported, import_sol, sol_table
@@ -130,40 +128,17 @@ def foreign_verdict(imported: Imported) -> str:
 
 def view(
     folder: options.Folder,
-    serve: Annotated[int | None, option("Serve the folder at this port; 0 chooses one.")] = None,
     renew: Annotated[bool, option("Generate the page again.", "--renew")] = False,
     no_open: Annotated[bool, option("Print the address, open no browser.", "--no-open")] = False,
 ) -> None:
-    """Open the page of a result in a browser, or serve it."""
+    """Open the page of a result in a browser."""
     is_chain(folder)
     file = folder / PAGE
     if renew or not file.is_file():
         renew_page(folder)
-    if serve is None:
-        address = file.resolve().as_uri()
-        opened = not no_open and webbrowser.open(address)
-        print(f"opened      {file}" if opened else f"open        {address}")
-        return
-    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
-    try:
-        server = ThreadingHTTPServer(("127.0.0.1", serve), handler)
-    except (OSError, OverflowError) as error:
-        raise DataError(
-            "port cannot be used",
-            where="--serve",
-            found=f"{serve}: {error}",
-            expected="a free port",
-            hint="--serve 0 chooses one",
-        ) from error
-    with server:
-        address = f"http://127.0.0.1:{server.server_address[1]}/{PAGE}"
-        print(f"serving     {address} until Ctrl-C", flush=True)
-        if not no_open:
-            webbrowser.open(address)
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            print("stopped")
+    address = file.resolve().as_uri()
+    opened = not no_open and webbrowser.open(address)
+    print(f"opened      {file}" if opened else f"open        {address}")
 
 
 _NAMES = "; ".join(f"{name}: {one.text}" for name, one in FORMATS.items())

@@ -25,9 +25,9 @@ from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import exit_code, verdict
 from soup_nlp.sequence.folder import SINGLE
-from soup_nlp.sequence.frames import IMAGES, VIDEOS, Frames
-from soup_nlp.sequence.score import chain_exit_code, chain_lines
-from soup_nlp.sequence.solve import AUTO, named, solve_chain
+from soup_nlp.sequence.frames import IMAGES, VIDEOS
+from soup_nlp.sequence.score import chain_exit_code
+from soup_nlp.sequence.solve import named, solve_chain
 from soup_nlp.storage.files import as_path, is_file, is_folder
 from soup_nlp.storage.folders import default_folder
 from soup_nlp.storage.progress import interruptible
@@ -226,7 +226,7 @@ def chain(
     intrinsics: options.Intrinsics = None,
     fov: options.Fov = None,
     undistort: options.Undistort = False,
-    stride: Annotated[str, option("Every n-th frame; auto: those with enough parallax.")] = "1",
+    stride: Annotated[int, option("Every n-th frame.", min=1)] = 1,
     frames: Annotated[int | None, option("Most frames to use; of a scene 10.", min=2)] = None,
     depth_scale: options.DepthScale = None,
     flow: Annotated[Text, in_flow("Folder or pattern of flows, one a pair; or a network.")] = None,
@@ -248,12 +248,6 @@ def chain(
     frames_of = source[0] if len(source) == 1 else source
     name, subject = named(frames_of)
     out = out or default_folder(f"chain-{name}", subject)
-
-    def begin(sequence: Frames, pairs: int) -> None:
-        names = ", ".join(Path(file).name for file in sequence.names)
-        spacing = f", far enough apart: {names}" if stride == AUTO else ""
-        if not quiet:
-            print(f"{len(sequence)} frames{spacing}; pairs to solve: {pairs}", file=sys.stderr)
 
     short = options.sizes(superpixels, neighbours, max_size)
     flows = options.given(source=flow, backward=flow_backward)
@@ -280,12 +274,11 @@ def chain(
             overrides=options.changed(preset, overrides, short),
             workers=workers,
             overwrite=overwrite,
-            begin=begin,
             say=say,
         )
     if not (solved or quiet):
         print("every pair was solved before: the chain is finished", file=sys.stderr)
-    print("\n".join(chain_lines(done)))
+    print("\n".join(done.summary["verdict"]))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "pairs/"]))
     code, why = chain_exit_code(done)
     return options.finish(not code, why, code)

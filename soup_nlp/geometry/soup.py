@@ -152,12 +152,6 @@ class Reconstruction:
         return np.asarray(self.soup.n[self.labels])
 
     @property
-    def normals_next(self) -> Float:
-        """(H, W, 3) unit normals of `points_next`, which are those of `points_ref` rotated."""
-        turned = np.einsum("nij,nj->ni", self.soup.R, self.soup.n)
-        return np.asarray(turned[self.labels])
-
-    @property
     def sigma_next(self) -> Float | None:
         """(H', W') standard deviation of log z of the next frame; NaN where nothing lands."""
         if self.sigma_ref is None:

@@ -31,30 +31,33 @@ def hidden(rec: Reconstruction) -> Mask:
     return ~inside | ~(z <= nearest * (1 + BEHIND))
 
 
-def joined(rec: Reconstruction, K: Float, group: NDArray[np.integer]) -> tuple[Mask, Mask]:
+def joined(
+    planes: Float, labels: NDArray[np.integer], group: NDArray[np.integer], K: Float
+) -> tuple[Mask, Mask]:
     """Whether neighbouring pixels lie on one continuous surface.
 
     They do within a superpixel, and across the border of two superpixels of one group whose planes
     meet there.
 
     Args:
-        rec: Reconstruction.
-        K: (3, 3) intrinsics of the reference frame.
+        planes: (N, 3) m of every superpixel, with depth 1 / (m . ray).
+        labels: (H, W) superpixels.
         group: (H, W) groups such as rigid components.
+        K: (3, 3) intrinsics, pixels.
 
     Returns:
         (H, W - 1) for every pixel and the one to its right, (H - 1, W) and the one below.
     """
-    ray = rays(K, pixel_grid(*rec.labels.shape))
+    ray = rays(K, pixel_grid(*labels.shape))
     out = []
     for a, b in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
-        i, k = rec.labels[a], rec.labels[b]
-        continuous = (i == k) & np.isfinite(rec.depth_ref[a]) & np.isfinite(rec.depth_ref[b])
-        across = (i != k) & (group[a] == group[b])
-        pairs = np.stack([i[across], k[across]], axis=1)
-        z = rec.soup.depth_across(pairs, 0.5 * (ray[a][across] + ray[b][across]))
-        near, far = z.min(axis=0), z.max(axis=0)
-        continuous[across] = (far - near) <= JUMP * near
+        i, k = labels[a], labels[b]
+        continuous = i == k
+        across = ~continuous & (group[a] == group[b])
+        between = 0.5 * (ray[a][across] + ray[b][across])
+        ends = np.stack([np.sum(planes[x[across]] * between, axis=1) for x in (i, k)])
+        far, near = ends.min(axis=0), ends.max(axis=0)
+        continuous[across] = near - far <= JUMP * far
         out.append(continuous)
     return out[0], out[1]
 

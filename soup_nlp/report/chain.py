@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, Image, Mask
+from soup_nlp.arrays import Float, Image, Int, Mask
 from soup_nlp.errors import FrameError
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.surface import joined
 from soup_nlp.report.figures import (
     Picture,
     colourise_depth,
@@ -65,37 +66,22 @@ class Brief(NamedTuple):
     """What a chain keeps of every pair; its images and maps are read again when they are needed.
 
     Attributes:
-        parts: Its components, in the unit of the chain.
-        depths: Some depths of its reference frame, in the unit of the chain.
+        parts: Its components.
+        depths: Some depths of its reference frame.
         certainty: Shares of `report.summary.certainty`.
-        parallax_px: Median displacement that the camera's translation causes, pixels.
-        true_depth: Whether the truth knows a depth.
-        true_motion: (4, 4) next_from_ref of the static scene by the truth; None if unknown.
     """
 
     parts: tuple[Component, ...]
     depths: Float
     certainty: Mapping[str, float | None]
-    parallax_px: float
-    true_depth: bool
-    true_motion: Float | None
 
     @classmethod
     def of(cls, pair: Result, count: int = 1) -> Brief:
         """That of one of `count` pairs."""
         step = max(7, -(-pair.labels.size * count // SAMPLES))
-        # component 0 of a truth is the static scene
-        truth = pair.tree["truth"]
-        true = truth.get("motions")
-        return cls(
-            pair.components.members,
-            # a view would keep the whole map
-            pair.depths[0].ravel()[::step].copy(),
-            pair.summary["certainty"],
-            pair.parallax_px,
-            bool({"depth_ref", "depth_next"} & truth.keys()),
-            None if true is None or not np.isfinite(true[0]).all() else true[0],
-        )
+        # a view would keep the whole map
+        depths = pair.depths[0].ravel()[::step].copy()
+        return cls(pair.components.members, depths, pair.summary["certainty"])
 
     def scaled(self, factor: float) -> Brief:
         """The same in another unit, of which `factor` are one of now."""
@@ -128,7 +114,7 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame of a chain, in the unit of the chain.
+    """One frame of a chain, in the unit of the chain: the record that every file is written from.
 
     Attributes:
         name: "ref" or "next" of a pair, else its number.
@@ -140,6 +126,11 @@ class Frame:
         components: (H, W) what moves by itself, by number of its track; 0 is the static scene, -1
             unknown.
         pose: world_from_camera; the world is the first frame's camera.
+        sure: (H, W) pixels of clouds, see `Result.sure`.
+        labels: (H, W) superpixel of its pair; 0 where the depth is unknown.
+        planes: (N, 3) m of every superpixel with depth 1 / (m . ray).
+        flow: (H, W, 2) flow to the next frame, pixels; None of the last frame.
+        unit: Unit of length as a phrase for headers of files.
     """
 
     name: str
@@ -150,12 +141,34 @@ class Frame:
     drawn: Mask
     components: NDArray[np.int32]
     pose: RigidMotion
+    sure: Mask
+    labels: NDArray[np.integer]
+    planes: Float
+    flow: NDArray[np.floating] | None
+    unit: str
 
     def __str__(self) -> str:
         h, w = self.depth.shape
         return f"Frame({self.name}, {w}x{h}, {self.drawn.mean():.0%} drawn)"
 
     __repr__ = __str__
+
+    @property
+    def points(self) -> Float:
+        """(H, W, 3) points in world coordinates; NaN where unknown."""
+        ray = rays(self.K, pixel_grid(*self.depth.shape))
+        return self.pose(self.depth[..., None] * ray)
+
+    @property
+    def normals(self) -> Float:
+        """(H, W, 3) unit normals of `points` towards the camera, in world coordinates."""
+        turned = -self.planes @ self.pose.R.T
+        return np.asarray((turned / np.linalg.norm(turned, axis=1, keepdims=True))[self.labels])
+
+    @cached_property
+    def surface(self) -> tuple[Mask, Mask]:
+        """Continuity to the right and downwards, see `geometry.surface.joined`."""
+        return joined(self.planes, self.labels, self.components, self.K)
 
     def _repr_html_(self) -> str:
         near, far = depth_range(self.depth)
@@ -172,12 +185,6 @@ class Frame:
         image = colourise_depth(self.depth, near, far, self.drawn)
         return Picture("depth", title, image, depth_legend(near, far))
 
-    @property
-    def points(self) -> Float:
-        """(H, W, 3) points in world coordinates; NaN where unknown."""
-        ray = rays(self.K, pixel_grid(*self.depth.shape))
-        return self.pose(self.depth[..., None] * ray)
-
 
 @dataclass(frozen=True, eq=False)
 class Chain:
@@ -188,7 +195,7 @@ class Chain:
             read when they are needed.
         briefs: What is kept of every pair.
         world_from_camera: Camera poses of the K + 1 frames.
-        tracks: Number of the track by label of a component, for every pair.
+        tracks: (C,) track of every component, for every pair.
         names: Names of the K + 1 frames in files.
         scales: (K,) factor from the own unit of each pair to that of the first.
         links: Links that determine the scales, including those of pairs over two frames.
@@ -198,7 +205,7 @@ class Chain:
     pairs: Sequence[Result]
     briefs: Sequence[Brief]
     world_from_camera: tuple[RigidMotion, ...]
-    tracks: tuple[dict[int, int], ...]
+    tracks: tuple[Int, ...]
     names: tuple[str, ...]
     scales: Float
     links: tuple[Link, ...] = ()
@@ -208,10 +215,8 @@ class Chain:
     def of(cls, result: Result) -> Chain:
         """A result as a chain of two frames."""
         poses = STILL, result.components.camera.inverse
-        tracks = {k: k for k in range(len(result.components))}
-        names = "ref", "next"
-        briefs = Lazy(lambda _: Brief.of(result), 1)
-        parts = (result,), briefs, poses, (tracks,), names, np.ones(1)
+        tracks, briefs = np.arange(len(result.components)), Lazy(lambda _: Brief.of(result), 1)
+        parts = (result,), briefs, poses, (tracks,), ("ref", "next"), np.ones(1)
         return cls(*parts, summary=result.summary)
 
     def __len__(self) -> int:
@@ -260,17 +265,15 @@ class Chain:
         """Unit of length as a phrase for headers of files."""
         return self.pairs[0].unit if self.single else f"{UNIT} of the first pair"
 
-    @cached_property
-    def depth_range(self) -> tuple[float, float]:
-        """(near, far) of the colours of depth in the shown unit, one for all frames."""
-        if self.single and (truth := self.pairs[0].true_depth) is not None:
-            return depth_range(truth)
-        return depth_range(self.depths * (self.metre or 1.0))
-
     @property
     def depths(self) -> Float:
         """Some depths of all pairs."""
         return np.concatenate([brief.depths for brief in self.briefs])
+
+    @cached_property
+    def depth_range(self) -> tuple[float, float]:
+        """(near, far) of the colours of depth in the shown unit, one for all frames."""
+        return depth_range(self.depths * (self.metre or 1.0))
 
     @cached_property
     def certainty(self) -> dict[str, float]:
@@ -279,43 +282,24 @@ class Chain:
         known = {k: [v for row in rows if (v := row.get(k)) is not None] for k in rows[0]}
         return {k: float(np.mean(values)) if values else np.nan for k, values in known.items()}
 
-    def part(self, first: int, last: int) -> Chain:
-        """The chain of the frames from `first` to `last`, in the same unit and axes."""
-        frames, pairs = slice(first, last + 1), slice(first, last)
-        links = [k for k in self.summary["links"] if first <= k["pairs"][0] < k["pairs"][1] < last]
-        return replace(
-            self,
-            pairs=Lazy(lambda k: self.pairs[first + k], last - first),
-            briefs=self.briefs[pairs],
-            world_from_camera=self.world_from_camera[frames],
-            tracks=self.tracks[pairs],
-            names=self.names[frames],
-            scales=self.scales[pairs],
-            links=tuple(k for k in self.links if first <= k.first < k.second < last),
-            summary={**self.summary, "links": links, "sources": self.summary["sources"][frames]},
-        )
-
-    def seen(self, frame: int) -> tuple[int, int]:
-        """A pair that holds a frame, and the frame's number in it: 0, and 1 for the last frame.
+    def __getitem__(self, number: int) -> Frame:
+        """A frame by its number.
 
         Raises:
             FrameError: there is no such frame.
         """
-        if not (isinstance(frame, int | np.integer) and 0 <= frame < len(self)):
+        if not (isinstance(number, int | np.integer) and 0 <= number < len(self)):
             raise FrameError(
-                "there is no such frame", found=frame, expected=f"0 to {len(self) - 1}"
+                "there is no such frame", found=number, expected=f"0 to {len(self) - 1}"
             )
-        last = int(frame == len(self.pairs))
-        return int(frame) - last, last
-
-    def __getitem__(self, number: int) -> Frame:
-        """A frame by its number."""
-        k, last = self.seen(number)
-        pair = self.pairs[k]
-        components = self.of_track(k)[pair.components.of_pixel]
-        sigma, drawn = pair.sigma, pair.drawn
+        # the last frame is the next one of the last pair
+        last = int(number == len(self.pairs))
+        pair, tracks = self.pairs[number - last], self.tracks[number - last]
+        components, sigma = tracks[pair.components.of_pixel], pair.sigma
+        sure, labels, drawn = pair.sure, pair.labels, pair.drawn
         if last:
-            components, sigma = pair.in_next(components, -1), pair.in_next(sigma, np.nan)
+            components, labels = pair.in_next(components, -1), pair.in_next(labels, 0)
+            sigma, sure = pair.in_next(sigma, np.nan), pair.in_next(sure, False)
             drawn = pair.in_next(drawn, False)
         return Frame(
             name=self.names[number],
@@ -326,6 +310,11 @@ class Chain:
             drawn=drawn,
             components=components.astype(np.int32),
             pose=self.world_from_camera[number],
+            sure=sure,
+            labels=labels,
+            planes=pair.planes[last],
+            flow=None if last else pair.flow,
+            unit=self.unit,
         )
 
     def __iter__(self) -> Iterator[Frame]:
@@ -344,39 +333,12 @@ class Chain:
         before, after = self.world_from_camera[pair], self.world_from_camera[pair + 1]
         return after @ self.briefs[pair].parts[label].motion @ before.inverse
 
-    def of_track(self, pair: int) -> NDArray[np.int64]:
-        """(C,) track of every component of a pair."""
-        return np.array([self.tracks[pair][k] for k in range(len(self.tracks[pair]))])
-
     @cached_property
-    def _members(self) -> dict[int, dict[int, Component]]:
-        out = defaultdict[int, dict[int, Component]](dict)
-        for k, (brief, numbers) in enumerate(zip(self.briefs, self.tracks, strict=True)):
-            for label, track in numbers.items():
-                out[track][k] = brief.parts[label]
+    def paths(self) -> dict[int, dict[int, Float]]:
+        """Centre (3,) in the world by frame, of every track; the static scene, 0, is none."""
+        out = defaultdict[int, dict[int, Float]](dict)
+        for k, (brief, tracks) in enumerate(zip(self.briefs, self.tracks, strict=True)):
+            for part, track in zip(brief.parts[1:], tracks[1:].tolist(), strict=True):
+                out[track][k] = self.world_from_camera[k](part.centre)
+                out[track][k + 1] = self.motion(k, part.label)(out[track][k])
         return dict(out)
-
-    @property
-    def track_numbers(self) -> list[int]:
-        """Numbers of the tracks; the background, 0, is none."""
-        return sorted(self._members.keys() - {0})
-
-    def members(self, track: int) -> dict[int, Component]:
-        """Components of a track, by number of the pair; a pair need not show the track."""
-        return dict(self._members.get(track, {}))
-
-    def share(self, track: int) -> float:
-        """Mean share of the images of a track where it is seen."""
-        shares = [
-            part.pixels / sum(one.pixels for one in self.briefs[k].parts)
-            for k, part in self.members(track).items()
-        ]
-        return float(np.mean(shares))
-
-    def path(self, track: int) -> dict[int, Float]:
-        """Centre (3,) of a track in the world, by frame."""
-        out: dict[int, Float] = {}
-        for k, part in self.members(track).items():
-            out[k] = self.world_from_camera[k](part.centre)
-            out[k + 1] = self.motion(k, part.label)(out[k])
-        return out

@@ -16,11 +16,9 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluation import recompute
 from soup_nlp.evaluation.scoring import DEPTHS, SURE
 from soup_nlp.geometry.constraints import constraints
-from soup_nlp.report.layout import require_layout
-from soup_nlp.report.summary import Summary
-from soup_nlp.storage.files import as_path, read_json
+from soup_nlp.report.layout import Stored
 from soup_nlp.storage.folders import SUMS, digest_of, read_sums
-from soup_nlp.storage.store import read_h5, require
+from soup_nlp.storage.store import require
 
 RELATIVE, ABSOLUTE = 1e-9, 1e-12
 """Rounding of a recomputed number: relative to it or to its sum, and absolute."""
@@ -97,36 +95,19 @@ class CheckReport:
         return "\n".join([head, *map(str, self.rows), *lines, *(f"     left: {x}" for x in LEFT)])
 
 
-@dataclass(frozen=True)
-class Stored:
-    """Contents of a result folder: entries of summary.json, arrays of result.h5."""
-
-    folder: Path
-    claims: Mapping[str, Any]
-    tree: dict[str, Any]
-
-    def soup(self, which: str) -> dict[str, Float]:
-        """Arrays of a soup; DataError if one is missing."""
-        keys = ("lam", "n", "d", "R", "t")
-        return {k: np.asarray(require(self.tree, f"{which}/{k}"), float) for k in keys}
-
-
 def check_folder(folder: str | Path) -> CheckReport:
     """Recompute energy, constraints, depth and scores of a result, and compare everything else.
 
     Raises:
         DataError: a file, a claim or an array is missing or malformed.
     """
-    folder = as_path(folder, "result folder")
-    claims = read_json(folder / "summary.json", "summary.json", Summary)
-    stored = Stored(folder, claims, read_h5(folder / "result.h5"))
+    stored = Stored.read(folder)
     try:
-        require_layout(stored.tree)
         return CheckReport(tuple(claim for check in CHECKS for claim in check(stored)))
     except MISFITS as error:
         lacks = isinstance(error, KeyError)
         what = "lacks a claim or an array" if lacks else "has claims and arrays that do not fit"
-        raise DataError(f"result {what}", where=folder, found=error) from error
+        raise DataError(f"result {what}", where=stored.folder, found=error) from error
 
 
 def _number(value: Any) -> float:

@@ -203,12 +203,6 @@ def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: 
     return np.array(sheet)
 
 
-def write_picture(path: PathLike, picture: Picture) -> None:
-    """Write a picture at its own size with its title above and its legend below, as PNG."""
-    # titles need a width of 500 pixels
-    write_png(path, strip([picture], "", panel_width=max(picture.image.shape[1], 500)))
-
-
 def _height(picture: Picture, width: int) -> int:
     """Height in pixels of a picture that is drawn with some width."""
     return max(1, round(width * picture.image.shape[0] / picture.image.shape[1]))

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import ParamSpec
 
 import numpy as np
 from PIL.Image import Image
@@ -18,10 +18,10 @@ from soup_nlp.errors import DataError
 from soup_nlp.pipeline import run as pipeline
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.chain import Chain
-from soup_nlp.report.figures import shown, write_depth_png16, write_picture, write_png
+from soup_nlp.report.figures import shown, write_depth_png16, write_png
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.layout import rows_in_file
-from soup_nlp.report.page import pair_page
+from soup_nlp.report.page import page
 from soup_nlp.report.pictures import overview, pictures
 from soup_nlp.report.result import PAGE, result_of
 from soup_nlp.report.summary import summary
@@ -33,13 +33,10 @@ from soup_nlp.storage.store import write_h5
 FULL = ("depth_ref_full.png", "depth_next_full.png")
 """Files of the depth at the size of the images, for a pair that was solved at a smaller size."""
 
-PICTURES = {name: f"{name}_colour.png" for name in ("depth_ref", "depth_next")}
-"""Files of the pictures that are also written alone, by name of the picture."""
-
 FILES = (
     *("config.yaml", "result.h5", "summary.json", "log.txt", "ipopt.log"),
-    *("depth_ref.png", "depth_next.png", *PICTURES.values(), "overview.png", PAGE),
-    *("motions.json", "trajectory.tum", "points_ref.ply", "points_next.ply"),
+    *("depth_ref.png", "depth_next.png", "depth_ref_colour.png", "overview.png", PAGE),
+    *("trajectory.tum", "points_ref.ply", "points_next.ply"),
 )
 """Files of a result folder."""
 
@@ -55,7 +52,7 @@ def prepare_folder(
 ) -> Path:
     """Check that a result can be written into a folder, before anything is computed.
 
-    `inputs` are files and folders of the problem, which are never overwritten; for `overwrite` and
+    `inputs` are files and folders of the problem, which may not lie in it; for `overwrite` and
     `subject` see `storage.folders.claim`.
 
     Raises:
@@ -65,19 +62,12 @@ def prepare_folder(
     # realpath, unlike resolve, accepts a link to itself
     here = Path(os.path.realpath(folder))
     for source in inputs or ():
-        if source == here:
+        if here in (source, source.parent):
             raise DataError(
-                "output folder is the input's folder",
-                where=folder,
-                expected="a folder of its own: depth and flow of a result would pass for truth",
-                hint="choose another --out",
-            )
-        if source.parent == here and source.name in (*FILES, *FULL):
-            raise DataError(
-                "an input would be overwritten by the result",
+                "an input lies in the output folder",
                 where=folder,
                 found=source.name,
-                expected="a folder that holds no input under the name of a result's file",
+                expected="a folder of its own: depth and flow of a result would pass for truth",
                 hint="choose another --out",
             )
     return claim(folder, (*FILES, *FULL, FAILED), overwrite, subject)
@@ -114,40 +104,26 @@ def write_folder(
         words = facts(run) if verdict is None else verdict
         contents = {**summary(run), "verdict": words.splitlines()}
         result = result_of(run, contents)
-        drawn, rec = pictures(Chain.of(result)), run.reconstruction
+        chain, rec = Chain.of(result), run.reconstruction
+        drawn = pictures(chain)
         depths: dict[str, AnyFloat] = {"ref": rec.depth_ref, "next": rec.depth_next}
         if run.full is not None:
             depths |= {"ref_full": run.full.depth_ref, "next_full": run.full.depth_next}
         scales = {
             name: write_depth_png16(new / f"depth_{name}.png", z) for name, z in depths.items()
         }
-        for name, file in PICTURES.items():
-            write_picture(new / file, drawn[name])
+        write_png(new / "depth_ref_colour.png", drawn["depth_ref"].image)
         write_png(new / "overview.png", overview(drawn, result.title))
-        write_formats(new, Chain.of(result), ("motions", "ply", *formats))
+        write_formats(new, chain, ("tum", "ply", *formats))
         if run.problem.output.page:
-            write_text(new / PAGE, pair_page(result, drawn))
+            write_text(new / PAGE, page(chain, drawn))
         write_json(new / "summary.json", {**contents, "depth_png_scale": scales})
-        attributes, rows = _attributes(run, config), rows_in_file(result.metre_unit)
-        write_h5(new / "result.h5", result.tree, attributes, rows)
+        about = {"name": run.problem.name, "config": config}
+        write_h5(new / "result.h5", result.tree, about, rows_in_file(result.metre_unit))
         names = {path.name for path in new.iterdir()} | {"log.txt"}
         files = [name for name in FILES if name in names] + sorted(names.difference(FILES))
         write_text(new / "log.txt", log if isinstance(log, str) else log(files))
     return files
-
-
-def _attributes(run: Run, config: str) -> dict[str, Any]:
-    """Root attributes of result.h5."""
-    return {
-        "name": run.problem.name,
-        "problem_hash": run.problem.digest(),
-        "seed": run.problem.seed,
-        "status": run.solution.status,
-        "converged": run.solution.converged,
-        "delivered": run.delivered,
-        "config": config,
-        "nlp": run.solution.description,
-    }
 
 
 def write_failure(folder: Path, log: str, ipopt_log: Path, overwrite: bool = False) -> None:

@@ -1,14 +1,19 @@
 """result.h5: one table of its arrays, from which it is written, read and checked."""
 
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 
+from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.evaluation.scoring import DEPTHS
 from soup_nlp.pipeline.record import Run
-from soup_nlp.storage.store import ReadTree, Row, parse_table, row_of
+from soup_nlp.report.summary import Summary
+from soup_nlp.storage.files import as_path, read_json
+from soup_nlp.storage.store import ReadTree, Row, parse_table, read_h5, require, row_of
 
 TABLE = """
 input/image_ref           1     H,W,3   reference image, 8-bit RGB
@@ -72,7 +77,7 @@ start/error               px    N       mean re-projection error
 start/parallax            px    N       displacement that the translation causes
 start/borrowed            1     N       plane or motion from neighbours
 start/motion              1     N       dominant motion, -1 for its own
-start/component           1     N       rigid component
+start/component           1     N       rigid component: what moves as one
 start/surface             1     N       region without a flow discontinuity
 start/tie                 1     N       what gives its component a scale: 0 largest, \
 1 contact below, 2 outline, 3 nothing, 4 fixed in image, 5 given depth, 6 occlusion, \
@@ -237,6 +242,33 @@ def require_layout(tree: ReadTree) -> None:
             index.size and not 0 <= index.min() <= index.max() <= last
         ):
             raise _wrong(path, "other values", f"whole numbers from 0 to {last}")
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Contents of a result folder: entries of summary.json, arrays of result.h5."""
+
+    folder: Path
+    claims: Mapping[str, Any]
+    tree: ReadTree
+
+    @classmethod
+    def read(cls, folder: str | Path) -> Self:
+        """Those of a folder, whose arrays fit `TABLE`.
+
+        Raises:
+            DataError: the folder holds no result, or a damaged one.
+        """
+        folder = as_path(folder, "result folder")
+        tree = read_h5(folder / "result.h5")
+        claims = read_json(folder / "summary.json", "summary.json", Summary)
+        require_layout(tree)
+        return cls(folder, claims, tree)
+
+    def soup(self, which: str) -> dict[str, Float]:
+        """Arrays of a soup; DataError if one is missing."""
+        keys = ("lam", "n", "d", "R", "t")
+        return {k: np.asarray(require(self.tree, f"{which}/{k}"), float) for k in keys}
 
 
 def _wrong(path: str, found: object, expected: str) -> DataError:

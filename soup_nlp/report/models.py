@@ -13,9 +13,8 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.errors import DataError, printable
 from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.surface import triangles, whole_cells
-from soup_nlp.report.chain import AXES, STILL, Chain, Frame, Lazy
+from soup_nlp.report.chain import AXES, Chain, Frame, Lazy
 from soup_nlp.report.figures import write_png
-from soup_nlp.report.result import Result
 from soup_nlp.storage.files import PathLike, write_bytes, write_text
 
 VOXEL = 0.004
@@ -49,7 +48,7 @@ def write_ply(
         xyz: (..., 3) positions.
         rgb: (..., 3) uint8 colours.
         normals: (..., 3) unit normals.
-        scalars: (...) numbers by the name of their property, such as "confidence".
+        scalars: (...) numbers by the name of their property, such as "component".
         comments: Lines of the header.
     """
     parts = [np.reshape(part, (-1, 3)) for part in (xyz, normals) if part is not None]
@@ -75,49 +74,29 @@ def write_ply(
     return len(table)
 
 
-def write_cloud(path: PathLike, chain: Chain, number: int) -> None:
-    """Write the points of a frame as PLY: those of its pair's reference image.
-
-    Those of a pair are in the coordinates of the frame's camera, those of a chain in the world's.
-
-    Properties beside position, normal and colour: `confidence` of the flow, `component` and
-    `sigma_log_depth`. Points that are not `result.sure` are left out.
-    """
-    k, side = chain.seen(number)
-    result, frame = chain.pairs[k], chain.names[number]
-    keep, pose = result.sure, STILL if chain.single else chain.world_from_camera[number]
-    scalars = {
-        "confidence": result.flow_confidence,
-        "component": chain.of_track(k)[result.components.of_pixel],
-        "sigma_log_depth": result.sigma,
-    }
-    axes = "the first frame's camera"
-    if chain.single:
-        axes = f"camera of the {('reference', 'next')[side]} frame"
+def write_points(path: Path, frame: Frame) -> None:
+    """Write the sure points of a frame as PLY, with normal, colour, component and sigma."""
+    keep = frame.sure
+    scalars: dict[str, ArrayLike] = {"component": frame.components[keep]}
+    scalars["sigma_log_depth"] = frame.sigma[keep]
     comments = [
-        f"{chain.name}: points of the reference image in frame {frame}",
-        f"frame: {axes}, {AXES}",
-        f"unit: {chain.unit}",
-        "confidence: of the flow, 0 to 1; component: what moves as one, 0 is the background",
+        f"points of frame {frame.name}",
+        f"axes: the first frame's camera, {AXES}",
+        f"unit: {frame.unit}",
+        "component: what moves as one, 0 is the background",
         f"{keep.mean():.1%} of the pixels: without hidden ones, those at jumps of the depth, and"
         " those of less confidence than output.min_confidence",
     ]
-    write_ply(
-        path,
-        pose(result.points[side][keep]),
-        result.images[0][keep],
-        result.normals[side][keep] @ pose.R.T,
-        {name: value[keep] for name, value in scalars.items()},
-        comments,
-    )
+    places = frame.points[keep], frame.image[keep], frame.normals[keep]
+    write_ply(path, *places, scalars, comments)
 
 
-def write_fused(path: PathLike, chain: Chain) -> None:
+def write_fused(path: Path, chain: Chain) -> None:
     """Write the static scene of all frames as one cloud."""
     cloud = fuse(chain)
     comments = [
         f"{chain.name}: static scene of {len(chain)} frames, one point per voxel",
-        f"frame: the first frame's camera, {AXES}",
+        f"axes: the first frame's camera, {AXES}",
         f"unit: {chain.unit}",
         "sigma_log_depth: of the frame that the point is from, at most 0.25",
     ]
@@ -130,24 +109,22 @@ def fuse(chain: Chain, most: int = MOST) -> Cloud:
 
     A point in front of the static surface of a neighbouring frame is removed if that frame is more
     certain there. A voxel keeps its most certain point. Of more than `most` points each k-th one is
-    returned.
+    returned. The last frame shows what the one before it shows.
     """
     count = len(chain.pairs)
-    total = sum(int(pair.static.sum()) for pair in chain.pairs)
-    step = max(1, math.ceil(math.sqrt(total / MOST)))
     frames = Lazy(chain.__getitem__, count)
+    step = max(1, math.ceil(math.sqrt(count * frames[0].depth.size / MOST)))
     clouds = []
-    for k, pair in enumerate(chain.pairs):
-        chosen = np.zeros_like(pair.static)
-        chosen[::step, ::step] = pair.static[::step, ::step]
+    for k, frame in enumerate(frames):
+        chosen = np.zeros_like(frame.sure)
+        chosen[::step, ::step] = _static(frame)[::step, ::step]
         cloud = np.empty(int(chosen.sum()), POINT)
-        cloud["points"] = frames[k].pose(pair.points[0][chosen])
-        cloud["colours"] = frames[k].image[chosen]
-        cloud["sigma"], cloud["frame"] = frames[k].sigma[chosen], k
+        cloud["points"], cloud["colours"] = frame.points[chosen], frame.image[chosen]
+        cloud["sigma"], cloud["frame"] = frame.sigma[chosen], k
         fits = np.ones(len(cloud), bool)
         for other in (k - 2, k - 1, k + 1, k + 2):
             if 0 <= other < count:
-                fits &= ~_contradicts(cloud, frames[other], chain.pairs[other].static)
+                fits &= ~_contradicts(cloud, frames[other])
         clouds.append(cloud[fits])
     cloud = np.concatenate(clouds)
     if not len(cloud):
@@ -157,6 +134,11 @@ def fuse(chain: Chain, most: int = MOST) -> Cloud:
     voxel = np.floor(cloud["points"][:, ::-1] / side).astype(np.int64)
     _, first = np.unique(voxel, axis=0, return_index=True)
     return cloud[first][:: max(1, -(-len(first) // most))]
+
+
+def _static(frame: Frame) -> Mask:
+    """(H, W) sure pixels of the static scene."""
+    return frame.sure & (frame.components == 0)
 
 
 def projected(frame: Frame, points: Float) -> tuple[Mask, Int, Int, Float]:
@@ -171,12 +153,12 @@ def projected(frame: Frame, points: Float) -> tuple[Mask, Int, Int, Float]:
     return inside, v, u, local[:, 2]
 
 
-def _contradicts(cloud: Cloud, frame: Frame, static: Mask) -> Mask:
+def _contradicts(cloud: Cloud, frame: Frame) -> Mask:
     """(M,) points in front of the static surface of a frame that is more certain there."""
     inside, v, u, z = projected(frame, cloud["points"])
     with np.errstate(invalid="ignore"):
-        in_front = z < IN_FRONT * frame.depth[v, u]
-    return np.asarray(static[v, u] & inside & in_front & (frame.sigma[v, u] <= cloud["sigma"]))
+        inside &= (z < IN_FRONT * frame.depth[v, u]) & (frame.sigma[v, u] <= cloud["sigma"])
+    return inside & _static(frame)[v, u]
 
 
 # --- meshes ---------------------------------------------------------------------------------------
@@ -189,39 +171,35 @@ GLTF = np.diag([1.0, -1.0, -1.0])
 """glTF has y up and looks along -z: half a turn about x from a camera's axes."""
 
 
-def surface_mesh(result: Result, frame: int) -> tuple[Float, Int, Float]:
-    """The surface of the reference image in frame 0 (reference) or 1 (next).
+def surface_mesh(frame: Frame) -> tuple[Float, Int, Float]:
+    """The surface of a frame, cut at jumps of the depth and between components.
 
-    It is cut at jumps of the depth, between components, and where depth is unknown. Returns (V, 3)
-    vertices in camera coordinates, (M, 3) triangles, counter-clockwise from the camera, and (V, 2)
-    pixels (u, v) of the reference image.
+    Returns:
+        (V, 3) vertices in the world, (M, 3) triangles, counter-clockwise from the camera, and
+        (V, 2) pixels (u, v).
     """
-    points = result.points[frame]
-    known = np.isfinite(points).all(axis=2) & (points[..., 2] > 0)
+    known = frame.depth > 0
     height, width = known.shape
     step = int(np.ceil(np.sqrt(height * width / CELLS)))
-    faces = triangles(whole_cells(*result.surface, known, step), width, step)
+    faces = triangles(whole_cells(*frame.surface, known, step), width, step)
     used, faces = np.unique(faces, return_inverse=True)
     pixels = np.stack([used % width, used // width], axis=1).astype(float)
-    return points.reshape(-1, 3)[used], faces.reshape(-1, 3), pixels
+    return frame.points.reshape(-1, 3)[used], faces.reshape(-1, 3), pixels
 
 
-def write_glb(path: PathLike, chain: Chain, number: int) -> None:
-    """Write the surface of a frame, textured with its pair's reference image.
+def write_glb(path: Path, frame: Frame) -> None:
+    """Write the surface of a frame, textured with its image.
 
-    Axes are those of glTF: x right, y up; the frame's camera of a pair, the first one of a chain,
-    looks along -z from the origin. Extras of the asset name the unit of length.
+    Axes are those of glTF: x right, y up; the first frame's camera looks along -z from the origin.
+    Extras of the asset name the unit of length.
     """
     import trimesh
     from PIL import Image
 
-    k, side = chain.seen(number)
-    vertices, faces, pixels = surface_mesh(chain.pairs[k], side)
-    pose = STILL if chain.single else chain.world_from_camera[number]
-    image = chain.pairs[k].images[0]
+    vertices, faces, pixels = surface_mesh(frame)
     packed = io.BytesIO()
-    Image.fromarray(image).save(packed, "JPEG", quality=QUALITY)
-    height, width = image.shape[:2]
+    Image.fromarray(frame.image).save(packed, "JPEG", quality=QUALITY)
+    height, width = frame.depth.shape
     # trimesh has v upwards, as OBJ does
     uv = (pixels + 0.5) / [width, height] * [1, -1] + [0, 1]
     material = trimesh.visual.material.PBRMaterial(
@@ -231,16 +209,11 @@ def write_glb(path: PathLike, chain: Chain, number: int) -> None:
         roughnessFactor=1.0,
         doubleSided=True,
     )
-    mesh = trimesh.Trimesh(
-        pose(vertices) @ GLTF,
-        faces,
-        visual=trimesh.visual.TextureVisuals(uv=uv, material=material),
-        process=False,
-    )
-    name = f"frame {chain.names[number]}"
-    camera = name if chain.single else "the first frame"
-    extras = {"unit": chain.unit, "frame": f"camera of {camera}, y up, looking along -z"}
-    scene = trimesh.Scene(metadata=extras)
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    mesh = trimesh.Trimesh(vertices @ GLTF, faces, visual=visual, process=False)
+    axes = "camera of the first frame, y up, looking along -z"
+    scene = trimesh.Scene(metadata={"unit": frame.unit, "frame": axes})
+    name = f"frame {frame.name}"
     scene.add_geometry(mesh, node_name=name, geom_name=name)
     write_bytes(path, scene.export(file_type="glb"))
 

@@ -3,21 +3,20 @@
 import base64
 import json
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from html import escape
 from importlib.resources import files
 from io import BytesIO
 from string import Template
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL.Image import fromarray
 
-from soup_nlp.arrays import Float, Image, Mask
-from soup_nlp.geometry.plane import inverse_depth
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, whole_cells
 from soup_nlp.report.chain import STILL, Chain
@@ -40,35 +39,23 @@ MODES = {
     "error": "error",
 }
 """Labels of the buttons that colour the 3D view, by name of the picture."""
-IN_CHAIN = ("image_ref", "depth_ref", "normals", "components", "superpixels", "confidence", "error")
-"""Pictures of every frame of a chain."""
-LISTED = 8
-"""Number of components whose motion is listed."""
 SHOWN = 3
-"""Smallest number of frames of a track that is shown; shorter tracks are mostly no objects."""
-SIDES, MANY, QUALITY = (1600, 720), 16, 80
-"""Larger side of a picture of a pair and of a chain, pixels; number of pairs above which pictures
-are smaller; JPEG quality of those of a chain."""
+"""Smallest number of frames of a path of a chain that is shown; shorter ones are mostly no
+objects."""
+SIDE, MANY = 1600, 4
+"""Larger side of a picture, pixels; number of pairs above which pictures are smaller."""
 PIXELS = 600_000, 4_000_000
 """Largest number of shown pixels of a pair, and of all pairs; larger images are subsampled."""
 
 
-def page(chain: Chain, parts: Mapping[str, str], drawn: Mapping[str, Picture] | None = None) -> str:
-    """The page as HTML that holds everything it shows.
-
-    `parts` are HTML of "summary", the line below the title, and of sections by their titles;
-    `drawn` are pictures of a pair, where they are drawn already.
-    """
-    sections = "".join(
-        f"<div{' class=wide' * (title == 'Verdict')}><h2>{title}</h2>{text}</div>\n"
-        for title, text in parts.items()
-        if title != "summary" and text
-    )
+def page(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> str:
+    """The page as HTML that holds everything it shows; `drawn` are pictures of a pair, if drawn."""
+    verdict = chain.summary.get("verdict") or [str(chain)]
     return Template(_file("page.html")).substitute(
         title=escape(chain.name),
         style=_file("page.css"),
-        summary=parts["summary"],
-        sections=sections,
+        summary=_headline(chain),
+        verdict=escape("\n".join(verdict)),
         three=_file("three.js"),
         script=_file("page.js"),
         # "<" could end the script element
@@ -76,37 +63,24 @@ def page(chain: Chain, parts: Mapping[str, str], drawn: Mapping[str, Picture] | 
     )
 
 
-def pair_page(result: Result, drawn: Mapping[str, Picture] | None = None) -> str:
-    """The page of a result."""
-    chain = Chain.of(result)
-    parts = {
-        "summary": _summary(result),
-        "Paths": path_table(chain),
-        "Verdict": preformatted(result.summary["verdict"]),
-    }
-    return page(chain, parts, drawn)
-
-
 def _file(name: str) -> str:
     """Text of a script, style or template of the page."""
     return (files("soup_nlp.report") / "web" / name).read_text(encoding="utf-8")
 
 
-def preformatted(lines: Sequence[str]) -> str:
-    """Lines of text in HTML."""
-    return "<pre>" + escape("\n".join(lines)) + "</pre>"
-
-
-class Markup(str):
-    """HTML of the program itself, which is not escaped."""
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in HTML; cells are text, or `Markup`."""
-    top = "".join(f"<th>{escape(h)}</th>" for h in head)
-    cells = [[c if isinstance(c, Markup) else escape(c) for c in row] for row in rows]
-    body = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in cells)
-    return f"<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>"
+def _headline(chain: Chain) -> str:
+    """The most important figures in one line of HTML; the sentence on what is drawn is first."""
+    told = chain.summary
+    drawn = drawn_line(chain.certainty, "the image" if chain.single else "all images")
+    words = [f"{len(chain)} frames"]
+    if "status" in told:
+        words.append("converged" if told["converged"] else f"not converged ({told['status']})")
+    score = told.get("score") or {"mre_one_scale": None}
+    scored = told.get("metrics", {}).get("solution", {"mre": score["mre_one_scale"]})
+    if scored["mre"] is not None:
+        words.append(f"MRE {scored['mre']:.4f} with one scale")
+    strong = [f"<strong>{escape(drawn)}</strong>"] if drawn else []
+    return " &middot; ".join([*strong, *map(escape, words)])
 
 
 def _css(colour: Any) -> str:
@@ -119,27 +93,17 @@ def _packed(array: NDArray[Any]) -> str:
     return base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
 
 
-def encoded(image: Image, kind: str, most: int = SIDES[0], **options: Any) -> str:
-    """A picture (H, W, 3), reduced to a largest side of `most` pixels, as a data URI."""
+def _figure(picture: Picture, pairs: int) -> dict[str, str]:
+    """A picture for the data; of a single pair, those with a legend are stored without loss."""
+    image, most = picture.image, SIDE * min(1.0, np.sqrt(MANY / pairs))
     side = max(image.shape[:2])
     if side > most:
         size = [round(x * most / side) for x in image.shape[1::-1]]
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    data = BytesIO()
-    fromarray(image).save(data, kind, **options)
-    return f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode('ascii')}"
-
-
-def _figure(picture: Picture, pairs: int) -> dict[str, str]:
-    """A picture for the data; of a single pair, those with a legend are stored without loss."""
-    if pairs > 1:
-        side = round(SIDES[1] * min(1.0, np.sqrt(MANY / pairs)))
-        source = encoded(picture.image, "jpeg", side, quality=QUALITY)
-    elif picture.legend is None:
-        source = encoded(picture.image, "jpeg", quality=90)
-    else:
-        # the least effort takes a fifth of the time; files are half as large again
-        source = encoded(picture.image, "webp", lossless=True, method=0, quality=50)
+    data, exact = BytesIO(), picture.legend is not None and pairs == 1
+    # the least effort takes a fifth of the time; files are half as large again
+    fromarray(image).save(data, "webp", lossless=exact, method=0, quality=50 if exact else 90)
+    source = f"data:image/webp;base64,{base64.b64encode(data.getvalue()).decode('ascii')}"
     return {"title": picture.title, "legend": _legend(picture.legend), "source": source}
 
 
@@ -157,70 +121,6 @@ def _legend(legend: Legend | None) -> str:
     return f'{bar}<div class="{kind}">{texts}</div>'
 
 
-def _summary(result: Result) -> str:
-    """The most important figures in one line."""
-    s, m = result.summary, result.summary["metrics"].get("solution")
-    words = ["converged" if s["converged"] else f"not converged ({s['status']})"]
-    words.append(f"{s['sizes']['superpixels']} superpixels")
-    if m and m["mre"] is not None:
-        words.append(f"MRE {m['mre']:.4f} after one {m['scale_rule']} scale")
-    words.append(f"{np.mean(result.flow_confidence > 0):.0%} of the flow usable")
-    whole = sum(v for k, v in s["seconds"].items() if not k.startswith("nlp_"))
-    if whole:
-        words.append(f"{whole:.1f} s")
-    return headline(drawn_line(s["certainty"]), words)
-
-
-def headline(drawn: str, words: Sequence[str]) -> str:
-    """Figures in one line of HTML; the sentence on what is drawn is first."""
-    strong = [f"<strong>{escape(drawn)}</strong>"] if drawn else []
-    return " &middot; ".join([*strong, *map(escape, words)])
-
-
-class Path(NamedTuple):
-    """What moves, or the camera: its colour, first frame, points (3,) and share of the images."""
-
-    name: str
-    colour: str
-    first: int
-    points: list[Float]
-    share: float | None = None
-
-
-def paths(chain: Chain) -> list[Path]:
-    """Paths of the camera and of what moves, in the shown unit, the largest first."""
-    metre = chain.metre or 1.0
-    camera = [metre * pose.t for pose in chain.world_from_camera]
-    out = list[Path]()
-    colours = component_colours(max(chain.track_numbers, default=0) + 1)
-    for track in chain.track_numbers:
-        path = chain.path(track)
-        points = [metre * point for point in path.values()]
-        moved = np.linalg.norm(points[-1] - points[0]) > 0.01 * abs(points[0][2])
-        if moved if chain.single else len(path) >= SHOWN:
-            first, share = min(path), chain.share(track)
-            out.append(Path(f"component {track}", _css(colours[track]), first, points, share))
-    out.sort(key=lambda one: -(one.share or 0.0))
-    return [Path("camera", "#ffa94d", 0, camera), *out]
-
-
-def path_table(chain: Chain) -> str:
-    """The largest paths as a table."""
-    rows, known = [], paths(chain)
-    for path in known[: LISTED + 1]:
-        length = float(np.linalg.norm(np.diff(path.points, axis=0), axis=1).sum())
-        share = "" if path.share is None else f"{path.share:.1%}"
-        frames = f"{path.first} to {path.first + len(path.points) - 1}"
-        name = Markup(f'<i style="background:{path.colour}"></i>{escape(path.name)}')
-        rows.append([name, share, frames, f"{length:.3g}"])
-    rest = f"<p>Smaller ones: {len(known) - LISTED - 1}.</p>" if len(known) > LISTED + 1 else ""
-    return (
-        table(["path of", "share of the images", "frames", f"length, {chain.length}"], rows)
-        + rest
-        + "<p>What moves by itself has a scale of its own: its path is as good as its depth.</p>"
-    )
-
-
 # --- the data of the page: planes, motions, cameras and pictures ----------------------------------
 
 
@@ -234,19 +134,16 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "deepest": median depth, depth beyond which points are hidden at first, largest depth.
         "origins": words for what gives a component its scale. "kinds": words for kinds of depth.
     """
-    metre, pairs, depths = chain.metre or 1.0, [], []
-    most = min(PIXELS[0], PIXELS[1] / len(chain.pairs))
-    for k in range(len(chain.pairs)):
-        shown = drawn or pictures(chain, k)
-        kept = {n: p for n, p in shown.items() if chain.single or n in IN_CHAIN}
-        figures = {name: _figure(picture, len(chain.pairs)) for name, picture in kept.items()}
+    metre, count = chain.metre or 1.0, len(chain.pairs)
+    pairs = []
+    for k in range(count):
+        shown = (drawn or pictures(chain, k)).items()
         packed = {
             name: _packed(value) if isinstance(value, np.ndarray) else value
-            for name, value in make_pair(chain, k, most).items()
+            for name, value in make_pair(chain, k, min(PIXELS[0], PIXELS[1] / count)).items()
         }
-        pairs.append({**packed, "pictures": figures})
-        depths.append(chain.pairs[k].depths[0].ravel())
-    z = metre * np.concatenate(depths)
+        pairs.append({**packed, "pictures": {name: _figure(one, count) for name, one in shown}})
+    z = metre * chain.depths
     z = z[np.isfinite(z)]
     far, deepest = _far(z)
     still = chain.single and chain.pairs[0].bending
@@ -257,7 +154,7 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "names": names or ["reference frame", "next frame"],
         "modes": [[n, word] for n, word in MODES.items() if n in pairs[0]["pictures"]],
         "cameras": [replace(pose, t=metre * pose.t).matrix for pose in poses],
-        "paths": [{"colour": p.colour, "points": p.points} for p in paths(chain)],
+        "paths": _paths(chain, metre),
         "middle": float(np.median(z)) if z.size else 1.0,
         "far": far,
         "deepest": deepest,
@@ -265,6 +162,19 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "origins": [ORIGINS[name] for name in TIES],
         "kinds": [*SAID.values()],
     }
+
+
+def _paths(chain: Chain, metre: float) -> list[dict[str, Any]]:
+    """Colours and points of the paths of the camera and of what moves."""
+    camera = [metre * pose.t for pose in chain.world_from_camera]
+    out = [{"colour": "#ffa94d", "points": camera}]
+    colours = component_colours(max(chain.paths, default=0) + 1)
+    for track, path in chain.paths.items():
+        points = [metre * point for point in path.values()]
+        moved = np.linalg.norm(points[-1] - points[0]) > 0.01 * abs(points[0][2])
+        if moved if chain.single else len(points) >= SHOWN:
+            out.append({"colour": _css(colours[track]), "points": points})
+    return out
 
 
 def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
@@ -297,13 +207,13 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
     byte = np.where(np.isfinite(sigma), 254 * np.clip(sigma / 0.5, 0, 1), 255)
     return {
         "labels": labels.astype(np.uint16),
-        "planes": _single(inverse_depth(soup.n, scale * soup.distance)),
+        "planes": _single(result.planes[0] / scale),
         "motion": _single(_motion(camera.R @ R, home, pivot)),
         "motionCamera": _single(_motion(R, T, pivot)),
         "seen": (~hidden(rec)[every]).astype(np.uint8),
         "sigma": byte.round().astype(np.uint8),
         "kind": result.kind[every].astype(np.uint8),
-        "component": chain.of_track(k)[result.components.of_superpixel].astype(np.uint16),
+        "component": chain.tracks[k][result.components.of_superpixel].astype(np.uint16),
         "tie": np.asarray(start["tie"], np.uint8),
         "surface": np.packbits(surface_cells(result, step), bitorder="little"),
         "count": len(soup),

@@ -32,19 +32,18 @@ DENSE = 0.5
 """If a smaller share of the pixels is known, as with laser points, each is drawn larger."""
 ERROR_TICKS, SIGMA_TICKS = (0.0, 0.05, 0.1, 0.15, 0.2), (0.0, 0.1, 0.2, 0.3)
 """Values below the legends of error and sigma; the last one has the brightest colour."""
-SPARE = ("depth_start", "normals")
-"""Pictures that an overview leaves out, in this order, to fill its last row."""
 
 
 def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
     """All pictures of a pair of a chain by name, in the order of the overview.
 
-    "image_ref", "image_next", "superpixels", "components", "flow", "flow_confidence",
-    "depth_ref", "depth_next", "depth_start", "depth_true", "error", "confidence" and "normals".
-    Pictures of unknown quantities are left out. Colours mean the same in all pairs.
+    "image_ref", "image_next", "superpixels", "components", "flow", "depth_ref", "depth_next",
+    "depth_true", "error", "confidence", "normals" and "flow_confidence". Pictures of unknown
+    quantities are left out. Colours mean the same in all pairs.
     """
     result = chain.pairs[k]
     before, after = result.images
+    flow, flow_confidence = _flow(result)
     drawn = [
         Picture("image_ref", "reference frame", before),
         Picture("image_next", "next frame", after),
@@ -54,7 +53,7 @@ def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
             draw_superpixels(before, result.labels),
         ),
         _components(chain, k),
-        *_flow(result),
+        flow,
         *_depths(chain, k),
     ]
     error = relative_error(result, chain.metre)
@@ -63,13 +62,13 @@ def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
         drawn.append(_shares("error", title, _enlarged(error), "inferno", ERROR_TICKS))
     title = "expected depth error (1 sigma)"
     drawn.append(_shares("confidence", title, result.sigma, "viridis", SIGMA_TICKS))
-    drawn.append(_normals(result))
+    drawn += [_normals(result), flow_confidence]
     return {picture.name: picture for picture in drawn}
 
 
 def _components(chain: Chain, k: int) -> Picture:
     """The image in the colours of the components; striped where most of the depth is drawn."""
-    result, track = chain.pairs[k], chain.of_track(k)
+    result, track = chain.pairs[k], chain.tracks[k]
     part = result.components.of_pixel
     count = len(track)
     colours = component_colours(max(track) + 1)[track]
@@ -110,7 +109,7 @@ def _flow(result: Result) -> list[Picture]:
 
 
 def _depths(chain: Chain, k: int) -> list[Picture]:
-    """Depths of both frames, of the start and of the truth, with one colour scale."""
+    """Depths of both frames and of the truth, with one colour scale."""
     result, scores = chain.pairs[k], chain.pairs[k].summary.get("metrics", {})
     truth, (near, far) = result.true_depth, chain.depth_range
     bar, out = depth_legend(near, far, f" {chain.length}"), []
@@ -128,9 +127,6 @@ def _depths(chain: Chain, k: int) -> list[Picture]:
     add("depth_ref", "depth of the reference frame", metre * result.depths[0], "solution", drawn)
     seen = result.in_next(drawn, False)
     add("depth_next", "depth of the next frame", metre * result.depths[1], "solution_next", seen)
-    if (start := result.depth_maps.get("start")) is not None:
-        scale = float(scores.get("start", {}).get("scale") or 1.0)
-        add("depth_start", "depth of the start", scale * start, "start")
     if truth is not None:
         true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)
         out.append(Picture("depth_true", "true depth; grey = no truth", true, bar))
@@ -176,12 +172,6 @@ def _normals(result: Result) -> Picture:
 
 
 def overview(drawn: Mapping[str, Picture], title: str) -> Image:
-    """The pictures of a result in a grid of three columns.
-
-    `SPARE` ones are left out if they would leave a row incomplete.
-    """
-    panels = dict(drawn)
-    for name in SPARE:
-        if len(panels) % 3:
-            panels.pop(name, None)
-    return strip([*panels.values()], title)
+    """The pictures of a result in whole rows of three columns; the last ones may be left out."""
+    panels = [*drawn.values()]
+    return strip(panels[: len(panels) // 3 * 3], title)

@@ -20,17 +20,18 @@ from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.constraints import Constraints, constraints
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.chain import UNIT, Chain
 from soup_nlp.report.figures import shown
 from soup_nlp.report.findings import drawn_line
-from soup_nlp.report.layout import require_layout, result_tree
+from soup_nlp.report.layout import Stored, result_tree
 from soup_nlp.report.pictures import overview, pictures
-from soup_nlp.report.summary import Summary, by_kind
-from soup_nlp.storage.files import as_path, plain, read_json
-from soup_nlp.storage.store import ReadTree, read_h5, require
+from soup_nlp.report.summary import by_kind
+from soup_nlp.storage.files import plain
+from soup_nlp.storage.store import ReadTree, require
 
 PAGE = "report.html"
 """Name of the page in a result folder."""
@@ -130,16 +131,6 @@ class Result:
         return self.tree["truth"].get("depth_ref")
 
     @property
-    def points(self) -> tuple[Float, Float]:
-        """(H, W, 3) points of the reference image in the camera coordinates of both frames."""
-        return self.reconstruction.points_ref, self.reconstruction.points_next
-
-    @property
-    def normals(self) -> tuple[Float, Float]:
-        """(H, W, 3) normals of `points`."""
-        return self.reconstruction.normals, self.reconstruction.normals_next
-
-    @property
     def unit(self) -> str:
         """Unit of length as a phrase for headers of files."""
         if self.metre is None:
@@ -167,11 +158,14 @@ class Result:
         source = self.reconstruction.source_next
         return np.where(source >= 0, values.ravel()[source], unknown)
 
-    @property
-    def parallax_px(self) -> float:
-        """Median displacement that the camera's translation causes, pixels."""
-        static = self.components.of_superpixel == 0
-        return float(np.median(self.tree["start"]["parallax"][static]))
+    @cached_property
+    def planes(self) -> tuple[Float, Float]:
+        """(N, 3) m of every superpixel with depth 1 / (m . ray), in both frames."""
+        soup = self.soup
+        ref = inverse_depth(soup.n, soup.distance)
+        turned = np.einsum("nij,nj->ni", soup.R, ref)
+        ahead = 1.0 + np.einsum("nj,nj->n", turned, soup.translation)
+        return ref, turned / ahead[:, None]
 
     @property
     def metre(self) -> float | None:
@@ -224,7 +218,7 @@ class Result:
     @cached_property
     def surface(self) -> tuple[Mask, Mask]:
         """Continuity of the surface to the right and downwards, see `geometry.surface.joined`."""
-        return joined(self.reconstruction, self.K, self.components.of_pixel)
+        return joined(self.planes[0], self.labels, self.components.of_pixel, self.K)
 
     @cached_property
     def sure(self) -> Mask:
@@ -259,13 +253,11 @@ def load(folder: str | Path) -> Result:
     Raises:
         DataError: the folder holds no result, or a damaged one.
     """
-    folder = as_path(folder, "result folder")
-    path = folder / "result.h5"
-    tree, summary = read_h5(path), read_json(folder / "summary.json", "summary.json", Summary)
-    require_layout(tree)
+    stored = Stored.read(folder)
+    tree, summary = stored.tree, stored.claims
     try:
         _, _, K_ref, K_next, _ = (require(tree, f"input/{name}") for name in INPUTS)
-        soup = Soup(*(require(tree, f"solution/{key}") for key in ("lam", "n", "d", "R", "t")))
+        soup = Soup(**stored.soup("solution"))
         planes = np.isfinite(soup.lam * soup.d).all()
         if not planes or not (np.abs(np.linalg.det(soup.R) - 1) < 1e-3).all():
             raise ValueError("planes or rotations of the solution are none")
@@ -275,17 +267,21 @@ def load(folder: str | Path) -> Result:
         given = {f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)}
         seg, (height, width) = Segmentation(**given), tree["depth"]["next"].shape
         rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
-        group, borrowed = tree["start"]["component"], tree["start"]["borrowed"].astype(bool)
+        start = tree["start"]
+        # older results have an array of their own for what moves as one
+        part, borrowed = start.get("part", start["component"]), start["borrowed"].astype(bool)
         return Result(
             tree=tree,
             summary={**summary, "certainty": by_kind(summary["certainty"])},
             reconstruction=replace(rec, sigma_ref=sigma),
-            components=find_components(soup, seg, group, K_ref, K_next, borrowed),
+            components=find_components(soup, seg, part, K_ref, K_next, borrowed),
             metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
             kind=kind,
         )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
-        raise DataError("result does not hold together", where=folder, found=error) from error
+        raise DataError(
+            "result does not hold together", where=stored.folder, found=error
+        ) from error
 
 
 def _metrics(row: Mapping[str, Any]) -> DepthMetrics:

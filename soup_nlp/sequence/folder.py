@@ -3,25 +3,25 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from shlex import quote
-from typing import Annotated, Any
+from typing import Annotated, Any, NotRequired
 
 import numpy as np
 from annotated_types import Len
-from pydantic import NonNegativeInt
 from typing_extensions import TypedDict
 
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.report.chain import AXES, Chain, Lazy
 from soup_nlp.report.check import CheckReport, Claim, check_folder, written
-from soup_nlp.report.formats import check_formats, write_depths, write_formats, write_tum
-from soup_nlp.report.page import pair_page
+from soup_nlp.report.figures import depth_png_scale, write_depth_png16
+from soup_nlp.report.formats import check_formats, write_formats
+from soup_nlp.report.page import page
 from soup_nlp.report.pairs import PAIRS, ROWS
 from soup_nlp.report.result import PAGE, Result
 from soup_nlp.report.result import load as load_pair
+from soup_nlp.sequence.frames import pair_name
 from soup_nlp.sequence.links import make_chain, read_pair
-from soup_nlp.sequence.score import chain_page, page_names, score
+from soup_nlp.sequence.score import chain_lines, score
 from soup_nlp.storage.files import as_path, is_file, read_json, write_json, write_text
 from soup_nlp.storage.folders import staged
 from soup_nlp.storage.rows import failed, read_rows
@@ -44,17 +44,12 @@ def is_chain(folder: Path) -> bool:
         return is_file(folder / CHAIN)
     rows = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
     broken = sorted(key for key, row in rows.items() if failed(row))
-    stored = sorted(key for key in rows if is_file(folder / PAIRS / key / "result.h5"))
-    solved = [key for key in stored if key not in broken]
-    hint = "the same soup-nlp chain command goes on where it stopped"
-    if solved:
-        hint += f"; soup-nlp view {quote(str(folder / PAIRS / solved[0]))} shows a single pair"
     raise DataError(
         "chain is not finished",
         where=folder,
-        found=f"pairs solved: {', '.join(solved) or 'none'}; failed: {', '.join(broken) or 'none'}",
+        found=f"pairs in {PAIRS}/: {len(rows)}, failed: {', '.join(broken) or 'none'}",
         expected=f"{CHAIN}, written when every pair is solved",
-        hint=hint,
+        hint="the same soup-nlp chain command goes on where it stopped",
     )
 
 
@@ -85,12 +80,7 @@ def read_chain(folder: Path) -> Chain:
 
 def read_pairs(folder: Path, count: int) -> Lazy[Result]:
     """The pairs of a chain's folder, each read when it is needed."""
-    return Lazy(lambda k: read_pair(pair_folder(folder, k)), count)
-
-
-def pair_folder(folder: Path, k: int) -> Path:
-    """Folder of the result of the frames k and k + 1."""
-    return folder / PAIRS / f"{k:03d}_{k + 1:03d}"
+    return Lazy(lambda k: read_pair(folder / PAIRS / pair_name(k)), count)
 
 
 def check(folder: Path) -> CheckReport:
@@ -103,9 +93,8 @@ def check(folder: Path) -> CheckReport:
         return check_folder(folder)
     chain, claims = read_chain(folder), []
     for k in range(len(chain.pairs)):
-        pair = pair_folder(folder, k)
-        right = float(check_folder(pair).ok)
-        claims.append(Claim(f"pair {pair.name}: every claim", 1.0, right))
+        right = float(check_folder(folder / PAIRS / pair_name(k)).ok)
+        claims.append(Claim(f"pair {pair_name(k)}: every claim", 1.0, right))
     poses = np.array([m.matrix for m in chain.world_from_camera])
     arrays: Mapping[str, tuple[Any, Float]] = {
         "scales by the pairs": ([row["scale"] for row in chain.summary["scales"]], chain.scales),
@@ -150,18 +139,15 @@ def convert(
 
 
 def renew_page(folder: Path) -> Path:
-    """Make the pages of a result or a chain again from its arrays; returns the first.
+    """Make the page of a result or a chain again from its arrays; returns it.
 
     Raises:
         DataError: the folder holds neither or a page that was changed, or cannot be written.
     """
-    found = load(folder)
+    found = chain_of(folder)
     with staged(folder) as new:
         try:
-            if isinstance(found, Chain):
-                write_pages(new, found)
-            else:
-                write_text(new / PAGE, pair_page(found))
+            write_text(new / PAGE, page(found))
         except (KeyError, ValueError, IndexError, TypeError) as error:
             lacks, hint = "result lacks what a page shows", "solve it again"
             raise DataError(lacks, where=folder, found=repr(error), hint=hint) from error
@@ -170,7 +156,7 @@ def renew_page(folder: Path) -> Path:
 
 def chain_files(count: int) -> list[str]:
     """Names of the files of a chain of `count` frames."""
-    return [*SINGLE[:2], *page_names(count), *(f"depth/{k:04d}.png" for k in range(count))]
+    return [*SINGLE, *(f"depth/{k:04d}.png" for k in range(count))]
 
 
 def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -> Chain:
@@ -185,20 +171,18 @@ def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -
     Returns:
         The chain with the contents of its chain.json.
     """
-    scale = write_depths(folder, chain)
+    scale = depth_png_scale(chain.depths)
+    (folder / "depth").mkdir(exist_ok=True)
+    for frame in chain:
+        write_depth_png16(folder / "depth" / f"{frame.name}.png", frame.depth, scale)
     contents = {"name": name, "sources": list(sources), **summary(chain)}
     contents |= {"depth_png_scale": scale, "score": score(chain)}
+    contents["verdict"] = chain_lines(replace(chain, summary=contents))
     chain = replace(chain, summary=contents)
     write_json(folder / CHAIN, contents)
-    write_tum(folder / "trajectory.tum", chain)
-    write_pages(folder, chain)
+    write_formats(folder, chain, ["tum"])
+    write_text(folder / PAGE, page(chain))
     return chain
-
-
-def write_pages(folder: Path, chain: Chain) -> None:
-    """Write the pages of a chain, one after the other."""
-    for name in page_names(len(chain)):
-        write_text(folder / name, chain_page(chain, name))
 
 
 def summary(chain: Chain) -> dict[str, Any]:
@@ -207,10 +191,7 @@ def summary(chain: Chain) -> dict[str, Any]:
         "frames": len(chain),
         "unit": chain.unit,
         "world": f"the first frame's camera: {AXES}",
-        "scales": [
-            {"pair": [k, k + 1], "scale": s, "parallax_px": brief.parallax_px}
-            for k, (brief, s) in enumerate(zip(chain.briefs, chain.scales, strict=True))
-        ],
+        "scales": [{"pair": [k, k + 1], "scale": scale} for k, scale in enumerate(chain.scales)],
         "links": [
             {
                 "pairs": [k.first, k.second],
@@ -224,83 +205,34 @@ def summary(chain: Chain) -> dict[str, Any]:
         ],
         "certainty": chain.certainty,
         "world_from_camera": [m.matrix for m in chain.world_from_camera],
-        "tracks": [
-            {
-                "track": track,
-                "path": chain.path(track),
-                "pixels": {k: part.pixels for k, part in chain.members(track).items()},
-            }
-            for track in chain.track_numbers
-        ],
+        "tracks": [{"track": track, "path": path} for track, path in sorted(chain.paths.items())],
     }
 
 
 # --- what chain.json holds, as far as it is read back -----------------------------------------
 
-Two = Annotated[list[NonNegativeInt], Len(2, 2)]
-"""Frames of a pair, or two pairs."""
 Row = Annotated[list[float], Len(4, 4)]
 
 
 class Scaled(TypedDict):
     """A pair of consecutive frames."""
 
-    pair: Two
     scale: float
-
-
-class Linked(TypedDict):
-    """A link between two pairs, see `report.chain.Link`."""
-
-    pairs: Two
-    ratio: float
-    spread: float
-    pixels: int
-    bridge: bool
-    flagged: bool
-
-
-class Tracked(TypedDict):
-    """A component that is followed."""
-
-    path: dict[str, list[float]]
-
-
-class TrueLink(TypedDict):
-    """A link by the truth."""
-
-    pairs: Two
-    true: float
-
-
-class PathError(TypedDict):
-    """Error of the camera's path."""
-
-    share: float
-    ate: float
-    rpe: float
-    rpe_degrees: float
 
 
 class Score(TypedDict):
     """Errors against the truth, see `sequence.score.score`."""
 
     scale: float
-    mre_own_scale: float
     mre_one_scale: float
-    cost: float
-    links: list[TrueLink]
-    path: PathError | None
 
 
 class Contents(TypedDict):
     """Contents of chain.json."""
 
     name: str
-    unit: str
     sources: list[str]
     scales: Annotated[list[Scaled], Len(1)]
-    links: list[Linked]
-    tracks: list[Tracked]
     world_from_camera: list[Annotated[list[Row], Len(4, 4)]]
     score: Score | None
+    verdict: NotRequired[list[str]]

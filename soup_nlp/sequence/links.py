@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from soup_nlp.arrays import Float, Mask
-from soup_nlp.errors import DataError, expect
+from soup_nlp.errors import DataError
 from soup_nlp.evaluation.metrics import overlap_shares
 from soup_nlp.geometry.superpixels import Labels
 from soup_nlp.report.chain import STILL, Brief, Chain, Lazy, Link
@@ -21,8 +21,6 @@ MIN_PIXELS = 200
 MOST_DRAWN = 0.5
 """A pair has no parallax if a larger share of its background has the depth of neighbours, and a
 chain is not good if a larger share of all its images is drawn."""
-MADE_BY = "soup_nlp.load(...) of the folder of each pair"
-"""Where pairs of a chain come from, for messages."""
 SAME = 0.3
 """Smallest intersection over union of two components of one track."""
 KEPT = ("input", "start", "truth", "solution", "weights", "energy")
@@ -113,15 +111,9 @@ def make_chain(pairs: Sequence[Result], summary: Mapping[str, Any] | None = None
     Raises:
         DataError: a pair shares no pixel with those before it.
     """
-    expect(pairs, (list, tuple, Lazy), "pairs of a chain", MADE_BY)
     near, bridges, matches, briefs = list[Link | None](), list[Link | None](), [], list[Brief]()
-    if not pairs:
-        expect(None, Result, "pair of a chain", MADE_BY)
     # every pair is read once
-    for k in range(len(pairs)):
-        for pair in pairs[k : k + 2]:
-            expect(pair, Result, "pair of a chain", MADE_BY)
-        pair = pairs[k]
+    for k, pair in enumerate(pairs):
         briefs.append(Brief.of(pair, len(pairs)))
         if k + 1 < len(pairs):
             near.append(near_link(pairs, k))
@@ -134,7 +126,8 @@ def make_chain(pairs: Sequence[Result], summary: Mapping[str, Any] | None = None
     poses = [STILL]
     for brief in briefs:
         poses.append(poses[-1] @ brief.parts[0].motion.inverse)
-    tracks = number(matches, [len(brief.parts) for brief in briefs])
+    numbers = number(matches, [len(brief.parts) for brief in briefs])
+    tracks = (np.array([of[label] for label in range(len(of))]) for of in numbers)
     names = tuple(f"{k:04d}" for k in range(len(poses)))
     results = Lazy(lambda k: pairs[k].scaled(scales[k]), len(pairs))
     parts = results, tuple(briefs), tuple(poses), tuple(tracks), names

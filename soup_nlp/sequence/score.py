@@ -1,7 +1,6 @@
-"""Errors of a chain: depth with one scale for all or one for each frame, and the camera path."""
+"""Verdict on a chain; its errors: depth with one scale for all or each frame, camera path."""
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,6 @@ from soup_nlp.evaluation.metrics import MEDIAN, UNSCALED, Convention, depth_metr
 from soup_nlp.geometry.rotation import log
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import certainty_lines, drawn_line
-from soup_nlp.report.page import headline, page, path_table, preformatted, table
-from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import sectioned
 from soup_nlp.sequence.links import MOST_DRAWN
 from soup_nlp.storage.files import read_text
@@ -25,10 +22,6 @@ AVERAGED = ("mre_own_scale", "mre_one_scale", "mre_affine", "rmse", "delta1")
 """Scores of frames of which a chain has the mean."""
 SAMPLES = 4_000_000
 """Number of pixels of a chain from which its scale is found."""
-SHOWN = 50
-"""Largest number of pairs on one page."""
-LINKS = ("pairs", "ratio of scales", "spread (log)", "true ratio", "pixels", "")
-"""Columns of `link_table`."""
 
 
 def score(
@@ -42,21 +35,22 @@ def score(
         poses: (K + 1, 4, 4) true world_from_camera; None for the motions of the pairs' truth.
 
     Returns:
-        "frames": MRE of every frame with its own median scale, with one for all ("scale") and with
-        a scale and a shift of its own; RMSE and delta < 1.25 with one scale. The same without
-        "frames" as means over the frames. "links": estimated and true ratio of scales. "path": see
+        "frames": MRE of every frame with its own median scale ("own_scale"), with one for all
+        ("scale") and with a scale and a shift of its own; RMSE and delta < 1.25 with one scale. The
+        same without "frames" as means over the frames, and the "cost" of one scale. "path": see
         `path_errors`; None if it is not known.
     """
     if truths is not None and len(truths) != len(chain):
         raise DataError("truth and chain differ in length", found=len(truths), expected=len(chain))
 
     def truth(k: int) -> Float | None:
-        pair, last = chain.seen(k)
-        known = chain.pairs[pair].tree["truth"].get(("depth_ref", "depth_next")[last])
+        # the last frame is the next one of the last pair
+        last = int(k == len(chain.pairs))
+        known = chain.pairs[k - last].tree["truth"].get(("depth_ref", "depth_next")[last])
         z = known if truths is None else truths[k]
         return z if z is not None and MEDIAN.counts(z) else None
 
-    if truths is None and not any(brief.true_depth for brief in chain.briefs):
+    if truths is None and not chain.pairs[0].tree["truth"]:
         return None
     own_scale, ratios, frames = dict[int, float](), list[Float](), []
     for k, frame in enumerate(chain):
@@ -86,36 +80,14 @@ def score(
             }
         )
     means = {key: float(np.mean([f[key] for f in frames])) for key in AVERAGED}
-    # the true ratio is that of the pairs' own depths, without the scales of the chain
-    ratio = chain.scales[1:] / chain.scales[:-1]
-    links = [
-        {"pairs": [k, k + 1], "estimated": r, "true": r * own_scale[k + 1] / own_scale[k]}
-        for k, r in enumerate(ratio)
-        if own_scale.keys() >= {k, k + 1}
-    ]
     poses = true_poses(chain) if poses is None else poses
     return {
         "scale": scale,
         "frames": frames,
         **means,
         "cost": means["mre_one_scale"] / means["mre_own_scale"] - 1,
-        "links": links,
         "path": None if poses is None else path_errors(chain, poses),
     }
-
-
-def link_table(contents: Mapping[str, Any]) -> list[list[str]]:
-    """The links of a chain.json as rows below their heads; empty without links."""
-    true = {tuple(k["pairs"]): k["true"] for k in (contents["score"] or {}).get("links", ())}
-    rows = []
-    for k in contents["links"]:
-        a, b = k["pairs"]
-        true_ratio = f"{true[a, b]:.3f}" if (a, b) in true else ""
-        note = "bridge" if k["bridge"] else "doubtful" if k["flagged"] else ""
-        numbers = [f"{k['ratio']:.3f}", f"{k['spread']:.3f}", true_ratio, str(k["pixels"])]
-        rows.append([f"{a}, {b}", *numbers, note])
-    # columns without a text are left out, and so is the table of a chain without links
-    return [[*row] for row in zip(*(c for c in zip(LINKS, *rows) if any(c[1:])))]
 
 
 def score_text(scores: Mapping[str, Any]) -> str:
@@ -133,17 +105,21 @@ def score_text(scores: Mapping[str, Any]) -> str:
 
 
 def chain_lines(chain: Chain) -> list[str]:
-    """Scales, links and, with a truth, errors of a chain for the terminal."""
-    lines, contents = [str(chain)], chain.summary
-    rows = link_table(contents)
-    widths = [max(map(len, column)) + 2 for column in zip(*rows, strict=True)]
-    lines += ["".join(f"{c:<{w}}" for c, w in zip(row, widths)).rstrip() for row in rows]
-    long = [track for track in contents["tracks"] if len(track["path"]) > 2]
-    lines.append(f"tracks      {len(long)} components followed over two pairs or more")
+    """Links, tracks, certainty and, with a truth, errors of a chain: its verdict."""
+    lines = [str(chain)]
+    if chain.links:
+        lines.append("pairs    ratio of scales  spread (log)  pixels")
+    for k in chain.links:
+        note = "  bridge" if k.bridge else "  doubtful" if k.flagged else ""
+        ends = f"{k.first}, {k.second}"
+        ratio = f"{np.exp(k.log_ratio):.3f}"
+        lines.append(f"{ends:<9}{ratio:<17}{k.spread:<14.3f}{k.pixels}{note}")
+    long = sum(len(path) > 2 for path in chain.paths.values())
+    lines.append(f"tracks      {long} components followed over two pairs or more")
     lines.append(sectioned({"certainty": certainty_lines(chain.certainty, "all images")}))
-    if contents["score"]:
-        lines.append(f"accuracy    {score_text(contents['score'])}")
-    return lines
+    if scores := chain.summary.get("score"):
+        lines.append(f"accuracy    {score_text(scores)}")
+    return "\n".join(lines).splitlines()
 
 
 def chain_exit_code(chain: Chain) -> tuple[int, str]:
@@ -172,10 +148,12 @@ def score_lines(scores: Mapping[str, Any] | None) -> list[str]:
 def true_poses(chain: Chain) -> Float | None:
     """(K + 1, 4, 4) world_from_camera by the truth of the pairs; None if it is not known."""
     poses = [np.eye(4)]
-    for brief in chain.briefs:
-        if brief.true_motion is None:
+    for pair in chain.pairs:
+        motions = pair.tree["truth"].get("motions")
+        # component 0 of a truth is the static scene
+        if motions is None or not np.isfinite(motions[0]).all():
             return None
-        poses.append(poses[-1] @ np.linalg.inv(brief.true_motion))
+        poses.append(poses[-1] @ np.linalg.inv(motions[0]))
     return np.array(poses)
 
 
@@ -243,31 +221,3 @@ def similarity(points: Float, target: Float) -> tuple[float, Float, Float]:
     scale = float((S * sign).sum() / size) if size > 0 else 1.0
     R = U * sign @ Vt
     return scale, R, target.mean(axis=0) - scale * R @ points.mean(axis=0)
-
-
-def page_names(frames: int) -> dict[str, tuple[int, int]]:
-    """Names of the pages of a chain of so many frames, each with its first and last frame."""
-    count = -(-(frames - 1) // SHOWN)
-    ends = [k * (frames - 1) // count for k in range(count + 1)]
-    names = [PAGE, *(f"report_{k + 1}.html" for k in range(1, count))]
-    return dict(zip(names, pairwise(ends), strict=True))
-
-
-def chain_page(chain: Chain, name: str = PAGE) -> str:
-    """One of the pages of a chain, see `page_names`; it holds at most `SHOWN` pairs."""
-    names, scores = page_names(len(chain)), chain.summary["score"]
-    shown = chain.part(*names[name]) if len(names) > 1 else chain
-    links, words = link_table(shown.summary), [f"{len(chain)} frames"]
-    words.append(score_text(scores) if scores else f"in {chain.unit}")
-    others = " ".join(
-        f"{a} to {b}" if other == name else f'<a href="{other}">{a} to {b}</a>'
-        for other, (a, b) in names.items()
-    )
-    top = headline(drawn_line(chain.certainty, "all images"), words)
-    parts = {
-        "summary": top + f"<br>frames {others}" * (len(names) > 1),
-        "Paths": path_table(shown),
-        "Links between pairs": table(links[0], links[1:]) if links else "",
-        "Verdict": preformatted(chain_lines(shown)),
-    }
-    return page(shown, parts)

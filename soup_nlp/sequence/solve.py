@@ -2,45 +2,35 @@
 
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Unpack
 
 import numpy as np
 
-from soup_nlp.config.problem import Problem, make_problem, title
+from soup_nlp.config.problem import Problem, title
 from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
 from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.pipeline.run import ProblemKeys, sections
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import write_png
 from soup_nlp.report.pairs import PAIRS, ROWS, fitting, head, kept_rows, needed_bytes, solve_into
-from soup_nlp.sequence.folder import (
-    CHAIN,
-    SINGLE,
-    chain_files,
-    pair_folder,
-    read_pairs,
-    write_chain,
-)
+from soup_nlp.sequence.folder import CHAIN, SINGLE, chain_files, read_pairs, write_chain
 from soup_nlp.sequence.frames import (
     DEPTHS,
     FLOWS,
-    MAX_STEP,
-    PROBED,
     Frames,
     Raw,
-    check_sequence,
     check_sizes,
     find_depths,
     find_images,
     is_video,
-    key_frames,
     numbered_files,
     video_frames,
 )
@@ -62,8 +52,8 @@ FILES = {
     ("depth_prior", "source"): DEPTHS,
 }
 """Keys that may name a folder with a file for each pair, and the suffixes of these."""
-AUTO = "auto"
-"""Stride that is chosen by parallax."""
+PROBED = 3
+"""Number of pairs whose flow measures a focal length that is not known."""
 
 Source = str | Path | Sequence[ImageLike]
 """Folder or pattern of images, video, scene:NAME, or a list of files, arrays or PIL images."""
@@ -77,12 +67,11 @@ def solve_chain(
     intrinsics: Sequence[float] | str | None = None,
     fov: float | None = None,
     undistort: bool = False,
-    stride: int | str = 1,
+    stride: int = 1,
     depth_scale: float | None = None,
     overrides: Sequence[str] = (),
     workers: int = 1,
     overwrite: bool = False,
-    begin: Callable[[Frames, int], None] | None = None,
     say: Say | None = None,
     **keys: Unpack[ProblemKeys],
 ) -> Chain:
@@ -98,12 +87,11 @@ def solve_chain(
             EXIF, or a guess.
         fov: Horizontal field of view, degrees.
         undistort: Remove the distortion that the file of the camera holds.
-        stride: Take every so many frames; "auto" takes those with enough parallax.
+        stride: Take every so many frames.
         depth_scale: Values per unit of length of true depth_*.png beside frame_*.
         overrides: Keys as on the command line, such as `["segmentation.superpixels=500"]`.
         workers: Processes.
         overwrite: Replace the result of another sequence.
-        begin: Called with the frames and the number of pairs before the first is solved.
         say: Called with (done, total, row) after every pair.
         keys: Those of `solve_pair`: `preset`, `seed`, `max_size`, and sections such as
             `segmentation={"superpixels": 500}`. `source` and `backward` of `flow`, and `source` of
@@ -124,26 +112,25 @@ def solve_chain(
     values = intrinsics if isinstance(intrinsics, str | None) else [*intrinsics]
     raw: Raw = {"undistort": undistort or None, "fov": fov, "intrinsics": values}
     camera = {key: value for key, value in raw.items() if value is not None}
-    step = _step(stride)
+    if not isinstance(stride, int) or stride < 1:
+        raise ConfigError("unknown stride", found=stride, expected="a number from 1")
     # frames of a video, or of arrays, are written before their number is known
     claim(folder, SINGLE, overwrite, subject)
     # every solve gives the warnings of its images
     with warnings.catch_warnings(action="ignore", category=DataWarning):
-        chosen = _frames(source, folder, camera, step, frames, depth_scale)
+        chosen = _frames(source, folder, camera, stride, frames, depth_scale)
     common = sections(keys, "chain")
     for section, defaults in OF_PAIRS.items():
         common[section] = {**defaults, **common.get(section, {})}
-    chosen = replace(chosen, files=_files_of_pairs(common, len(chosen) - 1, step))
-    options = Options(common, tuple(overrides))
-    # a wrong key or scene is found before the first pair is solved
-    options.problem(chosen, 0)
     count = len(chosen)
+    files = _files_of_pairs(common, count - 1, stride)
+    chosen = replace(chosen, files=files, keys=common, overrides=overrides)
+    # a wrong key or scene is found before the first pair is solved
+    chosen.problem(0)
     # nothing is called so, but no file or link of the user may be in its way
     claim(folder, [*chain_files(count), f"{PAIRS}/-"], overwrite, subject, ROWS)
-    if begin:
-        begin(chosen, count - 1)
-    chosen = one_camera(chosen, options)
-    problems = {pair_folder(Path(), k).name: options.problem(chosen, k) for k in range(count - 1)}
+    chosen = one_camera(chosen)
+    problems = {one.name: one for one in map(chosen.problem, range(count - 1))}
     # a pair that is solved otherwise ends the chain that it was part of
     heads = {name: head(problem) for name, problem in problems.items()}
     kept = {name for name, row in kept_rows(folder, heads).items() if not failed(row)}
@@ -158,13 +145,13 @@ def solve_chain(
     with staged(folder, whole=stale, overwrite=overwrite, subject=subject):
         # from here on, the folder is this chain's
         pass
-    solve_pairs(problems, folder, workers, say, heads)
+    solve_pairs(problems, heads, folder, workers, say)
     chain = make_chain(read_pairs(folder, count - 1))
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
         return write_chain(new, chain, name, chosen.names)
 
 
-def _files_of_pairs(keys: Raw, count: int, step: int | None) -> dict[tuple[str, str], list[Path]]:
+def _files_of_pairs(keys: Raw, count: int, stride: int) -> dict[tuple[str, str], list[Path]]:
     """Files of every pair, by section and key of the problem that name their folder or pattern.
 
     Raises:
@@ -177,7 +164,7 @@ def _files_of_pairs(keys: Raw, count: int, step: int | None) -> dict[tuple[str, 
         if not isinstance(name, str | Path) or not ("*" in str(name) or is_folder(name)):
             continue
         found = numbered_files(Path(name), kinds, f"{section}.{key}")
-        if step != 1:
+        if stride != 1:
             raise ConfigError("files of pairs need all frames", where="stride", expected="1")
         if len(found) < count:
             expected = f"one for each of {count} pairs"
@@ -186,39 +173,25 @@ def _files_of_pairs(keys: Raw, count: int, step: int | None) -> dict[tuple[str, 
     return out
 
 
-@dataclass(frozen=True)
-class Options:
-    """Keys of the problems of all pairs: sections as in a file, and overrides of these."""
-
-    keys: Raw = field(default_factory=dict)
-    overrides: tuple[str, ...] = ()
-
-    def problem(self, frames: Frames, k: int) -> Problem:
-        """The problem of two frames that follow each other."""
-        raw = {"name": pair_folder(Path(), k).name, **frames.problem(k, self.keys)}
-        return make_problem(raw, self.overrides, where="sequence")
-
-
 def solve_pairs(
     problems: Mapping[str, Problem],
+    heads: Mapping[str, Row],
     folder: Path,
     workers: int = 1,
     say: Say | None = None,
-    heads: Mapping[str, Row] | None = None,
 ) -> None:
     """Solve pairs in parallel processes into `pairs/000_001/` ...; those that are kept are not.
 
     Args:
         problems: Problems of the pairs, by the name of their folder.
+        heads: `head` of every problem.
         folder: Output folder.
         workers: Number of processes; fewer run where their memory would not suffice.
         say: Called with (done, total, row) after every solve.
-        heads: `head` of every problem, where it is known.
 
     Raises:
         SolverError: a pair cannot be solved.
     """
-    heads = heads or {name: head(problem) for name, problem in problems.items()}
     done = {k: row for k, row in kept_rows(folder, heads).items() if not failed(row)}
     todo = {
         name: partial(solve_into, problem, folder.resolve())
@@ -246,36 +219,27 @@ def solve_pairs(
         )
 
 
-def one_camera(frames: Frames, options: Options) -> Frames:
+def one_camera(frames: Frames) -> Frames:
     """The frames with one focal length for all, where it is only a guess.
 
-    The flows of up to `PROBED` pairs across the sequence are independent measurements of its
-    logarithm, each with the deviation of the guess as its prior. A known camera is left as it is,
-    and a pair that cannot be started is left out.
+    It is the surest of those that the flows of up to `PROBED` pairs across the sequence suggest. A
+    pair that cannot be started is left out.
     """
     if frames.scene is not None or frames.camera.keys() & {"intrinsics", "fov"}:
         return frames
+    pairs, last = list[Pair](), len(frames) - 2
     # every solve gives the warnings of its images
     with warnings.catch_warnings(action="ignore", category=DataWarning):
-        first = options.problem(frames, 0).load_pair()
-        if not first.focal_sigma > 0:
+        if not frames.problem(0).load_pair().focal_sigma > 0:
             return frames
-        last = len(frames) - 2
-        pairs = []
-        for k in np.unique(np.linspace(0, last, min(last + 1, PROBED)).astype(int)):
+        for k in sorted({*np.linspace(0, last, PROBED).astype(int)}):
             with suppress(SoupError):
-                pairs.append(observed_pair(options.problem(frames, int(k))))
+                pairs.append(observed_pair(frames.problem(int(k))))
     if not pairs:
         return frames
-    guess = first.K_ref[0, 0] / first.size[1]
-    factor = np.array([pair.K_ref[0, 0] / pair.size[1] / guess for pair in pairs])
-    sigmas = np.array([pair.focal_sigma for pair in pairs])
-    prior = first.focal_sigma**-2
-    total = prior + float(np.sum(sigmas**-2 - prior))
-    focal = first.K_ref[0, 0] * float(np.exp(sigmas**-2 @ np.log(factor) / total))
-    # distortion is an error of all pairs: together they are no more certain than the best one
-    sigma = float(sigmas.min())
-    fov = float(np.degrees(2 * np.arctan(first.size[1] / (2 * focal))))
+    surest = min(pairs, key=lambda pair: pair.focal_sigma)
+    focal, sigma = surest.K_ref[0, 0], surest.focal_sigma
+    fov = float(np.degrees(2 * np.arctan(surest.size[1] / (2 * focal))))
     warnings.warn(
         f"{frames.names[0]}: no intrinsics; focal length of all frames by the flow {focal:.0f} px"
         f" ({fov:.0f} degrees of view horizontally), right to {sigma:.0%}",
@@ -303,52 +267,32 @@ def named(frames: Source, folder: Path | None = None) -> tuple[str, str]:
     return title(path.stem if path.is_file() else path.name), f"sequence {path}"
 
 
-def _step(stride: int | str) -> int | None:
-    """The stride as a number; None if parallax decides.
-
-    Raises:
-        ConfigError: it is neither a positive number nor AUTO.
-    """
-    if stride == AUTO:
-        return None
-    text = str(stride)
-    # limits the number of digits
-    if not text.isdecimal() or len(text) > 8 or int(text) < 1:
-        raise ConfigError(
-            "unknown stride", where="stride", found=stride, expected=f"a number from 1, or {AUTO}"
-        )
-    return int(text)
-
-
 def _frames(
     source: Source,
     out: Path,
     camera: Raw,
-    step: int | None,
+    stride: int,
     most: int | None,
     depth_scale: float | None,
 ) -> Frames:
-    """The frames of a source; `step` None takes those with enough parallax."""
+    """The frames of a source."""
     if isinstance(source, str) and source.startswith(SCENE):
-        if step != 1 or camera:
+        if stride != 1 or camera:
             raise ConfigError("a rendered scene has its own camera and steps", found=source)
         scene = source.removeprefix(SCENE)
         return Frames(tuple(f"{scene}: frame {k}" for k in range(most or 10)), scene=scene)
-    depths, in_folder = list[Path](), False
-    # with AUTO the limit applies to the chosen frames
-    end = most if step else None
+    depths = list[Path]()
     if not isinstance(source, str | Path):
-        images = _files(source, out)[:: step or 1][:end]
+        images = _files(source, out)[::stride][:most]
     elif is_video(path := as_path(source, "frames", home=True)):
-        read = None if most is None or step else most * MAX_STEP
-        images = video_frames(path, out / "frames", step or 1, end or read)
+        images = video_frames(path, out / "frames", stride, most)
     else:
-        images, in_folder = find_images(path)[:: step or 1][:end], True
+        images = find_images(path)[::stride][:most]
         depths = [] if "undistort" in camera else find_depths(images)
     if len(images) < 2:
         raise ConfigError(
             "a sequence needs two frames at least",
-            where="stride" if step != 1 else None,
+            where="stride" if stride != 1 else None,
             found=len(images),
             expected="more frames, or a smaller stride",
         )
@@ -356,16 +300,8 @@ def _frames(
     beside = images[0].parent / "K.txt"
     if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
         camera = {"intrinsics": str(beside), **camera}
-    frames = Frames(tuple(map(str, images)), camera, depths, depth_scale)
     check_sizes(images, turn="intrinsics" not in camera)
-    if in_folder:
-        check_sequence(images)
-    if step:
-        return frames
-    first = make_problem({"input": frames.pair(0)}, where="sequence").load_pair()
-    keep = key_frames(images, first.K_ref, most)
-    kept = tuple(frames.names[k] for k in keep)
-    return replace(frames, names=kept, depths=[depths[k] for k in keep] if depths else [])
+    return Frames(tuple(map(str, images)), camera, depths, depth_scale)
 
 
 def _files(frames: Sequence[ImageLike], folder: Path) -> list[Path]:

@@ -23,8 +23,8 @@ SMALL = sets(
 )
 FILES = [
     "config.yaml", "result.h5", "summary.json", "log.txt", "ipopt.log", "depth_ref.png",
-    "depth_next.png", "depth_ref_colour.png", "depth_next_colour.png", "overview.png",
-    "motions.json", "trajectory.tum", "report.html", "points_ref.ply", "points_next.ply",
+    "depth_next.png", "depth_ref_colour.png", "overview.png",
+    "trajectory.tum", "report.html", "points_ref.ply", "points_next.ply",
 ]  # fmt: skip
 
 

@@ -69,7 +69,7 @@ def test_a_folder_of_inputs_is_no_output_folder(tmp_path, capsys):
     args = foreign(tmp_path / "pair")
     before = sorted(tmp_path.rglob("*"))
     assert main([*args, "--out", str(tmp_path / "pair")]) == 2
-    assert "input's folder" in capsys.readouterr().err
+    assert "an input lies in the output folder" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -77,7 +77,7 @@ def test_an_input_in_a_result_folder_is_not_overwritten(solved, tmp_path, capsys
     args, out = solved[0], shutil.copytree(solved[1], tmp_path / "out")
     flow = ["--flow", str(out / "overview.png")]
     assert main([*args, "--out", str(out), *flow]) == 2
-    assert "an input would be overwritten" in capsys.readouterr().err
+    assert "found: overview.png" in capsys.readouterr().err
 
 
 def test_a_result_folder_is_an_output_but_no_input(solved, tmp_path, capsys):

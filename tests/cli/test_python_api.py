@@ -1,6 +1,5 @@
 """Python has what the command line has: cameras, images, progress, scores, stored results."""
 
-import json
 import pickle
 import shutil
 import warnings
@@ -38,7 +37,7 @@ def run() -> soup_nlp.Run:
 def saved(run, tmp_path_factory) -> tuple[Path, list[str]]:
     """The folder that the run makes of itself, and the names of its files."""
     out = tmp_path_factory.mktemp("saved") / "out"
-    return out, run.save(out, formats=["npy", "motions"])
+    return out, run.save(out, formats=["npy", "tum"])
 
 
 def test_float_and_channels_first_images_are_the_same():
@@ -201,17 +200,17 @@ def test_a_run_prints_itself_in_five_lines(run):
 def test_a_run_saves_itself_and_is_converted(run, saved, tmp_path, capsys):
     out, other = shutil.copytree(saved[0], tmp_path / "out"), tmp_path / "other"
     files = saved[1]
-    assert set(files) >= {"result.h5", "points_ref.ply", "motions.json", "depth_ref.npy"}
+    assert set(files) >= {"result.h5", "points_ref.ply", "trajectory.tum", "depth_ref.npy"}
     assert all((out / name).exists() for name in files)
     assert check_folder(out).ok
-    assert main(["convert", str(out), "--to", "npy,motions, glb,colmap", "-o", str(other)]) == 0
+    assert main(["convert", str(out), "--to", "npy,tum, glb,colmap", "-o", str(other)]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert f"{other / 'mesh_next.glb'}" in printed
     # the folder has the data of the run
-    for name in ("motions.json", "trajectory.tum", "depth_ref.npy", "depth_next.npy"):
+    for name in ("trajectory.tum", "depth_ref.npy", "depth_next.npy"):
         assert (other / name).read_bytes() == (out / name).read_bytes(), name
-    told = json.loads((out / "motions.json").read_text())
-    np.testing.assert_array_equal(told["camera"]["next_from_ref"], run.camera.matrix)
+    position = np.loadtxt(out / "trajectory.tum")[1, 1:4]
+    np.testing.assert_allclose(position, run.camera.centre, atol=1e-8)
     note = out / "colmap" / "notes.txt"
     note.parent.mkdir()
     note.write_text("mine")

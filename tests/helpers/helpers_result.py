@@ -57,8 +57,16 @@ def toy_pairs() -> list[Result]:
     """Two pairs of frames 0, 1, 2; the wall comes nearer by CAMERA, and units differ by 2."""
     first = small_result()
     # seen from frame 1 the scene is the next frame of the first pair
-    depth = first.reconstruction.depth_next
-    second = first.scaled(0.5)
-    rec = replace(second.reconstruction, depth_ref=0.5 * depth)
-    second = replace(second, reconstruction=rec)
-    return [first, second]
+    depth, second = first.depths[1], first.scaled(0.5)
+    known, source = np.isfinite(depth), second.reconstruction.source_next
+    lost = (source < 0) | ~known.ravel()[source]
+    rec = replace(
+        second.reconstruction,
+        depth_ref=0.5 * depth,
+        depth_next=np.where(lost, np.nan, second.depths[1]),
+        labels=first.in_next(first.labels, 0),
+        source_next=np.where(lost, -1, source),
+        sigma_ref=np.where(known, second.sigma, np.nan),
+    )
+    parts = replace(second.components, of_pixel=first.in_next(first.components.of_pixel, 0))
+    return [first, replace(second, reconstruction=rec, components=parts)]

@@ -116,9 +116,7 @@ def option_cases(values: tuple[str, ...] = ODD_VALUES) -> Iterator[Case]:
             # with a valid folder these commands would run to their end
             ends = name in ENDS or word != "--out"
             for value in values if ends else ("", "\x1b[31m", "/dev/full", "x" * 10_000):
-                # --serve 0 takes any free port, and serves until it is stopped
-                if (word, value) != ("--serve", "0"):
-                    yield _option_case(name, word, parameter.name, value)
+                yield _option_case(name, word, parameter.name, value)
 
 
 def _option_case(command: str, word: str, name: str, value: str) -> Case:

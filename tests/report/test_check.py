@@ -162,7 +162,7 @@ def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
     write_folder(prepare_folder(folder), run, "a log\n")
     assert "nlp is Ipopt's answer" not in bad(check_folder(folder))
     with h5py.File(folder / "result.h5", "a") as file:
-        assert file.attrs["delivered"] == b"constrained NLP"
+        assert file.attrs["name"] == b"pair"
         file["answer/n"][0] = file["answer/n"][1]
     assert "nlp is Ipopt's answer" in bad(check_folder(folder))
 

@@ -2,22 +2,25 @@
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers_result import CERTAINTY, small_result
 
 from soup_nlp.cli.main import print_warning
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import strip
-from soup_nlp.report.formats import write_tum
+from soup_nlp.report.formats import FORMATS
 from soup_nlp.report.models import write_ply
-from soup_nlp.report.page import Markup, table
+from soup_nlp.report.page import page
 from soup_nlp.report.pictures import Picture
 from soup_nlp.storage.files import read_json
 
@@ -45,6 +48,12 @@ def test_text_of_a_stored_file_is_one_line(tmp_path: Path) -> None:
         assert text.isprintable()
 
 
+def hostile_summary() -> dict[str, Any]:
+    name = HOSTILE.replace("\ud800", "")
+    told = {"name": name, "status": name, "converged": False, "certainty": CERTAINTY}
+    return {**told, "sources": [name] * 2, "verdict": [name]}
+
+
 def test_text_leaves_no_file_broken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     count = write_ply(tmp_path / "a.ply", np.ones((5, 3)), np.ones((5, 3)), comments=[HOSTILE])
     header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
@@ -52,12 +61,12 @@ def test_text_leaves_no_file_broken(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert len(body) == 5 * (12 + 3)
     assert [line.split()[0] for line in header.decode("ascii").splitlines()].count("comment") == 1
     chain = SimpleNamespace(unit=HOSTILE, world_from_camera=[RigidMotion(np.eye(3), np.zeros(3))])
-    write_tum(tmp_path / "a.tum", chain)
+    FORMATS["tum"].whole["trajectory.tum"](tmp_path / "a.tum", chain)
     lines = (tmp_path / "a.tum").read_text().splitlines()
     assert [line[0] for line in lines] == ["#", "#", "0"]
-    cells = table([HOSTILE], [[HOSTILE, Markup("<i></i>")]])
-    assert "<img" not in cells
-    assert "<i></i>" in cells
+    shown = page(replace(Chain.of(small_result()), summary=hostile_summary()))
+    assert "<img src" not in shown
+    assert "&lt;img src" in shown
     assert strip([Picture("depth", HOSTILE, IMAGE)], HOSTILE).size
     with warnings.catch_warnings():
         print_warning(HOSTILE.replace("\ud800", ""), DataWarning)

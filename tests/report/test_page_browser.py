@@ -8,7 +8,8 @@ import pytest
 import trimesh
 from helpers_chromium import Chromium, find_chromium
 
-from soup_nlp.report.page import MODES, pair_page
+from soup_nlp.report.chain import Chain
+from soup_nlp.report.page import MODES, page
 from soup_nlp.report.result import result_of
 from soup_nlp.report.summary import summary
 
@@ -25,7 +26,7 @@ def opened(small_run, tmp_path_factory):
     """The page of a run, once it is ready."""
     shown = result_of(small_run, {**summary(small_run), "verdict": ["verdict"]})
     path = tmp_path_factory.mktemp("page") / "report.html"
-    path.write_text(pair_page(shown), encoding="utf-8")
+    path.write_text(page(Chain.of(shown)), encoding="utf-8")
     assert CHROMIUM is not None
     chromium = Chromium(CHROMIUM, 1000, 1000)
     chromium.open(path.resolve().as_uri())

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from helpers_result import BOARD, BOARD_Z, CAMERA, WALL_Z, K, board, small_result, toy_pairs
+from helpers_result import BOARD_Z, CAMERA, WALL_Z, K, board, small_result, toy_pairs
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -55,22 +55,30 @@ def test_ply_is_read_by_trimesh(tmp_path, result, frame):
     assert names == ["points_ref.ply", "points_next.ply"]
     path = tmp_path / ("points_ref.ply", "points_next.ply")[frame]
     cloud = trimesh.load(path)
-    keep = result.sure
-    np.testing.assert_allclose(cloud.vertices, result.points[frame][keep], rtol=FLOAT32, atol=1e-6)
-    np.testing.assert_array_equal(cloud.colors[:, :3], result.images[0][keep])
+    seen = Chain.of(result)[frame]
+    keep, rec = seen.sure, result.reconstruction
+    # of the next frame, what it shows of the sure pixels, in the axes of the first camera
+    source = np.arange(60 * 80).reshape(60, 80) if frame == 0 else rec.source_next
+    np.testing.assert_array_equal(keep, (source >= 0) & result.sure.ravel()[source])
+    assert keep.sum() == pytest.approx(result.sure.sum(), rel=0.1)
+    own = (rec.points_ref, CAMERA.inverse(rec.points_next))[frame].reshape(-1, 3)[source[keep]]
+    # a point is in the middle of its pixel: up to a pixel aside at a depth of 4
+    aside = (0, 4 / K[0, 0])[frame]
+    np.testing.assert_allclose(cloud.vertices, own, rtol=FLOAT32, atol=1e-6 + 1.1 * aside)
+    np.testing.assert_array_equal(cloud.colors[:, :3], result.images[frame][keep])
     raw = cloud.metadata["_ply_raw"]["vertex"]["data"]
-    np.testing.assert_array_equal(raw["confidence"], result.flow_confidence[keep])
-    np.testing.assert_array_equal(raw["component"], board()[keep])
-    np.testing.assert_allclose(raw["sigma_log_depth"], result.sigma[keep], rtol=FLOAT32)
-    normals = np.stack([raw[name] for name in ("nx", "ny", "nz")], axis=1)
-    turned = [0, 0, -1.0] @ np.array([np.eye(3), CAMERA.R])[frame].T
+    mine = board().ravel()[source[keep]]
+    np.testing.assert_array_equal(raw["component"], mine)
     np.testing.assert_allclose(
-        normals[~board()[keep]], [turned] * (~board() & keep).sum(), atol=1e-6
+        raw["sigma_log_depth"], result.sigma.ravel()[source[keep]], rtol=FLOAT32
     )
+    normals = np.stack([raw[name] for name in ("nx", "ny", "nz")], axis=1)
+    # the wall does not turn
+    np.testing.assert_allclose(normals[~mine], [[0, 0, -1.0]] * (~mine).sum(), atol=1e-6)
     head = path.read_bytes().split(b"end_header")[0].decode()
     assert "unit: soup unit" in head
     assert "about 10 m" in head
-    assert f"camera of the {('reference', 'next')[frame]} frame, x right, y down, z ahead" in head
+    assert "the first frame's camera, x right, y down, z ahead" in head
 
 
 @pytest.mark.parametrize("frame", [0, 1])
@@ -79,7 +87,7 @@ def test_glb_is_read_by_trimesh(tmp_path, result, frame):
     scene = trimesh.load(tmp_path / ("mesh_ref.glb", "mesh_next.glb")[frame])
     assert scene.metadata["unit"] == result.unit
     (mesh,) = scene.geometry.values()
-    vertices, faces, pixels = surface_mesh(result, frame)
+    vertices, faces, pixels = surface_mesh(Chain.of(result)[frame])
     # glTF: x right, y up, the camera looks along -z
     np.testing.assert_allclose(mesh.vertices, vertices * [1, -1, -1], rtol=FLOAT32, atol=1e-6)
     np.testing.assert_array_equal(mesh.faces, faces)
@@ -87,20 +95,21 @@ def test_glb_is_read_by_trimesh(tmp_path, result, frame):
     top_left = np.argmin(pixels.sum(axis=1))
     assert mesh.vertices[top_left, 0] < 0 < mesh.vertices[top_left, 1]
     # counter-clockwise from the camera: normals towards it
-    assert (np.sum(mesh.face_normals * mesh.triangles_center, axis=1) < 0).all()
+    eye = Chain.of(result)[frame].pose.t * [1, -1, -1]
+    assert (np.sum(mesh.face_normals * (mesh.triangles_center - eye), axis=1) < 0).all()
     # every vertex has the colour of its pixel; the gradient is 4 levels a pixel, JPEG a few
     colour = mesh.visual.material.baseColorTexture.convert("RGB")
     texture = np.asarray(colour, float)
     at = mesh.visual.uv * [80, -60] + [0, 60] - 0.5
     u, v = np.rint(at).astype(int).T
     np.testing.assert_allclose(np.stack([u, v], 1), pixels)
-    gap = np.abs(texture[v, u] - result.images[0][v, u])
+    gap = np.abs(texture[v, u] - result.images[frame][v, u])
     assert np.median(gap) < 5
     assert gap.max() < 40
 
 
 def test_meshes_have_no_curtains(result):
-    vertices, faces, _ = surface_mesh(result, 0)
+    vertices, faces, _ = surface_mesh(Chain.of(result)[0])
     depth = vertices[:, 2][faces]
     np.testing.assert_allclose(depth, depth[:, :1].repeat(3, axis=1))
     np.testing.assert_allclose(np.unique(depth.round(9)), [BOARD_Z, WALL_Z])
@@ -110,7 +119,7 @@ def test_meshes_have_no_curtains(result):
 
 def test_large_meshes_are_thinned(result, monkeypatch):
     monkeypatch.setattr("soup_nlp.report.models.CELLS", 60 * 80 // 4)
-    vertices, faces, pixels = surface_mesh(result, 0)
+    vertices, faces, pixels = surface_mesh(Chain.of(result)[0])
     assert not (pixels % 2).any()
     assert 0.7 * 60 * 80 / 2 < len(faces) < 60 * 80 / 2
     np.testing.assert_allclose(np.unique(vertices[:, 2].round(9)), [BOARD_Z, WALL_Z])
@@ -177,20 +186,9 @@ def test_recordings_are_read_by_rerun(tmp_path, result):
     assert [rows.get(f"/world/{name}") for name in both] == [2] * 4
 
 
-def test_motions_and_trajectory(tmp_path, result):
-    write_formats(tmp_path, Chain.of(result), ["motions"])
-    told = json.loads((tmp_path / "motions.json").read_text())
-    np.testing.assert_allclose(told["camera"]["next_from_ref"], CAMERA.matrix, atol=1e-9)
-    np.testing.assert_allclose(told["camera"]["position_in_ref"], CAMERA.centre, atol=1e-9)
-    background, own = told["components"]
-    assert background["background"]
-    assert not own["background"]
-    np.testing.assert_allclose(own["next_from_ref"], BOARD.matrix, atol=1e-9)
-    np.testing.assert_allclose(CAMERA.matrix @ own["own_motion"]["matrix"], BOARD.matrix, atol=1e-9)
-    turn = np.radians(own["rotation_deg"])
-    np.testing.assert_allclose(Rotation.from_rotvec(turn).as_matrix(), BOARD.R, atol=1e-9)
-    assert "soup unit" in told["unit"]
-    # the trajectory holds ref_from_camera
+def test_the_trajectory_of_a_pair(tmp_path, result):
+    assert write_formats(tmp_path, Chain.of(result), ["tum"]) == ["trajectory.tum"]
+    # it holds ref_from_camera
     first, second = np.loadtxt(tmp_path / "trajectory.tum")
     np.testing.assert_allclose(first, [0, 0, 0, 0, 0, 0, 0, 1])
     np.testing.assert_allclose(second[1:4], CAMERA.centre, atol=1e-8)
@@ -206,7 +204,7 @@ def test_masks_flow_cameras_and_poses_are_plain_files(tmp_path, result):
         assert labels.dtype == moving.dtype == np.uint8
         np.testing.assert_array_equal(moving, 255 * (labels > 0))
         assert (moving > 0).mean() == pytest.approx(share or board().mean(), rel=0.3 * (not share))
-    uv = cv2.readOpticalFlow(str(tmp_path / "flow.flo"))
+    uv = cv2.readOpticalFlow(str(tmp_path / "flow_ref.flo"))
     np.testing.assert_array_equal(uv, result.flow.astype(np.float32))
     np.testing.assert_array_equal(np.loadtxt(tmp_path / "K.txt"), K)
     np.testing.assert_array_equal(np.load(tmp_path / "sigma_ref.npy"), np.float32(result.sigma))
@@ -221,7 +219,9 @@ MASKS = "components", "moving"
 def test_transforms_project_points_where_the_cameras_see_them(tmp_path, result):
     write_formats(tmp_path, Chain.of(result), ["transforms"])
     told = json.loads((tmp_path / "transforms" / "transforms.json").read_text())
-    point = np.array([*result.points[0][30, 10] * [1, -1, -1], 1])  # on the wall, y up
+    point = np.array(
+        [*result.reconstruction.points_ref[30, 10] * [1, -1, -1], 1]
+    )  # on the wall, y up
     where = [np.array([10, 30]), np.array([10, 30]) + result.reconstruction.flow[30, 10]]
     for frame, at in zip(told["frames"], where, strict=True):
         x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ point

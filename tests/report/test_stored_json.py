@@ -16,11 +16,11 @@ from soup_nlp.errors import DataError, SoupError
 from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.report.page import page
 from soup_nlp.report.result import load
 from soup_nlp.report.summary import Summary
 from soup_nlp.sequence.folder import Contents, renew_page, write_chain
 from soup_nlp.sequence.links import make_chain
-from soup_nlp.sequence.score import chain_lines, chain_page
 from soup_nlp.storage.files import read_json
 
 pytestmark = pytest.mark.slow
@@ -51,13 +51,7 @@ def test_every_entry_of_a_chain(tmp_path):
     write_chain(tmp_path, chain, "toy", ["a.png", "b.png", "c.png"])
     path = tmp_path / "chain.json"
     tree, accepted = json.loads(path.read_text()), 0
-    tree["score"] = {
-        **{"scale": 2.0, "mre_own_scale": 0.1, "mre_one_scale": 0.1, "cost": 0.0},
-        **{
-            "links": [{"pairs": [0, 1], "true": 2.0}],
-            "path": dict.fromkeys(("share", "ate", "rpe", "rpe_degrees"), 0.1),
-        },
-    }
+    tree["score"] = {"scale": 2.0, "mre_one_scale": 0.1}
     for _, root in changes(tree):
         path.write_text(json.dumps(root))
         try:
@@ -66,9 +60,8 @@ def test_every_entry_of_a_chain(tmp_path):
             continue
         accepted += 1
         chain = replace(chain, summary=contents)
-        assert chain_lines(chain)
         if accepted % 20 == 0:
-            assert chain_page(chain)
+            assert page(chain)
     assert accepted > 20
 
 
