@@ -56,9 +56,11 @@ def certainty_lines(shares: Mapping[str, float], of: str = "the image") -> list[
     """A sentence for every kind of depth that is worth a mention; `shares` by `certainty`."""
     lines = []
     for kind, words in SAID.items():
-        half = f", half of it to {shares['median_sigma']:.1%} (1 sigma)" * (kind == "measured")
         if shares[kind] >= LEAST:
-            lines.append(f"{shares[kind]:.0%} of {of} is {words}{half}")
+            lines.append(f"{shares[kind]:.0%} of {of} is {words}")
+            # null in a stored result where nothing is measured
+            if kind == "measured":
+                lines[-1] += f", half of it to {shares['median_sigma']:.1%} (1 sigma)"
     return lines
 
 
