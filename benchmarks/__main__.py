@@ -23,7 +23,7 @@ from benchmarks.family.instances import (
 )
 from benchmarks.family.write import check_sol, family_tasks, write_family
 from benchmarks.scores import measure_pair
-from benchmarks.sigma import measure_terms, sigma_page
+from benchmarks.sigma import measure_terms, write_sigma
 from benchmarks.solvers import write_results
 from benchmarks.suites import SUITES, Options, list_suite
 from benchmarks.table import Cell, measure
@@ -117,7 +117,7 @@ def sigma(
     wanted = Options(("dis",), width, (0,), tuple(only or ()))
     cells = [c for own in cells_of(suite, data, wanted, overrides).values() for c in own]
     frame = measure(cells, measure_terms, out / "sigma.jsonl", workers)
-    return finish(out / "sigma.md", frame, sigma_page(frame))
+    return finish(out / "sigma.md", frame, write_sigma(out / "sigma.md", frame))
 
 
 @app.command()

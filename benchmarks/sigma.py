@@ -1,15 +1,16 @@
 """The factors of sigma: fitted to the errors of solved pairs, families left out in turn."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from scipy.optimize import minimize
 
-from benchmarks.scores import solved
-from benchmarks.table import Cell, markdown
+from benchmarks.scores import sigma_scores, solved
+from benchmarks.table import Cell, markdown, panels, provenance, save
 from soup_nlp.arrays import Float
-from soup_nlp.evaluation.confidence import DRAWN, PRIOR, SHARES, with_prior
+from soup_nlp.evaluation.confidence import FACTORS, LARGEST, sigma_of
 from soup_nlp.evaluation.scoring import at_truth
 from soup_nlp.storage.each import Row
 
@@ -20,34 +21,25 @@ HEAVY = 4.0
 would widen all of sigma."""
 PULL = 1e-3
 """Loss by the squared change of the logarithm of a factor."""
-FACTORS = {**SHARES, "drawn": DRAWN, "prior": PRIOR}
-"""Today's constants of sigma, by name."""
+SCORES = ("nll", "flat", "within1", "within2", "sure_wrong", "right_unsure", "ause")
+"""Scores of sigma in the table of families, see `benchmarks.scores.sigma_scores`."""
 
 
 def measure_terms(cell: Cell) -> Row:
     """Errors of log depth after the median scale, and terms of sigma, at pixels of one pair."""
     run = solved(cell)
-    truth, sure = run.pair.truth, run.confidence
+    truth = run.pair.truth
     assert truth is not None
     z, gt = at_truth(truth, run.reconstruction.depth_ref)
     at = np.flatnonzero((np.isfinite(gt) & np.isfinite(z) & (gt > 0) & (z > 0)).ravel())
     at = np.random.default_rng(0).permutation(at)[:PIXELS]
     z, gt = z.ravel()[at], gt.ravel()[at]
-    maps = {name: term / SHARES[name] for name, term in sure.terms.items()}
-    maps["drawn"] = (sure.sigma == DRAWN).astype(float)
-    terms = {name: at_truth(truth, value)[0].ravel()[at] for name, value in maps.items()}
+    terms = {name: at_truth(truth, v)[0].ravel()[at] for name, v in run.confidence.terms.items()}
     error = np.log(z * np.median(gt / z) / gt)
     return {
         "error": np.round(error, 5).tolist(),
-        "terms": {name: np.round(np.minimum(v, 1e4), 5).tolist() for name, v in terms.items()},
+        "terms": {name: np.round(np.minimum(v, LARGEST), 5).tolist() for name, v in terms.items()},
     }
-
-
-def sigma_of(terms: Mapping[str, Float], factor: Mapping[str, float]) -> Float:
-    """Sigma by terms and factors, as `soup_nlp.evaluation.confidence` adds them up."""
-    squares = np.sum([(factor[name] * terms[name]) ** 2 for name in SHARES], axis=0)
-    known = with_prior(np.sqrt(squares), factor["prior"])
-    return np.where(terms["drawn"] > 0, factor["drawn"], known)
 
 
 def loss(error: Float, sigma: Float) -> float:
@@ -63,8 +55,9 @@ Pairs = dict[str, list[tuple[Float, dict[str, Float]]]]
 def pairs_of(frame: pd.DataFrame) -> Pairs:
     """Errors and terms of the rows that were measured, by family."""
     out: Pairs = {}
+    columns = [column for column in frame if column.startswith("terms.")]
     for _, row in frame[frame["ok"].eq(True)].iterrows():
-        terms = {name: np.array(row[f"terms.{name}"]) for name in (*SHARES, "drawn")}
+        terms = {name.removeprefix("terms."): np.array(row[name]) for name in columns}
         out.setdefault(row["family"], []).append((np.array(row["error"]), terms))
     return out
 
@@ -89,16 +82,59 @@ def fitted(pairs: Pairs) -> dict[str, float]:
     return dict(zip(names, np.exp(best.x).tolist(), strict=True))
 
 
-def sigma_page(frame: pd.DataFrame) -> str:
-    """Today's factors, those of all families, and those with each left out with its loss."""
+def family_scores(pairs: Pairs, factors: Mapping[str, Mapping[str, float]]) -> list[Row]:
+    """Mean scores of sigma by family, each with its own factors."""
+    rows = []
+    for family, own in pairs.items():
+        scores = [sigma_scores(e, sigma_of(t, factors[family])) for e, t in own]
+        tenths = np.mean([s["reliability"] for s in scores], axis=0).tolist()
+        table = pd.DataFrame(scores)[list(SCORES)].astype(float).mean()
+        rows.append({"family": family, **table, "reliability": tenths})
+    return rows
+
+
+def write_sigma(page: Path, frame: pd.DataFrame) -> str:
+    """The page of the fit; its picture is written beside it.
+
+    It has today's factors, those of all families and the range of those with a family left out, and
+    scores by family with today's factors and with those of all other families.
+    """
     pairs = pairs_of(frame)
     every = fitted(pairs)
-    rows = {"today": {**FACTORS, "loss": mean_loss(pairs, FACTORS)}}
-    rows["all families"] = {**every, "loss": mean_loss(pairs, every)}
-    for family in pairs if len(pairs) > 1 else ():
-        others = fitted({name: p for name, p in pairs.items() if name != family})
-        alone = {family: pairs[family]}
-        now = {"loss of it": mean_loss(alone, others), "by today's": mean_loss(alone, FACTORS)}
-        rows[f"without {family}"] = {**others, **now}
-    table = pd.DataFrame(rows).T.rename_axis("fit")
-    return f"# Factors of sigma\n\n{markdown(table, '.3f')}\n"
+    others = {
+        left: fitted({name: p for name, p in pairs.items() if name != left or len(pairs) == 1})
+        for left in pairs
+    }
+    fits = pd.DataFrame({"today": FACTORS, "all families": every})
+    fits["least"], fits["most"] = (pd.DataFrame(others).agg(how, axis=1) for how in ("min", "max"))
+    before = family_scores(pairs, dict.fromkeys(pairs, FACTORS))
+    after = family_scores(pairs, others)
+    plot_reliability(page.with_suffix(".png"), {"today": before, "of the other families": after})
+    blocks = [
+        "# Factors of sigma",
+        f"{sum(map(len, pairs.values()))} pairs of {len(pairs)} families; {provenance(frame)}. Loss"
+        f" of today's factors {mean_loss(pairs, FACTORS):.4f}, of those of all families"
+        f" {mean_loss(pairs, every):.4f}. Least and most: with one family left out.",
+        markdown(fits.rename_axis("factor"), ".3f"),
+    ]
+    for title, rows in (("today's factors", before), ("factors of the other families", after)):
+        table = pd.DataFrame(rows).set_index("family")[list(SCORES)]
+        table.loc["mean"] = table.mean()
+        blocks += [f"## By {title}", markdown(table, ".3f")]
+    blocks.append(f"![Reliability of sigma by family]({page.stem}.png)")
+    return "\n\n".join(blocks) + "\n"
+
+
+def plot_reliability(path: Path, sides: Mapping[str, list[Row]]) -> None:
+    """Root mean square error of log depth by sigma, a curve for every family, in two panels."""
+    out, axes = panels(1, len(sides), 5.0, 5.0, sharey=True)
+    for ax, (title, rows) in zip(axes.flat, sides.items(), strict=True):
+        for k, row in enumerate(rows):
+            sigma, error = np.array(row["reliability"]).T
+            style = ("-", "--", ":")[k // 10 % 3]
+            ax.loglog(sigma, np.maximum(error, 1e-4), style, lw=1, label=row["family"])
+        ax.plot((0.003, 2), (0.003, 2), color="black", lw=0.8)
+        ax.set(xlim=(0.003, 2), ylim=(0.001, 3), xlabel="sigma", title=f"factors: {title}")
+    axes[0, 0].set_ylabel("RMS error of log depth")
+    axes[0, -1].legend(fontsize=5, ncols=2)
+    save(out, path)

@@ -1,7 +1,7 @@
 """Uncertainty of depth: marginal variances of the whole assembly, and what they cannot know.
 
 See docs/confidence.md. All standard deviations are of log depth, the global scale left out. The
-constants are fitted by `python -m benchmarks sigma`, which leaves out one family after the other.
+factors are fitted by `python -m benchmarks sigma`, which leaves out one family after the other.
 """
 
 import logging
@@ -28,7 +28,7 @@ from soup_nlp.start.scales import displacement, log_pace
 
 log = logging.getLogger(__name__)
 
-SHARES = {
+FACTORS = {
     "flow": 2.5,
     "scale": 1.5,
     "pace": 0.8,
@@ -36,17 +36,18 @@ SHARES = {
     "outline": 0.45,
     "mixed": 0.1,
     "bends": 0.22,
+    "drawn": 0.55,
+    "prior": 1.2,
 }
-"""Factors of the terms of sigma, see `terms`; sigma is the root of the sum of their squares."""
+"""Constants of sigma: factors of the terms, and the standard deviations of log depth of what is
+drawn, and within a scene without any evidence; see `sigma_of`."""
+ADDED = tuple(name for name in FACTORS if name not in ("drawn", "prior"))
+"""Terms whose squares are added up."""
 MISFIT, MOST_MISFIT = 2.0, 5.0
 """Misfits count as this many times as much noise, and the largest misfit of a pixel, pixels: larger
 values carry no information."""
 OUTLINE_REACH = 0.005
 """Distance from a step of depth up to which it counts, relative to the longer side of the image."""
-DRAWN = 0.55
-"""Standard deviation of the drawn depth where the camera rests or only turns."""
-PRIOR = 1.2
-"""Standard deviation of log depth within a scene, without any evidence."""
 PRIOR_SHARE = 0.001
 """Factor of E_prior in the information: it is no evidence, but keeps variances finite where there
 is none."""
@@ -72,7 +73,7 @@ class Confidence:
         marginals: Marginal variances of the planes and of the components' scales.
         component_sigma: (C,) standard deviation of the components' log scale.
         evidence: Evidence of the flow for the depth of every component.
-        terms: (H, W) terms of sigma by the names of `SHARES`, times their factors.
+        terms: (H, W) terms of sigma by name, without their factors, see `terms`.
         kind: (H, W) by what the depth is known, an index of `KINDS`.
     """
 
@@ -122,10 +123,21 @@ def at_outlines(depth: Float) -> Float:
     return np.maximum(2 * extent(reach) - extent(2 * reach), 0.0)
 
 
-def with_prior(sigma: Float, prior: Float | float = PRIOR) -> Float:
+def with_prior(sigma: Float, prior: Float | float = FACTORS["prior"]) -> Float:
     """Standard deviation s with a prior's information added: `1 / s^2 + 1 / prior^2`."""
     sigma = np.minimum(sigma, LARGEST)
     return np.asarray(sigma / np.hypot(1.0, sigma / prior))
+
+
+def sigma_of(terms: Mapping[str, Float], factor: Mapping[str, float] = FACTORS) -> Float:
+    """Standard deviation of log depth by its terms, see `terms`, and `FACTORS`.
+
+    What is drawn has one number. Elsewhere it is the root of the sum of the squares of the terms
+    times their factors, to which the information of a prior is added.
+    """
+    squares = sum((factor[name] * terms[name]) ** 2 for name in ADDED) + terms["camera"] ** 2
+    known = with_prior(np.sqrt(squares), factor["prior"])
+    return np.where(terms["drawn"] > 0, factor["drawn"], known)
 
 
 def terms(
@@ -137,7 +149,7 @@ def terms(
     component: Float,
     sure: Evidence,
 ) -> dict[str, Float]:
-    """(H, W) terms of the standard deviation of log depth, by the names of `SHARES`, without them.
+    """(H, W) terms of the standard deviation of log depth by name, without their factors.
 
     * flow: `sqrt(noise max(noise, MISFIT misfit)) spread`. The random error of the flow, pixels,
       times the standard deviation by the marginals. The misfit is that of the answer.
@@ -149,7 +161,10 @@ def terms(
     * outline: step of log depth nearby.
     * mixed: `4 p (1 - p)`, p the share of usable flow of the superpixel, at least a half: two
       surfaces may share it.
+    * camera: standard deviation by errors of the camera.
     * bends: 1 where surfaces bend: relief follows from their own stretching, not from parallax.
+    * drawn: 1 where nothing tells the depth: the camera rests or only turns, something stands still
+      in the image, or a surface is taken to bend although its flow jumps (`Start.unexplained`).
 
     Args:
         rec: The answer.
@@ -165,9 +180,10 @@ def terms(
     usable = np.maximum(np.bincount(at, flow.confidence.ravel()) / np.bincount(at), 0.5)
     depth = _log(rec.soup.depth_at(anchor_ray))
     middle = np.asarray(ndimage.median(depth, part, np.arange(int(part.max()) + 1)))
-    gap = np.maximum(np.nan_to_num(sure.gap), noise * SHARES["relief"])
+    gap = np.maximum(np.nan_to_num(sure.gap), noise * FACTORS["relief"])
     pace = np.maximum(log_pace(displacement(rec.soup, anchor_ray, part), part), 0.0)
     other = part != SCENE
+    drawn = start.at_rest | (start.tie == FIXED) | (start.bends & start.unexplained)
     local = np.sqrt(noise * np.maximum(noise, MISFIT * flow_misfit(rec, flow)))
     return {
         "flow": local[labels] * np.minimum(spread, LARGEST),
@@ -176,7 +192,9 @@ def terms(
         "relief": (noise / gap[part] * np.abs(depth - middle[part]))[labels],
         "outline": at_outlines(rec.depth_ref),
         "mixed": (4 * usable * (1 - usable))[labels],
+        "camera": np.minimum(sure.sigma, LARGEST)[labels],
         "bends": start.bends[labels].astype(float),
+        "drawn": drawn[labels].astype(float),
     }
 
 
@@ -210,10 +228,7 @@ def confidence(
 ) -> Confidence:
     """The uncertainty of the depth of an answer.
 
-    Where the camera rests or only turns, where something is fixed in the image, and where a
-    surface is taken to bend although its flow jumps (`Start.unexplained`), sigma is that of
-    what is drawn. Elsewhere the information of all terms and of a prior on the depths of a
-    scene add up; so does that of a depth prior.
+    The information of a depth prior is added to that of `sigma_of`.
 
     Args:
         rec: The answer.
@@ -233,30 +248,26 @@ def confidence(
         spread = spread_in_image(info, variances.plane, labels, pair.K_ref)
     except (ModelError, ArithmeticError) as error:
         # a foreign solver may return an answer without finite information
-        log.warning("no uncertainty can be computed, all depth counts as a guess: %s", error)
+        log.warning("no uncertainty can be computed, all depth counts as drawn: %s", error)
         variances = Marginals(
             np.full((len(rec.soup), 3, 3), np.inf),
             np.full(int(start.component.max()) + 1, np.inf),
         )
         spread = np.full(labels.shape, np.inf)
-    fixed = start.tie == FIXED
-    rigid = ~start.bends & ~fixed & (not start.at_rest)
+    rigid = ~start.bends & (start.tie != FIXED) & (not start.at_rest)
     sure = evidence(rec.soup, data, start.component, start.noise, pair.focal_sigma, rigid)
     component = np.sqrt(variances.component)
     known = terms(rec, pair.flow, start, data.anchor_ray, spread, component, sure)
-    known = {name: SHARES[name] * value for name, value in known.items()}
-    squares = (
-        sum(value**2 for value in known.values()) + np.minimum(sure.sigma, LARGEST)[labels] ** 2
-    )
-    drawn = (start.at_rest | fixed | (start.bends & start.unexplained))[labels]
-    sigma = np.where(drawn, DRAWN, with_prior(np.sqrt(squares)))
+    sigma = sigma_of(known)
     given = np.zeros(len(rec.soup), bool)
     if given_depth is not None:
         # where the depth is that of a prior which no flow confirms, the flow is no evidence
         alone = np.isfinite(given_depth.sigma) & (given_depth.sigma > MOST_SIGMA)
-        sigma = with_prior(np.where(alone[labels], PRIOR, sigma), given_depth.sigma[labels])
+        sigma = with_prior(
+            np.where(alone[labels], FACTORS["prior"], sigma), given_depth.sigma[labels]
+        )
         given = given_depth.from_prior
     # what is as uncertain as a drawing is one
-    nothing = (drawn & ~given[labels]) | (sigma >= DRAWN)
+    nothing = ((known["drawn"] > 0) & ~given[labels]) | (sigma >= FACTORS["drawn"])
     kind = kinds(rec, pair.flow, start, nothing, given)
     return Confidence(sigma, spread, variances, with_prior(component), sure, known, kind)

@@ -4,17 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.chain import chain_page, measure_chain, sequences
-from benchmarks.sigma import FACTORS, HEAVY, fitted, loss, sigma_of
+from benchmarks.sigma import HEAVY, fitted, loss, write_sigma
 from benchmarks.table import Cell, frame_of
-from soup_nlp.evaluation.confidence import SHARES
-
-
-@pytest.mark.slow
-def test_sigma_by_terms_is_that_of_a_run(small_run):
-    sure = small_run.confidence
-    terms = {name: term / SHARES[name] for name, term in sure.terms.items()}
-    terms["drawn"] = np.zeros(sure.sigma.shape)
-    np.testing.assert_allclose(sigma_of(terms, FACTORS), sure.sigma)
+from soup_nlp.evaluation.confidence import ADDED, FACTORS
 
 
 def test_large_errors_count_linearly():
@@ -24,13 +16,43 @@ def test_large_errors_count_linearly():
     assert loss(np.array([2.0]), one) == pytest.approx(2.0)
 
 
+def no_terms(count):
+    return dict.fromkeys((*ADDED, "camera", "drawn"), np.zeros(count))
+
+
+@pytest.mark.slow
 def test_the_fit_finds_the_factor_of_normal_errors():
     rng = np.random.default_rng(0)
-    terms = {name: np.zeros(4000) for name in (*SHARES, "drawn")}
+    terms = no_terms(4000)
     terms["flow"] = np.exp(rng.normal(-4, 0.5, 4000))
     factor = fitted({"family": [(rng.normal(0, 1.0 * terms["flow"]), terms)]})
     assert factor["flow"] == pytest.approx(1.0, rel=0.05)
     assert factor["pace"] == pytest.approx(FACTORS["pace"], rel=0.05)
+
+
+def test_the_page_has_the_scores_of_families_by_the_factors_of_the_others(tmp_path):
+    rng, rows = np.random.default_rng(1), []
+    for family, spread in (("one", 0.1), ("two", 0.2)):
+        terms = no_terms(300)
+        terms["drawn"] = np.ones(300)
+        row = {"error": rng.normal(0, spread, 300).tolist(), "terms": terms}
+        about = {"ok": True, "family": family, "pair": family, "code": "c", "cpu_seconds": 1.0}
+        rows.append({**Cell(sequences(None)[0]).identity(), **about, **row})
+    page = write_sigma(tmp_path / "sigma.md", frame_of(rows))
+    assert (tmp_path / "sigma.png").stat().st_size > 1000
+    today, others = page.split("## By ")[1:]
+    (drawn,) = (line.split("|") for line in page.splitlines() if line.startswith("| drawn"))
+    assert float(drawn[4]) == pytest.approx(0.1, rel=0.2)
+    assert float(drawn[5]) == pytest.approx(0.2, rel=0.2)
+    assert today.startswith("today's factors")
+    # the other family has half of the errors
+    within = {}
+    for line in others.splitlines():
+        if line.startswith(("| one", "| two")):
+            cells = [cell.strip() for cell in line.split("|")]
+            within[cells[1]] = float(cells[4])
+    assert within["one"] > 0.9
+    assert within["two"] < 0.5
 
 
 SMALL = (

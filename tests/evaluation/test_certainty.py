@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soup_nlp.evaluation.confidence import DRAWN, KINDS, PRIOR, confidence, kinds
+from soup_nlp.evaluation.confidence import FACTORS, KINDS, confidence, kinds
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.report.findings import LEAST, ORIGINS, SAID, certainty_lines, drawn_line
 from soup_nlp.report.summary import by_kind, certainty
@@ -66,11 +66,11 @@ def test_before_a_camera_at_rest_all_is_drawn_but_what_is_given(small_run):
 
 def test_what_is_as_uncertain_as_a_drawing_is_one(small_run):
     sure = small_run.confidence
-    assert (sure.kind[sure.sigma >= DRAWN] == KINDS.index("drawn")).all()
+    assert (sure.kind[sure.sigma >= FACTORS["drawn"]] == KINDS.index("drawn")).all()
     alone = dict.fromkeys(("proj", "cont", "orient", "prior"), 0.0)
     blind = replace(small_run, weights=small_run.weights.replace(**alone))
     nothing = sure_of(blind, blind.start)
-    assert np.median(nothing.sigma) == pytest.approx(PRIOR, rel=0.05)
+    assert np.median(nothing.sigma) == pytest.approx(FACTORS["prior"], rel=0.05)
     assert nothing.share("drawn") > 0.95
 
 

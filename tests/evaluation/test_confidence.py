@@ -12,14 +12,14 @@ from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow
 from soup_nlp.evaluation import information as information_module
 from soup_nlp.evaluation.confidence import (
-    DRAWN,
+    ADDED,
+    FACTORS,
     MISFIT,
     MOST_SIGMA,
-    PRIOR,
-    SHARES,
     at_outlines,
     confidence,
     flow_misfit,
+    sigma_of,
     with_prior,
 )
 from soup_nlp.evaluation.information import information, marginals, spread_in_image
@@ -31,6 +31,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.start.components import FIXED, SCENE, TIES
 
 FORM = Formulation()
+PRIOR = FACTORS["prior"]
 
 
 @pytest.fixture(scope="module")
@@ -202,10 +203,13 @@ def sure(small_room):
 
 
 def test_sigma_is_the_root_of_the_squares_of_its_terms(small_room, sure):
-    known = sum(term**2 for term in sure.terms.values())
+    terms = sure.terms
+    assert not any(terms[name].any() for name in ("camera", "bends", "drawn"))
+    known = sum((FACTORS[name] * terms[name]) ** 2 for name in ADDED)
     np.testing.assert_allclose(sure.sigma, with_prior(np.sqrt(known)))
-    assert sure.terms.keys() == SHARES.keys()
-    assert all(np.isfinite(term).all() and term.min() >= 0 for term in sure.terms.values())
+    assert all(np.isfinite(term).all() and term.min() >= 0 for term in terms.values())
+    loose = {**terms, "camera": np.full_like(sure.sigma, 0.3)}
+    np.testing.assert_allclose(sigma_of(loose), with_prior(np.sqrt(known + 0.09)))
 
 
 def test_an_undetermined_superpixel_has_the_sigma_of_the_prior(small_room, sure):
@@ -294,13 +298,13 @@ def test_the_scale_of_what_moves_faster_than_the_scene_is_open(small_room, sure)
     faster = replace(small_room, soup=replace(soup, lam=soup.lam * factor[:, 0]))
     more = sure_of(faster).terms["pace"] - sure.terms["pace"]
     inside = moving[labels]
-    assert more[inside].min() > 0.9 * SHARES["pace"] * np.log(5.0) - sure.terms["pace"].max()
+    assert more[inside].min() > 0.9 * np.log(5.0) - sure.terms["pace"].max()
     np.testing.assert_allclose(more[~inside], 0.0, atol=1e-9)
 
 
 def test_relief_is_less_sure_the_less_of_the_flow_depth_explains(small_room, sure):
     gap = sure.evidence.gap[SCENE]
-    assert gap > SHARES["relief"] * small_room.start.noise
+    assert gap > FACTORS["relief"] * small_room.start.noise
     scene = (small_room.start.component == SCENE)[small_room.segmentation.labels]
     noisy = replace(small_room, start=replace(small_room.start, noise=2 * small_room.start.noise))
     twice = sure_of(noisy).terms["relief"][scene]
@@ -317,14 +321,14 @@ def test_drawn_depth_has_the_sigma_of_what_is_drawn(small_room, change):
     changes = {"rest": {"at_rest": True}, "fixed": {"tie": np.where(part, FIXED, start.tie)}}
     drawn = sure_of(replace(small_room, start=replace(start, **changes[change]))).sigma
     inside = (part | (change == "rest"))[small_room.segmentation.labels]
-    assert (drawn[inside] == DRAWN).all()
-    assert drawn[~inside].size == 0 or (drawn[~inside] != DRAWN).any()
+    assert (drawn[inside] == FACTORS["drawn"]).all()
+    assert drawn[~inside].size == 0 or (drawn[~inside] != FACTORS["drawn"]).any()
 
 
 def test_where_surfaces_bend_nothing_is_surer_than_relief_without_parallax(small_room):
     all_bend = np.ones(len(small_room.soup), bool)
     bends = replace(small_room, start=replace(small_room.start, bends=all_bend))
-    assert sure_of(bends).sigma.min() >= with_prior(SHARES["bends"]) * (1 - 1e-9)
+    assert sure_of(bends).sigma.min() >= with_prior(FACTORS["bends"]) * (1 - 1e-9)
 
 
 def test_an_energy_that_sees_no_plane_leaves_everything_to_the_prior(small_room):
