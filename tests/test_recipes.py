@@ -89,21 +89,16 @@ def test_a_dataset_is_a_section_that_loads_itself(tmp_path):
 
 
 @pytest.fixture
-def run_example(tmp_path, monkeypatch):
-    """Runs the programs of a page, which write networks, in an empty folder."""
+def networks(tmp_path, monkeypatch):
+    """The networks of docs/networks.py in an empty folder."""
     pytest.importorskip("onnx", reason="no onnx")
     pytest.importorskip("onnxruntime", reason="no onnxruntime")
     monkeypatch.chdir(tmp_path)
-
-    def run(page: str) -> None:
-        text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-        exec("".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})
-
-    return run
+    runpy.run_path(str(ROOT / "docs/networks.py"))
 
 
-def test_a_network_is_any_onnx_file(run_example):
-    run_example("networks.md")
+@pytest.mark.usefixtures("networks")
+def test_a_network_is_any_onnx_file():
     rng = np.random.default_rng(0)
     wide = cv2.GaussianBlur(rng.integers(0, 255, (80, 101, 3), dtype=np.uint8), (0, 0), 3)
     pair = Pair(wide[:, 1:], wide[:, :-1], *[intrinsics(90, 90, 50, 40)] * 2)
@@ -114,8 +109,8 @@ def test_a_network_is_any_onnx_file(run_example):
     assert np.median(flow.confidence) > 0.9
 
 
-def test_a_depth_prior_may_be_an_onnx_file(run_example):
-    run_example("networks.md")
+@pytest.mark.usefixtures("networks")
+def test_a_depth_prior_may_be_an_onnx_file():
     image = np.zeros((50, 60, 3), np.uint8)
     pair = Pair(image, image, *[intrinsics(90, 90, 50, 40)] * 2)
     found = PriorOptions(source="ramp.onnx").load(pair, Path).depth_prior

@@ -63,6 +63,8 @@ def run_line(words):
         return main(words[1:])
     if words[:3] == ["python", "-m", "benchmarks"]:
         return benchmarks.main(words[3:])
+    if words[0] == "python":
+        return subprocess.run([sys.executable, ROOT / words[1]], check=False).returncode
     beside = str(Path(sys.executable).parent)
     program = shutil.which(words[0], path=beside) or shutil.which(words[0])
     if program is None:
