@@ -178,8 +178,8 @@ def test_little_to_see_is_a_result(flow, most, images, tmp_path):
         ("chain missing", "nothing matches it"),
         ("chain scene:stret", "did you mean street"),
         ("chain scene:street --set solver.maxiter=3", "did you mean max_iter"),
-        ("check missing", "summary.json is missing"),
-        (f"check {__file__}", "test_cli.py/summary.json"),
+        ("check missing", "the folder missing does not exist"),
+        (f"check {__file__}", "test_cli.py/result.h5"),
     ],
 )
 def test_arguments_that_are_no_pair_and_no_result_are_refused(

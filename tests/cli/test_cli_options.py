@@ -103,7 +103,7 @@ def test_a_result_folder_is_an_output_but_no_input(solved, tmp_path, capsys):
         assert f"delete {SUMS} where no solve has left files" in said
     (out / SUMS).unlink()
     assert main(["solve", str(out / "pair.yaml"), "--out", str(tmp_path / "other")]) == 2
-    assert "found: summary.json of a solve" in capsys.readouterr().err
+    assert "found: result.h5 of a solve" in capsys.readouterr().err
 
 
 def test_images_may_differ_in_size(tmp_path, capsys):

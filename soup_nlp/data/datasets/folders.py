@@ -205,7 +205,8 @@ def _refuse_result(folder: Folder) -> None:
             where=folder.path,
             found=f"{SUMS if marked else 'result.h5'} of a solve",
             expected="a folder with inputs only",
-            hint="move the frames, K.txt and the truth to a folder of their own",
+            hint="move the frames, K.txt and the truth to a folder of their own"
+            + (f"; delete {SUMS} where no solve has left files" if marked else ""),
         )
 
 
