@@ -25,17 +25,18 @@ from soup_nlp.start.views import FlowFit
 
 STANDS, HIDES = 0.4, 0.2
 """Quantiles of the depth ratios along the outline of a component, below it and elsewhere."""
-BELOW_WEIGHT = 3.0
-"""Weight of the contact below a component, relative to the rest of its outline."""
+STRONG = 3.0
+"""Weight of the contact below a component and of the order along an outline, relative to the
+contact of a whole outline."""
 FASTER, SLOWER = 1.5, 0.05
 """Price of a log unit by which a component moves farther or less far than the scene."""
 FREE = 1.0
 """Log units by which a component that stands on something may move farther than the scene."""
 UNDER = 2.0
 """Price of a log unit by which a component lies below the ground."""
-IN_FRONT, COVERS = 0.3, 4.0
-"""Least step of log depth along the outline of what covers something (true steps have medians of
-0.2 to 1.9), and the price of a log unit less."""
+IN_FRONT = 0.3
+"""Least step of log depth along the outline of what covers something: true steps have medians of
+0.2 to 1.9."""
 UNKNOWN = np.log(100.0)
 """If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
 MOST = 6.0
@@ -101,7 +102,7 @@ def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> list[Rows]:
         mine &= (around.component != SCENE) & ~fixed[around.neighbour]
         a, b, length = around.component[mine], around.other[mine], around.contact[mine]
         weight = length / np.bincount(a, length, count)[a]
-        weight = weight * (BELOW_WEIGHT if below else 1.0)
+        weight = weight * (STRONG if below else 1.0)
         share, tie = (STANDS, "contact below") if below else (HIDES, "outline")
         out.append(rows(a, b, ratio[mine], weight * (1 - share), weight * share, tie))
     return out
@@ -138,7 +139,7 @@ def before(flow: FlowFit, soup: Soup, label: Int, order: Float) -> Rows:
     z = soup.depth_across(ends, flow.middle[at])
     length = seg.boundary_length[at].astype(float)
     outline = numbered(front * (int(label.max()) + 1) + back)
-    weight = COVERS * length / np.bincount(outline, length)[outline]
+    weight = STRONG * length / np.bincount(outline, length)[outline]
     return rows(front, back, np.log(z[1] / z[0]) - IN_FRONT, weight, 0.0, "occlusion")
 
 
