@@ -152,6 +152,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
         borrowed=none.astype(bool),
         motion=none,
         component=record.component,
+        part=record.component,
         motions=[],
         surface=record.surface,
         tie=none,

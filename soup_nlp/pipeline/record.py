@@ -149,7 +149,7 @@ class Run(Case):
     def components(self) -> Components:
         """Rigid components with their motions; the first is the static scene."""
         pair, start = self.pair, self.start
-        geometry = self.soup, self.segmentation, start.component, pair.K_ref, pair.K_next
+        geometry = self.soup, self.segmentation, start.part, pair.K_ref, pair.K_next
         return find_components(*geometry, start.borrowed)
 
     @property

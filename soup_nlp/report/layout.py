@@ -77,7 +77,8 @@ start/error               px    N       mean re-projection error
 start/parallax            px    N       displacement that the translation causes
 start/borrowed            1     N       plane or motion from neighbours
 start/motion              1     N       dominant motion, -1 for its own
-start/component           1     N       rigid component: what moves as one
+start/component           1     N       rigid component, which has one scale
+start/part                1     N       what moves as one, also before a camera at rest
 start/surface             1     N       region without a flow discontinuity
 start/tie                 1     N       what gives its component a scale: 0 largest, \
 1 contact below, 2 outline, 3 nothing, 4 fixed in image, 5 given depth, 6 occlusion, \

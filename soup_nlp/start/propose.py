@@ -53,6 +53,8 @@ class Start:
         component: (N,) index of the rigid component, which shares one scale: the superpixels of a
             dominant motion, or a connected piece of superpixels with their own motions. The first
             one is the scene (`SCENE`).
+        part: (N,) group that moves as one: its component; before a camera at rest each piece that
+            moves.
         motions: The motions that superpixels share.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside;
             where a region bends, discontinuities make up most of its outline.
@@ -78,6 +80,7 @@ class Start:
     borrowed: Mask
     motion: Int
     component: Int
+    part: Int
     motions: list[Motion]
     surface: Int
     tie: Int
@@ -112,6 +115,7 @@ class Start:
             borrowed=borrowed,
             motion=zero - 1,
             component=zero,
+            part=zero,
             motions=[],
             surface=zero,
             tie=zero,
@@ -195,6 +199,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         borrowed=weak,
         motion=label,
         component=component,
+        part=component,
         motions=choice.motions,
         surface=surface,
         tie=tie,
@@ -213,9 +218,10 @@ def _ordered(flow: FlowFit, start: Start, part: Int, contrast: Float) -> Start:
     moved = np.abs(scale - 1) > 1e-6
     soup = replace(start.soup, lam=start.soup.lam * scale).normalised()
     tie = np.where(moved, TIES.index("occlusion"), 0)
-    component = numbered(np.where(moved | start.at_rest, part, SCENE))
+    component = numbered(np.where(moved, part, SCENE))
     stays = held(flow, soup, component, tie, order, contrast)
-    return replace(start, soup=soup, tie=tie, component=component, order=stays)
+    part = part if start.at_rest else component
+    return replace(start, soup=soup, tie=tie, component=component, part=part, order=stays)
 
 
 def _scene_first(label: Int, counts: Mask | None = None) -> Int:
