@@ -81,7 +81,7 @@ def test_a_dataset_is_a_section_that_loads_itself(tmp_path):
         "base": str(tmp_path),
         "segmentation": {"superpixels": 12, "neighbours": 4},
     }
-    problem = WiderProblem.make(raw)
+    problem = WiderProblem(**raw)
     assert problem.input_paths()[0] == tmp_path / "pair.npz"
     case = prepare(problem)
     assert case.pair.size == (48, 64)

@@ -57,7 +57,7 @@ def information(
         weights: Constants of the energy.
         form: Visibility; constraints carry no information.
     """
-    whole = majorant(Formulation.make(dict(form)))
+    whole = majorant(Formulation(**dict(form)))
     nlp, layout = build_tangent_nlp(soup, data, weights, whole, "inverse-depth")
     x, theta = nlp.x0, nlp.thetas(eps=SMOOTHING, eps_pixel=SMOOTHING)
     matrix = nlp.hessian(x, np.zeros(nlp.ng), theta=theta).tocsr()

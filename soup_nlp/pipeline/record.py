@@ -66,7 +66,7 @@ class Case:
     def formulation(self, **changes: object) -> Formulation:
         """The formulation and smoothing of the problem, with some fields changed."""
         options, eps = dict(self.problem.formulation), self.options.eps
-        return Formulation.make({**options, "eps": eps, "eps_pixel": eps, **changes})
+        return Formulation(**{**options, "eps": eps, "eps_pixel": eps, **changes})
 
     def nlp(self, form: Formulation) -> tuple[NLP, Layout]:
         """The NLP of a formulation at the case's soup; tangent coordinates are about the start."""

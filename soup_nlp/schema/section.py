@@ -209,12 +209,7 @@ class Section(BaseModel, metaclass=_Checked):
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some values changed, checked again."""
-        return self.make({**dict(self), **changes})
-
-    @classmethod
-    def make(cls, values: Mapping[str, Any]) -> Self:
-        """A record with these values and defaults for the other fields; else a ConfigError."""
-        return cls(**values)
+        return type(self)(**{**dict(self), **changes})
 
     @classmethod
     def help(cls) -> dict[str, str]:

@@ -329,7 +329,7 @@ def test_the_camera_scales_with_the_width_or_height():
 )
 def test_a_scene_that_cannot_be_rendered_is_refused(key, value):
     with pytest.raises(ConfigError, match=key):
-        SceneInput.make({"kind": "scene", "scene": "room", key: value})
+        SceneInput(**{"kind": "scene", "scene": "room", key: value})
 
 
 def test_a_scene_goes_on_where_its_first_pair_ends():
