@@ -20,6 +20,7 @@ from soup_nlp.start.bending import (
     PLAIN_TURN,
     displaced,
     fit_robustly,
+    least_gap,
     trimmed_mean,
     turned,
 )
@@ -32,7 +33,6 @@ from soup_nlp.start.camera_error import (
 )
 from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Matches
-from soup_nlp.start.prior_evidence import least_gap
 from soup_nlp.start.settle import RELIEF
 
 OPEN = 0.5

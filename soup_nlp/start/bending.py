@@ -33,10 +33,19 @@ rests."""
 LEAST_GAP, TURN_PX, TURN_SHARE = 3.0, 0.03, 9e-5
 """Error up to which a motion explains the flow: in units of the flow's noise, and in pixels, or as
 a share of the longer side of a small image."""
+LEAST_GAP_PX = 0.5
+"""Pixels by which depths must explain the flow of a component better than one depth or a turn, at
+least `LEAST_GAP` noises of the flow, so that it determines them; from a third on it may confirm a
+prior."""
 STEP, NEAREST = 1e-5, 1e-3
 """Step by which matrices of motions are differentiated, and least depth of a moved point."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
 """Pixels of the fit of a turn, and the least scale of the refinement of a motion, pixels."""
+
+
+def least_gap(noise: float) -> float:
+    """Pixels of relief that determine the depth of a component, by the noise of the flow."""
+    return max(LEAST_GAP_PX, LEAST_GAP * noise)
 
 
 def reference_noise(residual: Float) -> float:

@@ -14,13 +14,13 @@ from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
+from soup_nlp.start.bending import least_gap
 from soup_nlp.start.components import FIXED, SCENE, TIES
 from soup_nlp.start.prior_evidence import (
     COMPARED,
     LEAST_SIGMA,
     PriorEvidence,
     Seen,
-    least_gap,
     without_gaps,
 )
 from soup_nlp.start.propose import Start

@@ -20,7 +20,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.start.bending import LEAST_GAP, RELIEF, displaced, fit_robustly, trimmed_mean
+from soup_nlp.start.bending import RELIEF, displaced, fit_robustly, least_gap, trimmed_mean
 from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.labelling import CLIP
@@ -34,10 +34,6 @@ EXPLAINED = 0.5
 """Least share of a variance that is explained: of log depth by the flow by a prior that the flow
 confirms (right maps warped by 20 % explain 0.66 and more, maps of other scenes 0.39 and less), and
 of a map by the superpixels, which explain next to nothing of independent pixels."""
-LEAST_GAP_PX = 0.5
-"""Pixels by which depths must explain the flow of a component better than one depth or a turn, at
-least `LEAST_GAP` noises of the flow, so that it determines them; from a third on it may confirm a
-prior."""
 LEAST_SIGMA, UNCONFIRMED = 0.12, RELIEF * EXPLAINED**0.5
 """Standard deviation of log depth of a prior: the least, and that of an unconfirmed one, which is
 that of one that the flow hardly confirms in a usual scene."""
@@ -176,11 +172,6 @@ class Seen(NamedTuple):
         slope = np.where(strong[:, None], planes.slope[:, 0], 0.0)
         by_flow = views.soup(np.where(strong, mu, 1.0), slope, best.R, best.t)
         return soup.taking(by_flow, mask), strong
-
-
-def least_gap(noise: float) -> float:
-    """Pixels of relief that determine the depth of a component, by the noise of the flow."""
-    return max(LEAST_GAP_PX, LEAST_GAP * noise)
 
 
 def without_gaps(pair: Pair, seg: Segmentation) -> tuple[Float, Mask, Float]:
