@@ -80,9 +80,9 @@ start/motion              1     N       dominant motion, -1 for its own
 start/component           1     N       rigid component, which has one scale
 start/part                1     N       what moves as one, also before a camera at rest
 start/surface             1     N       region without a flow discontinuity
-start/tie                 1     N       what gives its component a scale: 0 largest, \
-1 contact below, 2 outline, 3 nothing, 4 fixed in image, 5 given depth, 6 occlusion, \
-7 too fast
+start/tie                 1     N       what gives its component a scale: 0 it is the scene, \
+1 contact below, 2 outline, 3 nothing, 4 ground, 5 fixed in image, 6 given depth, 7 occlusion, \
+8 too fast
 start/bends               1     N       in a region with the energy for surfaces that bend
 start/unexplained         1     N       no motion explains the flow, or it bends although it jumps
 start/bending             1     -       a region bends
