@@ -118,11 +118,8 @@ WITH_TYPES: dict[str, set[str]] = {module: set() for module in MODULES}
 """The same with those for types alone."""
 OUTSIDE: dict[str, set[str]] = {module: set() for module in MODULES}
 """Foreign libraries that every module imports, those for types alone left out."""
-PURPOSE: dict[str, str] = {}
-"""Docstring of every module."""
 for importer, file in MODULES.items():
     parsed = ast.parse(file.read_text(encoding="utf-8"))
-    PURPOSE[importer] = ast.get_docstring(parsed) or ""
     for name, for_types in imports(parsed, importer, file.name == "__init__.py"):
         target = own(name)
         if target is None:
@@ -241,8 +238,3 @@ def test_numbers_do_not_reach_symbols(module):
 def test_modules_do_not_import_in_circles():
     # raises an error that names the modules of a circle
     TopologicalSorter({module: INSIDE[module] - {""} for module in MODULES}).prepare()
-
-
-def test_every_module_has_a_purpose_line():
-    for module, text in PURPOSE.items():
-        assert len(text.partition("\n")[0]) > 10, module

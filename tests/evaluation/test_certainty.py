@@ -8,7 +8,7 @@ import pytest
 
 from soup_nlp.evaluation.confidence import FACTORS, KINDS, confidence, kinds
 from soup_nlp.geometry.surface import hidden
-from soup_nlp.report.findings import LEAST, ORIGINS, SAID, certainty_lines, drawn_line
+from soup_nlp.report.findings import ORIGINS
 from soup_nlp.report.summary import by_kind, certainty
 from soup_nlp.start.components import SCENE, TIES
 
@@ -72,24 +72,6 @@ def test_what_is_as_uncertain_as_a_drawing_is_one(small_run):
     nothing = sure_of(blind, blind.start)
     assert np.median(nothing.sigma) == pytest.approx(FACTORS["prior"], rel=0.05)
     assert nothing.share("drawn") > 0.95
-
-
-def test_every_kind_has_one_sentence():
-    lines = certainty_lines(shares(measured=0.7, inferred=0.2, drawn=0.1))
-    assert lines == [
-        "70% of the image is measured by parallax, half of it to 5.0% (1 sigma)",
-        "20% of the image is inferred from contact, order, bending, a continued surface or a given"
-        " depth",
-        "10% of the image is drawn: nothing tells its depth",
-    ]
-    assert SAID.keys() == set(KINDS)
-    # next to nothing is not worth a word
-    assert certainty_lines(shares(measured=1.0, drawn=LEAST / 2)) == [
-        "100% of the image is measured by parallax, half of it to 5.0% (1 sigma)"
-    ]
-    assert drawn_line(shares(measured=1.0)) == ""
-    said = drawn_line(shares(measured=0.7, drawn=0.3), "all images")
-    assert said == "30% of all images is drawn: nothing tells its depth"
 
 
 def test_older_results_have_kinds_too():

@@ -156,22 +156,6 @@ def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, c
 
 
 @pytest.mark.slow
-def test_a_false_claim_of_success_is_not_verified(exported, tmp_path, capsys):
-    sol = answer(exported, "false.sol", move=1e-3)
-    run = import_sol(exported, sol).run
-    assert not run.solution.converged
-    assert run.solution.stages[-1].objective != 0
-    assert main(["check", str(sol)]) == 1
-    said = capsys.readouterr().out
-    assert "FAIL so3" in said
-    assert "not verified" in said
-    assert "a constraint does not hold" in said
-    assert main(["import", str(exported), str(sol), "--out", str(tmp_path / "r")]) == 1
-    limit = import_sol(exported, answer(exported, "limit.sol", code=400))
-    assert "no success claimed" in str(limit)
-
-
-@pytest.mark.slow
 def test_the_worst_superpixel_is_named(exported):
     _, nlp, layout, (v, r), _ = problem_of(exported)
     x = nlp.x0.copy()
@@ -230,12 +214,3 @@ def test_a_presolved_start_has_multipliers(tmp_path, capsys):
     line = next(s for s in capsys.readouterr().out.splitlines() if s.startswith("energy"))
     energy = f"{manifest['exact_energy_at_start']['total']:.6g}"
     assert line == f"energy      start {energy}  solution {energy}"
-
-
-@pytest.mark.slow
-def test_no_multipliers_where_the_start_is_not_stationary(exported):
-    manifest = json.loads((exported / "manifest.json").read_text())
-    assert manifest["start"] == "proposal"
-    assert not manifest["initial_duals"]
-    lines = (exported / "soup.nl").read_text().splitlines()
-    assert not any(line[0] in "dS" for line in lines)

@@ -1,8 +1,5 @@
 """The .nl file equals the NLP: read back by CasADi, ASL, POUNCE and SCIP."""
 
-import json
-import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,62 +99,6 @@ def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("foreign")
     lam_g = np.full(nlp.ng, -1.0)
     return nlp, layout, write_nl(folder / "soup.nl", nlp, lam_g)
-
-
-def test_ampls_own_library_agrees(written):
-    """ASL, the reader behind most solvers, through gjh_asl_json: derivatives at the start."""
-    tool = shutil.which("gjh_asl_json")
-    if tool is None:
-        pytest.skip("gjh_asl_json (Debian package gjh-asl-json) is not installed")
-    nlp, _, file = written
-    stub = file.path.with_suffix("")
-    args = ["rows=soup.row", "cols=soup.col", "json=soup.json"]
-    subprocess.run([tool, stub.name, *args], cwd=stub.parent, check=True, capture_output=True)
-    # ASL counts names from the files; the JSON is keyed by them
-    said = json.loads(stub.with_suffix(".json").read_text())
-    stats = said["problem statistics"]
-    assert stats["total no. of variables"] == nlp.nx
-    assert stats["total no. of constraints"] == nlp.ng
-    assert (
-        stats["no. of nonlinear variables in both constraints and objectives"]
-        == file.counts["nonlinear_variables"]["both"]
-    )
-    assert stats["no. of nonzeros in constraints' Jacobian"] == nlp.nnzj
-    cols = stub.with_suffix(".col").read_text().split()
-    rows = stub.with_suffix(".row").read_text().split()
-
-    def matrix(section: str, down: list[str]) -> np.ndarray:
-        """Entries whose names are those of a row and of a variable."""
-        place = {f"{r}_{c}": (i, j) for i, r in enumerate(down) for j, c in enumerate(cols)}
-        out = np.zeros((len(down), len(cols)))
-        for key, number in _section(said, section).items():
-            out[place[key]] = number
-        return out
-
-    v, r = file.variables, file.rows
-    J = nlp.jacobian(nlp.x0).toarray()[np.ix_(r, v)]
-    np.testing.assert_allclose(matrix("constraints' jacobian", rows[:-1]), J, 1e-10, 1e-10)
-    gradient = nlp.gradient(nlp.x0)[None, v]
-    np.testing.assert_allclose(matrix("gradient", ["E"]), gradient, 1e-10, 1e-10)
-    # the Hessian of f + y g at the duals of the file
-    assert said["supplied starting points"]["dual"] == dict.fromkeys(rows[:-1], 1)
-    H = matrix("lagrangian hessian", cols)
-    H = np.where(H, H, H.T)
-    expected = nlp.hessian(nlp.x0, np.ones(nlp.ng)).toarray()[np.ix_(v, v)]
-    np.testing.assert_allclose(H, expected, rtol=1e-8, atol=1e-8)
-
-
-def _section(tree: dict, name: str) -> dict:
-    """First mapping of that name anywhere in a tree."""
-    todo = [tree]
-    while todo:
-        node = todo.pop()
-        for key, child in node.items():
-            if isinstance(child, dict):
-                if key == name:
-                    return child
-                todo.append(child)
-    raise KeyError(name)
 
 
 def pounce_agrees(nlp: NLP, file: NLFile, x: np.ndarray) -> None:

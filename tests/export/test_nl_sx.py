@@ -161,22 +161,6 @@ def test_pounce_reads_every_function(tmp_path):
     close(back.gradient(at), gradient)
 
 
-def test_without_constraints(tmp_path):
-    x = ca.SX.sym("x", 3)
-    file = write_sx_nl(tmp_path / "linear.nl", {"x": x, "f": x[0] - 2 * x[2] + 1})
-    assert not any(file.counts["nonlinear_variables"].values())
-    back = ReadBack(file.path)
-    assert np.array_equal(back.values([1, 5, 7])[2].full().ravel(), [1, 0, -2])
-    assert float(back.values([1, 5, 7])[0]) == -12
-
-
-def test_long_sums_do_not_nest(tmp_path):
-    x = ca.SX.sym("x", 500)
-    file = write_sx_nl(tmp_path / "sum.nl", {"x": x, "f": ca.sum1(ca.sqrt(x**2 + 1))})
-    assert "\no54\n500\n" in file.path.read_text()
-    assert float(ReadBack(file.path).values(np.zeros(500))[0]) == 500
-
-
 @pytest.mark.parametrize(
     ("operation", "make"),
     [

@@ -39,16 +39,6 @@ def test_superpixels_are_connected_and_numbered(image, method, count):
     assert abs(n - count) <= near
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("size", "count"), [((60, 80), 40), ((60, 80), 150), ((120, 320), 60), ((120, 320), 300)]
-)
-def test_fine_texture_does_not_cost_superpixels(size, count):
-    labels = segment(noise(*size), count)
-    assert abs(assert_partition(labels) - count) <= max(1, 0.03 * count)
-    assert np.median(np.bincount(labels.ravel())) > 0.3 * labels.size / count
-
-
 def test_an_image_of_one_colour_has_equal_cells():
     grey = np.full((48, 64, 3), 90, np.uint8)
     labels = segment(grey, 12, "grid")

@@ -88,13 +88,6 @@ def test_numbers_that_are_not_finite_violate_every_kind():
     assert constraints(changed("lam", 0, np.inf)).largest["simplex"] == np.inf
 
 
-def test_the_table_names_units_and_the_worst_superpixel():
-    text = str(constraints(changed("R", (1, 0, 0), 0.1), RAYS))
-    assert "FAIL so3       R'R = I" in text
-    assert "1 of 2      1 (2.1e-01)" in text
-    assert "in units of entry of R'R" in text
-
-
 @pytest.mark.parametrize(
     ("soup", "message"),
     [

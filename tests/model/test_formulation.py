@@ -1,6 +1,5 @@
 """One problem in every gauge: packing, names, sizes, patterns."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +20,6 @@ from hypothesis import strategies as st
 
 from soup_nlp.errors import ModelError
 from soup_nlp.model import oracle
-from soup_nlp.model.elements import TERMS
 from soup_nlp.model.kernel import Pattern
 from soup_nlp.model.layout import MatrixLayout, TangentLayout
 from soup_nlp.model.programs import build_tangent_nlp, exact_chart
@@ -54,22 +52,6 @@ def test_tangent_pack_and_unpack_are_inverse_of_each_other(chart, seed):
     layout = TangentLayout.about(problem.soup, problem.data, chart)
     soup = random_soup(seed, len(problem.seg))
     assert_same_soup(layout.unpack(layout.pack(soup)), soup.normalised(), 1e-11)
-
-
-def test_a_superpixel_at_rest_gets_a_tiny_translation():
-    soup = random_soup(0, 6)
-    t = soup.t.copy()
-    t[2] = 0
-    soup = replace(soup, t=t)
-    back = MatrixLayout(np.full(6, 1 / 6), "unit-translation")
-    back = back.unpack(back.pack(soup))
-    truth = soup.normalised()
-    length = np.linalg.norm(truth.translation, axis=1)
-    moved = np.linalg.norm(back.translation - truth.translation, axis=1)
-    assert 0 < moved[2] < 2e-3 * np.median(length)
-    np.testing.assert_allclose(np.delete(moved, 2), 0, atol=1e-12)
-    layout = MatrixLayout(np.full(6, 1 / 6), "unit-offset")
-    np.testing.assert_array_equal(layout.unpack(layout.pack(soup)).translation[2], 0)
 
 
 def test_superpixels_of_one_plane_stay_on_one_while_it_turns():
@@ -112,19 +94,6 @@ def test_names_are_unique_and_point_to_their_numbers(gauge):
         assert "7" in name.partition("[")[2].rstrip("]").split(",")[:2], name
 
 
-@pytest.mark.parametrize(
-    ("chart", "plane"), [("depth", ["lam", "s1", "s2"]), ("inverse-depth", ["rho", "g1", "g2"])]
-)
-def test_names_of_the_presolve(chart, plane):
-    problem = tiny()
-    nlp, _ = build_tangent_nlp(problem.soup, problem.data, PAPER, form(), chart)
-    assert len(set(nlp.x_names())) == nlp.nx == 9 * 12
-    names = nlp.g_names()
-    assert len(set(names)) == nlp.ng
-    assert {re.sub(r"\[.*", "", name) for name in names} == {"simplex", "visible"}
-    assert nlp.x_names()[9:12] == [f"{k}[1]" for k in plane]
-
-
 def test_sizes_are_those_of_the_formulation():
     problem, n = tiny(), 12
     nlp, _ = problem.nlp(PAPER, form())
@@ -136,17 +105,6 @@ def test_sizes_are_those_of_the_formulation():
     assert other.sizes()["variables"] == 17 * n + 1
     assert other.sizes()["equalities"] == 8 * n + 2
     assert sizes["jacobian_nonzeros"] == nlp.nnzj == nlp.jacobian(nlp.x0).nnz
-
-
-def test_the_print_shows_sizes_and_sparsity():
-    nlp, _ = tiny().nlp(PAPER, form())
-    text = str(nlp)
-    assert text.startswith(f"NLP soup: {nlp.nx} variables, {nlp.ng} constraints")
-    for nonzeros, cells in ((nlp.nnzj, nlp.nx * nlp.ng), (nlp.nnzh, sum(range(nlp.nx + 1)))):
-        assert f"{nonzeros} nonzeros, {nonzeros / cells:.3%} of {cells}\n" in text
-    assert "Hessian kind: exact" in text
-    for name in (*TERMS, "so3", "normal", "visible", "simplex"):
-        assert re.search(rf"^  {name} +\d+ x ", text, re.M), name
 
 
 def test_a_table_must_fit_its_kernel_and_be_finite():

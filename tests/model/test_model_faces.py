@@ -89,21 +89,6 @@ def test_terms_in_tangent_coordinates_equal_plain_numpy(units, chart):
                 assert e == pytest.approx(expected[term], rel=EXACT[term]), term
 
 
-def test_truncations_of_the_tiny_problem_cut_some_and_spare_some():
-    # or the tests above would not see them
-    for units in UNITS:
-        problem, weights = tiny(units), weights_for(units)
-        wide = weights_for(units, truncated=False)
-        for term in ("arap", "proj", "cont"):
-            cut = oracle.values(term, problem.soup, problem.data, weights)
-            free = oracle.values(term, problem.soup, problem.data, wide)
-            assert np.mean(cut < free) > 0.05, term
-            assert (cut <= free * (1 + 1e-12)).all()
-        turn = oracle.values("orient", problem.soup, problem.data, weights)
-        turn /= problem.data.orient_weight
-        assert 0.05 < np.mean(turn < weights.sigma_orient) < 0.95
-
-
 # --- finite differences --------------------------------------------------------------------------
 
 
@@ -132,26 +117,6 @@ def assert_derivatives(nlp: NLP, x: np.ndarray, seed: int) -> None:
 def test_derivatives_equal_finite_differences(coordinates, units, at_anchors, truncated):
     nlp, _ = program(coordinates, units, at_anchors, truncated)
     assert_derivatives(nlp, wiggle(nlp, 3, 0.05), 4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("gauge", GAUGES)
-def test_columns_of_jacobian_and_hessian(gauge):
-    """Small entries of long rows, which rounding along dense directions hides."""
-    nlp, _ = program(gauge, "pixels", True)
-    x = wiggle(nlp, 7, 0.03)
-    lam_g = np.random.default_rng(8).normal(size=nlp.ng)
-    J, H = nlp.jacobian(x).toarray(), nlp.hessian(x, lam_g).toarray()
-    # every variable of a superpixel once, of another one each
-    for j in (*range(0, nlp.nx, 11), nlp.nx - 1):
-        v, name = np.eye(nlp.nx)[j], f"d / d {nlp.x_names()[j]}"
-        np.testing.assert_allclose(
-            directional(nlp.constraints, x, v), J[:, j], atol=1e-8, rtol=0, err_msg=name
-        )
-        slope = directional(lambda y: lagrangian_gradient(nlp, y, 1.0, lam_g), x, v)
-        np.testing.assert_allclose(
-            slope, H[:, j], atol=1e-8 * (1 + np.abs(H).max()), rtol=0, err_msg=name
-        )
 
 
 # --- kinds of Hessian ----------------------------------------------------------------------------

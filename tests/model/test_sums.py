@@ -1,7 +1,5 @@
 """Sums of kernels in numpy have the values of CasADi's graph."""
 
-from dataclasses import replace
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from soup_nlp.model import operations
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp
+from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.symbolic import make_oracle
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
@@ -130,14 +128,3 @@ def test_lengths_are_checked():
         nlp.value(np.zeros(2))
     with pytest.raises(ValueError, match="lam_g has 1 entries, expected 5"):
         nlp.hessian(np.zeros(6), np.zeros(1))
-
-
-def test_kernels_serve_another_camera(case):
-    """Derivatives are taken once for equal expressions."""
-    K = case.data.K_next * np.array([[1.1], [1.2], [1.0]])
-    kernels = []
-    for data in (case.data, replace(case.data, K_next=K)):
-        nlp, _ = build_tangent_nlp(case.soup, data, case.weights, Formulation())
-        kernels.append([group.kernel for group in nlp.groups])
-    assert kernels[0] == kernels[1]
-    assert len(set(kernels[0])) == len(kernels[0])

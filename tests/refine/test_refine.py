@@ -1,8 +1,6 @@
 """Proposals are feasible and of the right size; rounds never raise E and repair superpixels."""
 
 import threading
-import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -213,22 +211,6 @@ def test_broken_superpixels_are_repaired_by_their_neighbours():
         assert np.abs(ratio[component] / np.median(ratio[component]) - 1).max() < 1e-3
 
 
-def test_a_soup_at_its_optimum_is_left_alone():
-    scene = Planar()
-    # one plane under one motion with exact flow: E is 0
-    first = np.zeros(len(scene.truth), int)
-    same = Soup(*(v[first] for v in vars(scene.truth).values()))
-    y = same.moved(same.points(scene.data.pixel_ray.reshape(len(same), -1, 3)))
-    data = replace(scene.data, pixel_target=camera.project(K_NEXT, y))
-    # a slanted plane has relief, which E_prior charges
-    done = refine_soup(same, data, Weights(prior=0.0), FEW, seed=0)
-    assert done.energy["total"] < 1e-9
-    ratio = done.soup.depth_at(data.anchor_ray) / same.depth_at(data.anchor_ray)
-    assert np.abs(ratio / ratio[0] - 1).max() < 1e-6
-    gap = done.soup.R - same.R
-    assert np.abs(gap).max() < 1e-6
-
-
 def test_interruption_and_time_limit_keep_the_best():
     tiny = Tiny("pixels", samples=6)
     weights = weights_for("pixels")
@@ -243,39 +225,6 @@ def test_interruption_and_time_limit_keep_the_best():
     late = refine_soup(tiny.soup, tiny.data, weights, FEW.replace(max_seconds=1e-9))
     assert late.status == "time limit"
     assert not late.rounds
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("what", "status"),
-    [("stop", "interrupted"), ("interrupt", "interrupted"), ("wait", "time limit")],
-)
-def test_a_listener_can_end_a_round(what, status, monkeypatch):
-    """By the stop event, by a KeyboardInterrupt, which TRW-S catches, or by the time limit."""
-    # TRW-S does not stop at a gap
-    monkeypatch.setattr(mppbp, "TRWS_GAP", -1.0)
-    tiny, stop, heard = Tiny("pixels", samples=6), threading.Event(), []
-
-    def listener(progress: object) -> None:
-        heard.append(str(progress))
-        if what == "wait":
-            end = time.process_time() + 0.55
-            while time.process_time() < end:
-                pass
-        elif len(heard) == 2 and what == "interrupt":
-            raise KeyboardInterrupt
-        elif len(heard) == 2:
-            stop.set()
-
-    o = FEW.replace(max_seconds=0.5 if what == "wait" else 300.0)
-    watch = Watch(listener, stop)
-    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o, seed=1, watch=watch)
-    assert done.status == status
-    assert stop.is_set() == (what == "stop")
-    assert [r.status for r in done.rounds] == ["interrupted"]
-    assert done.rounds[0].iterations == len(heard) == (1 if what == "wait" else 2)
-    assert heard[0].startswith("refine 1")
-    assert done.energy["total"] <= done.energy_begin["total"]
 
 
 @pytest.mark.parametrize("particles", [2, 3, 9])

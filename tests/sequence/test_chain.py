@@ -12,7 +12,7 @@ from soup_nlp.report.chain import Link
 from soup_nlp.report.formats import write_formats
 from soup_nlp.report.models import fuse
 from soup_nlp.sequence.links import chained_scales, follow, link, make_chain, number
-from soup_nlp.sequence.score import path_errors, read_path, similarity
+from soup_nlp.sequence.score import path_errors, read_path
 
 pytestmark = pytest.mark.slow
 
@@ -130,17 +130,6 @@ def test_frames_of_a_chain_have_all_that_is_known_of_them():
             chain[wrong]
         with pytest.raises(DataError):
             chain.depth(wrong)
-
-
-def test_similarities_are_found_exactly():
-    rng = np.random.default_rng(3)
-    points, R = rng.normal(size=(6, 3)), exp([0.3, -0.2, 0.5])
-    scale, turn, shift = similarity(points, 2.5 * points @ R.T + [1, 2, 3])
-    assert scale == pytest.approx(2.5)
-    np.testing.assert_allclose(turn, R, atol=1e-12)
-    np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-12)
-    # a mirror image is no rotation
-    assert np.linalg.det(similarity(points * [1, 1, -1], points)[1]) == pytest.approx(1)
 
 
 def test_errors_of_a_path_are_those_of_evo(tmp_path):

@@ -128,15 +128,6 @@ def test_hessian_of_an_unsorted_table_is_upper_triangular():
     np.testing.assert_allclose(H, expected, rtol=1e-12)
 
 
-def test_a_bound_beyond_the_optimum_is_active():
-    nlp = rosenbrock(2, ubx=0.5)
-    stage = solve(nlp)
-    # on x1 = 0.5 the best x2 is 0.25
-    np.testing.assert_allclose(stage.x, [0.5, 0.25], atol=1e-4)
-    assert stage.lam_x[0] == pytest.approx(1.0, rel=1e-3)
-    assert (stage.x <= 0.5 + 1e-8).all()
-
-
 def test_an_infeasible_problem_is_a_result_with_its_status():
     stage = solve(of_one_variable(lambda x: x, lambda x: x**2, ubg=-1.0), max_iter=200)
     assert not stage.converged

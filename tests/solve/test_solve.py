@@ -1,6 +1,5 @@
 """Soups solved: constraints, gauges, limits, interruption, a world whose truth is the optimum."""
 
-import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -35,7 +34,6 @@ from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, _near, solve_soup
 from soup_nlp.start.propose import propose
 from soup_nlp.start.views import FlowFit
-from soup_nlp.storage.progress import Progress, Watch
 
 pytestmark = pytest.mark.slow
 
@@ -219,36 +217,6 @@ def test_a_limit_gives_a_whole_solution(room, limit, status):
     assert_whole(solution, room)
 
 
-def test_a_stop_before_the_start_gives_the_start(room):
-    stop = threading.Event()
-    stop.set()
-    solution = room.solve(watch=Watch(stop=stop))
-    assert solution.status == "Interrupted"
-    assert not solution.converged
-    assert_whole(solution, room)
-    assert solution.energy["total"] == pytest.approx(solution.energy_start["total"], rel=1e-3)
-
-
-def test_progress_and_sentences_are_delivered(room, solved, tmp_path):
-    seen: list[Progress] = []
-    said: list[str] = []
-    log = tmp_path / "ipopt.log"
-    solution = room.solve(watch=Watch(seen.append, say=said.append, log_file=str(log)))
-    stages = list(dict.fromkeys(p.stage for p in seen))
-    assert stages == [s.name for s in solution.stages]
-    for stage in solution.stages:
-        count = [p.iteration for p in seen if p.stage == stage.name]
-        assert count == list(range(len(count)))
-        assert len(count) >= stage.iterations
-    assert any(line.startswith("NLP soup: ") for line in said)
-    assert [name for name in stages if any(s.startswith(f"{name}: ") for s in said)] == stages
-    assert log.read_text().count("Number of Iterations") >= 1
-    # same start, same answer, whoever listens
-    for name in ("lam", "n", "R", "t"):
-        own = getattr(solution.soup, name)
-        np.testing.assert_array_equal(own, getattr(solved["unit-offset"].soup, name))
-
-
 # --- a world whose truth is the optimum ----------------------------------------------------------
 
 
@@ -283,17 +251,6 @@ def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge, kind)
     assert_constraints(solution, data)
     ratio = solution.soup.depth_at(data.anchor_ray) / truth.depth_at(data.anchor_ray)
     np.testing.assert_allclose(ratio, np.median(ratio), rtol=1e-3)
-
-
-def test_one_superpixel_is_solved():
-    pose, move = plane_pose(2.0, yaw=20), motion((0, 1, 0), (0.2, 0, 0))
-    pair = plane_world(pose, move, 64, 48)
-    seg = build_segmentation(np.zeros((48, 64), np.int32), pair.image_ref)
-    truth = plane_soup(pose, move, 1)
-    data = in_pixels(build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 30, 0), truth, seg)
-    solution = solve_soup(disturbed(truth, 0.05), data, WEIGHTS, form(), OPTIONS)
-    assert_constraints(solution, data)
-    assert solution.energy["total"] < 0.05 * solution.energy_start["total"]
 
 
 def test_the_constrained_nlp_starts_at_the_presolves_kkt_point(room, solved):
