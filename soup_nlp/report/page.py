@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL.Image import fromarray
 
-from soup_nlp.arrays import Float, Mask
+from soup_nlp.arrays import Float
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, whole_cells
 from soup_nlp.report.chain import STILL, Chain
@@ -203,7 +203,7 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
     camera = STILL if result.bending else result.components.camera.inverse
     home = T @ camera.R.T + scale * camera.t
     pivot = _pivots(result, scale)
-    labels, sigma = rec.labels[every], result.sigma[every]
+    labels, sigma, known = rec.labels[every], result.sigma[every], np.isfinite(rec.depth_ref)
     byte = np.where(np.isfinite(sigma), 254 * np.clip(sigma / 0.5, 0, 1), 255)
     return {
         "labels": labels.astype(np.uint16),
@@ -215,7 +215,7 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
         "kind": result.kind[every].astype(np.uint8),
         "component": chain.tracks[k][result.components.of_superpixel].astype(np.uint16),
         "tie": np.asarray(start["tie"], np.uint8),
-        "surface": np.packbits(surface_cells(result, step), bitorder="little"),
+        "surface": np.packbits(whole_cells(*result.surface, known, step), bitorder="little"),
         "count": len(soup),
         "step": step,
         "size": rec.labels.shape[::-1],
@@ -231,11 +231,6 @@ def _single(values: Float) -> NDArray[np.float32]:
     """Numbers in single precision; those of a diverged solve are limited to its range."""
     limits = np.finfo(np.float32)
     return np.clip(values, limits.min, limits.max).astype(np.float32)
-
-
-def surface_cells(result: Result, step: int) -> Mask:
-    """(h - 1, w - 1) cells of four shown pixels without a jump of the depth."""
-    return whole_cells(*result.surface, np.isfinite(result.reconstruction.depth_ref), step)
 
 
 def _far(z: Float) -> tuple[float, float]:

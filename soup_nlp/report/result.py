@@ -13,7 +13,7 @@ from PIL.Image import fromarray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError
-from soup_nlp.evaluation.confidence import KINDS, MIN_CONFIDENCE, MOST_SIGMA, NO_CONFIDENCE
+from soup_nlp.evaluation.confidence import KINDS, MIN_CONFIDENCE, NO_CONFIDENCE
 from soup_nlp.evaluation.metrics import DepthMetrics
 from soup_nlp.evaluation.scoring import DEPTHS
 from soup_nlp.geometry.components import Components, find_components
@@ -29,14 +29,11 @@ from soup_nlp.report.figures import shown
 from soup_nlp.report.findings import drawn_line
 from soup_nlp.report.layout import Stored, result_tree
 from soup_nlp.report.pictures import overview, pictures
-from soup_nlp.report.summary import by_kind
 from soup_nlp.storage.files import plain
 from soup_nlp.storage.store import ReadTree, require
 
 PAGE = "report.html"
 """Name of the page in a result folder."""
-INPUTS = ("image_ref", "image_next", "K_ref", "K_next", "confidence")
-"""Arrays of the pair without which there is no `Result`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +69,7 @@ class Result:
         return fromarray(overview(pictures(Chain.of(self)), self.title))
 
     def _repr_html_(self) -> str:
-        return shown(str(self), overview(pictures(Chain.of(self)), self.title))
+        return shown(str(self), np.asarray(self.plot()))
 
     @property
     def title(self) -> str:
@@ -256,27 +253,26 @@ def load(folder: str | Path) -> Result:
     stored = Stored.read(folder)
     tree, summary = stored.tree, stored.claims
     try:
-        _, _, K_ref, K_next, _ = (require(tree, f"input/{name}") for name in INPUTS)
+        for name in ("input/image_ref", "input/image_next", "input/confidence"):
+            require(tree, name)
+        K_ref, K_next = require(tree, "input/K_ref"), require(tree, "input/K_next")
         soup = Soup(**stored.soup("solution"))
         planes = np.isfinite(soup.lam * soup.d).all()
         if not planes or not (np.abs(np.linalg.det(soup.R) - 1) < 1e-3).all():
             raise ValueError("planes or rotations of the solution are none")
         sigma = require(tree, "depth/sigma_ref")
-        # older results know no kinds of depth
-        kind = tree.get("confidence", {}).get("kind", np.where(sigma > MOST_SIGMA, 2, 0))
         given = {f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)}
         seg, (height, width) = Segmentation(**given), tree["depth"]["next"].shape
         rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
         start = tree["start"]
-        # older results have an array of their own for what moves as one
-        part, borrowed = start.get("part", start["component"]), start["borrowed"].astype(bool)
+        parts = start["part"], K_ref, K_next, start["borrowed"].astype(bool)
         return Result(
             tree=tree,
-            summary={**summary, "certainty": by_kind(summary["certainty"])},
+            summary=summary,
             reconstruction=replace(rec, sigma_ref=sigma),
-            components=find_components(soup, seg, part, K_ref, K_next, borrowed),
+            components=find_components(soup, seg, *parts),
             metrics={name: _metrics(row) for name, row in summary["metrics"].items()},
-            kind=kind,
+            kind=require(tree, "confidence/kind"),
         )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
         raise DataError(

@@ -1,6 +1,5 @@
 """What a run found and how sure that is, as numbers: summary.json and the shares of the verdict."""
 
-from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, Literal, NotRequired
 
@@ -39,15 +38,6 @@ class Shares(TypedDict):
     median_sigma: Number
 
 
-class OldShares(TypedDict):
-    """Shares of a result that knows no kinds of depth, see `by_kind`."""
-
-    determined: float
-    flow: float
-    guess: float
-    median_sigma: Number
-
-
 class Sizes(TypedDict):
     """Sizes of the problem."""
 
@@ -69,7 +59,7 @@ class Summary(TypedDict):
     truth_unit: str | None
     seconds: dict[str, float]
     sizes: Sizes
-    certainty: Shares | OldShares
+    certainty: Shares
     verdict: list[str]
 
 
@@ -154,12 +144,3 @@ def certainty(run: Run) -> dict[str, float]:
     sigma = sure.sigma[sure.kind == KINDS.index("measured")]
     middle = float(np.median(sigma)) if sigma.size else float("nan")
     return {**{kind: sure.share(kind) for kind in KINDS}, "median_sigma": middle}
-
-
-def by_kind(shares: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The shares of a summary.json by kind; older ones have other names."""
-    if "drawn" in shares:
-        return shares
-    flow, rest = shares["flow"], shares["determined"] - shares["flow"]
-    old = {"measured": flow, "inferred": rest, "drawn": shares["guess"]}
-    return {**old, "median_sigma": shares["median_sigma"]}

@@ -12,7 +12,6 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.report.findings import certainty_lines, drawn_line, flow_words, found_words, hints
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.summary import certainty
-from soup_nlp.solve.stages import Solution
 
 STATUS = {
     "Solve_Succeeded": "converged to the tolerance",
@@ -41,8 +40,6 @@ TITLES = {
 RULES = {"none": "no scale", "affine": "one scale and shift each, of least squares"}
 """Words for rules of the scale of scores."""
 PAD = " " * 12
-BUSY = 1.5
-"""Wall time over CPU time from which the verdict names the load of the machine."""
 
 
 def verdict(
@@ -84,8 +81,10 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
     """
     whole = {k: v for k, v in run.seconds.items() if not k.startswith("nlp_")}
     inner = {k[4:]: v for k, v in run.seconds.items() if k.startswith("nlp_")}
+    status = run.solution.status
+    words = STATUS.get(status, f"not converged: {status}, best iterate kept")
     sections = {
-        "status": _status(run),
+        "status": [f"{words} ({status})"],
         "found": found_words(run),
         "certainty": certainty_lines(certainty(run)),
         "try": hints(run),
@@ -97,18 +96,9 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
         "seconds": [
             f"{sum(whole.values()):.1f}: {_numbers(whole, '.1f')}",
             *[f"of nlp: {_numbers(inner, '.1f')}"] * (details and bool(inner)),
-            *_load(run.solution),
         ],
     }
     return sectioned(sections)
-
-
-def _load(solution: Solution) -> list[str]:
-    """The CPU time of the NLP, which its limit counts, where the machine was busy."""
-    wall = sum(v for k, v in solution.seconds.items() if k in solution.cpu_seconds)
-    used = sum(solution.cpu_seconds.values())
-    busy = wall > BUSY * used + 1.0
-    return [f"the NLP had {used:.1f} CPU s of them: other programs ran"] if busy else []
 
 
 def sectioned(sections: Mapping[str, Sequence[str]]) -> str:
@@ -148,12 +138,6 @@ def _details(run: Run) -> dict[str, list[str]]:
 
 def _numbers(values: Mapping[str, float], form: str) -> str:
     return "  ".join(f"{k} {v:{form}}" for k, v in values.items())
-
-
-def _status(run: Run) -> list[str]:
-    s = run.solution
-    words = STATUS.get(s.status, f"not converged: {s.status}, best iterate kept")
-    return [f"{words} ({s.status})"]
 
 
 def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:

@@ -9,7 +9,7 @@ import pytest
 from soup_nlp.evaluation.confidence import FACTORS, KINDS, confidence, kinds
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.report.findings import ORIGINS
-from soup_nlp.report.summary import by_kind, certainty
+from soup_nlp.report.summary import certainty
 from soup_nlp.start.components import SCENE, TIES
 
 
@@ -17,11 +17,6 @@ def sure_of(run, start, given=None):
     """The uncertainty of a run with another start."""
     energy = run.data, run.weights, run.problem.formulation
     return confidence(run.reconstruction, run.pair, start, *energy, given)
-
-
-def shares(**known):
-    """Shares of the kinds; those that are not given are 0."""
-    return {**dict.fromkeys(KINDS, 0.0), "median_sigma": 0.05, **known}
 
 
 def test_every_pixel_is_of_one_kind(small_run):
@@ -72,13 +67,6 @@ def test_what_is_as_uncertain_as_a_drawing_is_one(small_run):
     nothing = sure_of(blind, blind.start)
     assert np.median(nothing.sigma) == pytest.approx(FACTORS["prior"], rel=0.05)
     assert nothing.share("drawn") > 0.95
-
-
-def test_older_results_have_kinds_too():
-    old = {"determined": 0.9, "flow": 0.6, "contact": 0.3, "guess": 0.1, "median_sigma": 0.05}
-    known = shares(measured=0.6, inferred=0.3, drawn=0.1)
-    assert by_kind(old) == pytest.approx(known)
-    assert by_kind(known) is known
 
 
 def test_the_page_has_words_for_what_gives_a_component_its_scale():

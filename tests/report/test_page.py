@@ -14,10 +14,11 @@ import pytest
 from soup_nlp.cli.main import main
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.rotation import exp
+from soup_nlp.geometry.surface import whole_cells
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import drawn_line
 from soup_nlp.report.folder import write_folder
-from soup_nlp.report.page import MODES, make_pair, make_scene, page, surface_cells
+from soup_nlp.report.page import MODES, make_pair, make_scene, page
 from soup_nlp.report.pictures import _enlarged, pictures
 from soup_nlp.report.result import result_of
 from soup_nlp.report.summary import summary
@@ -111,7 +112,8 @@ def test_curtains_are_cut(shown, small_run):
     members = (found[0], replace(found[0], label=1))
     part = half[labels].astype(np.int32)
     two = replace(found, of_superpixel=half, of_pixel=part, members=members)
-    surface = surface_cells(replace(shown, components=two), 1)
+    known = np.isfinite(small_run.reconstruction.depth_ref)
+    surface = whole_cells(*replace(shown, components=two).surface, known)
 
     def alike(values):
         first = values[:-1, :-1]
@@ -119,7 +121,6 @@ def test_curtains_are_cut(shown, small_run):
         return np.all([first == other for other in others], axis=0)
 
     assert surface.shape == (labels.shape[0] - 1, labels.shape[1] - 1)
-    known = np.isfinite(small_run.reconstruction.depth_ref)
     whole = alike(known) & known[:-1, :-1]
     assert surface[alike(labels) & whole].all()
     assert not surface[~whole].any()
@@ -132,9 +133,8 @@ def test_large_images_are_thinned(shown):
     scene = make_pair(Chain.of(shown), 0, 256 * 128 / 8)
     assert scene["step"] == 3
     assert scene["labels"].shape == (43, 86)
-    surface = surface_cells(shown, 3)
-    assert surface.shape == (42, 85)
-    assert 0.5 < surface.mean() < 1
+    bits = np.unpackbits(scene["surface"], bitorder="little", count=42 * 85)
+    assert 0.5 < bits.mean() < 1
 
 
 def test_a_far_sky_is_left_out_at_first(shown):
