@@ -164,9 +164,9 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     )
     options, energy = solver_options(problem, start), problem.energy
     pixels = None if energy.pixel_samples == "all" else energy.pixel_samples
-    anchors = record.bending or energy.arap_at_anchors
     assert pair.flow is not None
-    data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, anchors)
+    cameras = pair.K_ref, pair.K_next
+    data = build_energy_data(seg, pair.flow, *cameras, pixels, problem.seed, record.bending)
     data = replace(
         in_pixels(data, start.soup, seg, start.bends),
         edge_weight=record.edge_share * data.edge_weight,

@@ -28,7 +28,7 @@ from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.ipopt import DEFAULTS, GOOD
-from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.system import end_with_parent
 
@@ -167,7 +167,7 @@ def pounce(command: str, task: Task, tuned: bool = False) -> Answer:
 def package(task: Task) -> Answer:
     """Solve as this package does: Ipopt's stages, then the constrained NLP."""
     m = task.limits
-    options = SolverOptions(
+    options = Stages(
         eps=task.form.eps,
         tol=m.tol,
         max_iter=m.iterations,

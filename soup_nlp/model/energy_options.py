@@ -79,8 +79,6 @@ class EnergyOptions(Section):
     units: Literal["pixel", "paper"] = "pixel"
     """pixel (every term in pixels, free of scale) or paper (one length unit: the lengths of the
     initial translations add up to 1)."""
-    arap_at_anchors: bool = False
-    """Compare motions at the anchors instead of the camera's origin."""
     across: Share = 0.03
     """Factor of E_arap, E_prior and, over gaps in depth, E_cont between superpixels of different
     components; 1 is the paper's."""

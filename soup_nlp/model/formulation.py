@@ -14,12 +14,6 @@ class FormulationOptions(Section):
 
     gauge: Gauge = "unit-offset"
     """unit-offset or unit-translation."""
-    hessian: Hessian = "exact"
-    """exact, gauss-newton or gauss-newton+constraints."""
-    theta: Share = 0.9
-    """Share of curvature along a residual that the Gauss-Newton Hessian leaves out."""
-    ridge: NonNegative = 1e-2
-    """Added to the Gauss-Newton Hessian's diagonal."""
     min_facing: Annotated[float, Field(ge=0, le=0.5)] = 1e-3
     """Visibility: lower bound c of -n . r."""
     depth_ratio: Annotated[float, Field(ge=1.01, le=MOST)] = 5.0
@@ -32,8 +26,14 @@ coordinates per superpixel about the proposal, in which SO(3) and unit normals h
 
 
 class Formulation(FormulationOptions):
-    """A formulation with its smoothing and coordinates, which belong to the stage of the solver."""
+    """A formulation with what belongs to a stage of the solver: smoothing, coordinates, Hessian."""
 
+    hessian: Hessian = "exact"
+    """exact, gauss-newton or gauss-newton+constraints."""
+    theta: Share = 0.9
+    """Share of curvature along a residual that the Gauss-Newton Hessian leaves out."""
+    ridge: NonNegative = 1e-2
+    """Added to the Gauss-Newton Hessian's diagonal."""
     coordinates: Coordinates = "matrix"
     """matrix or tangent; a gauge is of matrices only."""
     eps: NonNegative = 1e-2

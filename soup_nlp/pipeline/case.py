@@ -20,7 +20,7 @@ from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import BENDING_ARAP, WIDEST_BENDING_EPS, Weights
 from soup_nlp.model.reweighting import Known, in_pixels, in_translations, weighted
 from soup_nlp.pipeline.record import Case
-from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.camera_error import camera_error
 from soup_nlp.start.components import TIES, TOO_FAST
@@ -178,17 +178,16 @@ def superpixels(problem: Problem, pair: Pair, count: int | None = None) -> Label
     return labels if s.follow_flow_px is None else follow_flow(labels, pair.flow, s.follow_flow_px)
 
 
-def solver_options(problem: Problem, start: Start) -> SolverOptions:
+def solver_options(problem: Problem, start: Start) -> Stages:
     """The solver's options of a problem, the smoothing no wider than bending surfaces allow."""
-    solver = problem.solver
+    solver = Stages(**dict(problem.solver))
     if not start.bending or problem.energy.units != "pixel":
         return solver
     # widths above the limit become the limit, which then occurs once
     eps = dict.fromkeys(min(e, WIDEST_BENDING_EPS) for e in solver.presolve_eps)
     # E_arap truncated from the beginning tears bending surfaces; beside rigid regions E_arap
     # without truncation lets the scales of components slide
-    untruncated = solver.untruncated or bool(start.bends.all())
-    return solver.replace(presolve_eps=tuple(eps), untruncated=untruncated)
+    return solver.replace(presolve_eps=tuple(eps), untruncated=bool(start.bends.all()))
 
 
 def build_energy(
@@ -199,7 +198,7 @@ def build_energy(
     e = problem.energy
     pixels = None if e.pixel_samples == "all" else e.pixel_samples
     bends = start.bends & (e.units == "pixel")
-    anchors = bool(bends.any()) or e.arap_at_anchors
+    anchors = bool(bends.any())
     data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, pixels, problem.seed, anchors)
     data = replace(data, pixel_weight=np.where(start.wrong[:, None], 0.0, data.pixel_weight))
     prior = None

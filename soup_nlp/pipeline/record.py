@@ -26,7 +26,7 @@ from soup_nlp.model.layout import Layout, MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp, exact_chart
 from soup_nlp.refine.records import Refined
-from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import Solution
 from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
@@ -56,7 +56,7 @@ class Case:
     data: EnergyData
     weights: Weights
     soup: Soup
-    options: SolverOptions
+    options: Stages
     original: Pair | None = None
     given: Given | None = None
 

@@ -28,7 +28,7 @@ from soup_nlp.model.layout import Chart, Layout, MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp, exact_chart, majorant
 from soup_nlp.solve.ipopt import Ipopt, Stage
-from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.solver_options import Stages
 from soup_nlp.storage.progress import Watch
 
 PUSH = 1e-8
@@ -95,7 +95,7 @@ class Presolve:
     data: EnergyData
     weights: Weights
     form: Formulation
-    o: SolverOptions
+    o: Stages
     watch: Watch
     deadline: float
     rim: Float | None = None

@@ -41,17 +41,9 @@ class SolverOptions(Section):
     """Smoothing widths of the stages with the majorant Hessian, decreasing."""
     presolve_iterations: Whole = 60
     """Iteration limit of each of these stages and of the Gauss-Newton ones."""
-    stagnation: NonNegative = 1e-3
-    """Relative change of f that ends a majorant stage if it occurs twice in a row; Gauss-Newton
-    stages end at a tenth of it and less."""
-    untruncated: bool = False
-    """The presolve also runs a second strategy, which truncates E_arap only at its end, and the
-    result with the lower energy is taken; always on where all surfaces bend."""
     exact_iterations: Count = 100
     """Iteration limit of the stage with the exact Hessian, at `eps`; 0 omits it and those of
     Gauss-Newton."""
-    presolve_tol: Tolerance = 1e-8
-    """Dual infeasibility that ends the stages before the constrained NLP."""
     eps: Tolerance = 0.01
     """Smoothing of the constrained NLP."""
     max_iter: Count = 10
@@ -63,3 +55,16 @@ class SolverOptions(Section):
     """CPU time of this process that all stages together may take."""
     ipopt: dict[str, bool | int | float | str] = Field(default_factory=dict)
     """Further Ipopt options of the constrained NLP."""
+
+
+class Stages(SolverOptions):
+    """SolverOptions with what is no option of a problem."""
+
+    stagnation: NonNegative = 1e-3
+    """Relative change of f that ends a majorant stage if it occurs twice in a row; Gauss-Newton
+    stages end at a tenth of it and less."""
+    untruncated: bool = False
+    """The presolve also runs a second strategy, which truncates E_arap only at its end, and the
+    result with the lower energy is taken: where all surfaces bend."""
+    presolve_tol: Tolerance = 1e-8
+    """Dual infeasibility that ends the stages before the constrained NLP."""

@@ -20,7 +20,7 @@ from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.solve.ipopt import Ipopt, Stage
 from soup_nlp.solve.kkt import UNMET, WARM, residuals, warm_start
 from soup_nlp.solve.presolve import Presolve
-from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.solver_options import Stages
 from soup_nlp.storage.progress import Watch
 
 SAME = 1 + 1e-6
@@ -80,7 +80,7 @@ def solve_soup(
     data: EnergyData,
     weights: Weights,
     form: Formulation | None = None,
-    options: SolverOptions | None = None,
+    options: Stages | None = None,
     *,
     watch: Watch | None = None,
 ) -> Solution:
@@ -97,7 +97,7 @@ def solve_soup(
     Returns:
         The solution; a solve that fails is a Solution with its status, not an exception.
     """
-    rest = form or Formulation(), options or SolverOptions(), watch or Watch()
+    rest = form or Formulation(), options or Stages(), watch or Watch()
     return _Solve(start, data, weights, *rest).run()
 
 
@@ -132,7 +132,7 @@ class _Solve:
     data: EnergyData
     weights: Weights
     form: Formulation
-    o: SolverOptions
+    o: Stages
     watch: Watch
     stages: list[Stage] = field(default_factory=list)
     laps: _Laps = field(default_factory=_Laps)

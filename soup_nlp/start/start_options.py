@@ -17,8 +17,6 @@ class StartOptions(Section):
     """Inlier distance of a motion, pixels."""
     bending: bool = True
     """Whether surfaces may bend; if false, everything is rigid."""
-    discontinuity_px: NonNegative = 1.0
-    """Jump of the flow between two neighbours at which a surface ends, pixels."""
     upright: bool = True
     """Whether the image is upright, so that components stand on what is below them. If false, a
     component is scaled by its whole outline."""
@@ -28,7 +26,9 @@ class StartOptions(Section):
 
 
 class SeededStart(StartOptions):
-    """StartOptions with the seed, which a problem has once for all its stages."""
+    """StartOptions with the seed, which a problem has once, and what is no option of a problem."""
 
     seed: Seed = 0
     """Seed of sampling and RANSAC."""
+    discontinuity_px: NonNegative = 1.0
+    """Jump of the flow between two neighbours at which a surface ends, pixels."""

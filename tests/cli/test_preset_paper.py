@@ -36,7 +36,6 @@ PAPER = {
     "start.method": "homography",
     # Eq. 1 to 7: factor 1 of E_arap, the same everywhere; rho and rho_n alone truncate; four terms
     "energy.units": "paper",
-    "energy.arap_at_anchors": False,
     "energy.across": 1.0,
     "energy.arap_scene": 0.0,
     "energy.weights.prior": 0.0,

@@ -30,7 +30,7 @@ from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import optimality
-from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import Solution, _near, solve_soup
 from soup_nlp.start.propose import propose
 from soup_nlp.start.views import FlowFit
@@ -48,7 +48,7 @@ WEIGHTS = Weights(
     sigma_arap=1.0,
     sigma_proj=np.inf,
 )
-OPTIONS = SolverOptions(presolve_eps=(0.3, 0.1, 0.03), eps=0.03, max_iter=100, max_seconds=3600)
+OPTIONS = Stages(presolve_eps=(0.3, 0.1, 0.03), eps=0.03, max_iter=100, max_seconds=3600)
 
 
 def form(**options) -> Formulation:
@@ -71,7 +71,7 @@ class Problem:
         data = build_energy_data(seg, flow, pair.K_ref, pair.K_next, 8, 0)
         self.data: EnergyData = in_pixels(data, self.start, seg)
 
-    def solve(self, options: SolverOptions = OPTIONS, f: Formulation | None = None, **more):
+    def solve(self, options: Stages = OPTIONS, f: Formulation | None = None, **more):
         return solve_soup(self.start, self.data, WEIGHTS, f or form(), options, **more)
 
 

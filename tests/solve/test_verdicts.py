@@ -17,7 +17,7 @@ from soup_nlp.solve import stages
 from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import optimality, warm_start
 from soup_nlp.solve.presolve import _rim
-from soup_nlp.solve.solver_options import SolverOptions
+from soup_nlp.solve.solver_options import Stages
 
 FORM = Formulation()
 
@@ -72,7 +72,7 @@ def test_an_answer_that_violates_its_constraints_has_not_converged(monkeypatch):
         return replace(stage, x=x, status="Solve_Succeeded", converged=True)
 
     monkeypatch.setattr(Ipopt, "__call__", answered)
-    options = SolverOptions(presolve=False, max_iter=1)
+    options = Stages(presolve=False, max_iter=1)
     for off, status in ((0.9e-6, "Solve_Succeeded"), (1.1e-6, "Constraints_Violated")):
         found = stages.solve_soup(tiny.soup, tiny.data, PAPER, FORM, options)
         assert found.status == status

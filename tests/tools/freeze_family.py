@@ -37,7 +37,7 @@ def family_problem(scene: str, size: int) -> Problem:
             "flow": {"source": "truth"},
             # 0.2 pixels where surfaces bend, as in the records of all sizes, see `case_of`
             "energy": {"weights": {"prior": 0.0015}} if scene == "sheet" else {},
-            "solver": {"presolve_tol": 1e-8, "tol": 1e-8, "max_iter": 60},
+            "solver": {"tol": 1e-8, "max_iter": 60},
         }
     )
 
