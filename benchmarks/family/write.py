@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from typing_extensions import TypedDict
 
 from benchmarks.family.frozen import RECORDS, load_frozen
 from benchmarks.family.instances import VERSION, Instance, build_instance, case_of, parse_name
@@ -30,6 +31,25 @@ Entry = dict[str, Any]
 REACHED = 1e-4
 """Relative distance up to which an objective has reached the best known one."""
 INDEX = "index.json"
+
+
+class Best(TypedDict):
+    """The best known point of an instance."""
+
+    objective: float
+
+
+class Named(TypedDict):
+    """An instance."""
+
+    name: str
+    best_known: Best
+
+
+class Index(TypedDict):
+    """Contents of index.json, as far as they are read back."""
+
+    instances: list[Named]
 
 
 def published() -> dict[str, Any]:
@@ -188,7 +208,7 @@ def family_tasks(folder: Path) -> Iterator[Labelled]:
     Raises:
         DataError: the index cannot be read.
     """
-    for entry in read_json(folder / INDEX, "index of the family", dict[str, Any])["instances"]:
+    for entry in read_json(folder / INDEX, "index of the family", Index)["instances"]:
         instance = parse_name(entry["name"])
         label = {
             "problem": f"{instance.scene} {instance.start}",

@@ -19,7 +19,16 @@ from soup_nlp.batches.page import page
 from soup_nlp.batches.sources import Source, problems_of
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError, SoupError
-from soup_nlp.report.pairs import PAIRS, ROWS, fitting, head, kept_rows, needed_bytes, solve_into
+from soup_nlp.report.pairs import (
+    PAIRS,
+    ROWS,
+    fitting,
+    head,
+    kept_rows,
+    needed_bytes,
+    places,
+    solve_into,
+)
 from soup_nlp.storage.each import Row, each, failure
 from soup_nlp.storage.files import as_path, write_text
 from soup_nlp.storage.folders import claim, staged
@@ -87,7 +96,7 @@ def batch(
     """
     folder = as_path(out, "output folder")
     problems = problems_of(pairs, overrides)
-    claim(folder, FILES, overwrite, journal=ROWS)
+    claim(folder, [*FILES, *places(problems)], overwrite, journal=ROWS)
     rows: dict[str, Row] = {}
     heads, needs = dict[str, Row](), 0.0
     for name, problem in problems.items():

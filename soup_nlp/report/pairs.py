@@ -1,7 +1,7 @@
 """Pairs of a batch or a chain: each is solved into a folder of its own, with a row in one file."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Required
 
@@ -66,6 +66,12 @@ def _result(place: Path) -> str | None:
     sums = read_sums(place)
     known = sums.files.get("result.h5", "") if sums else ""
     return known if is_file(place / "result.h5") else None
+
+
+def places(names: Iterable[str]) -> list[str]:
+    """Names below the folders of pairs, for `claim`: no file or link may be in their way."""
+    # nothing is called so
+    return [f"{PAIRS}/{name}/-" for name in names]
 
 
 def needed_bytes(problem: Problem) -> float:

@@ -20,7 +20,16 @@ from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.pipeline.run import ProblemKeys, sections
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import write_png
-from soup_nlp.report.pairs import PAIRS, ROWS, fitting, head, kept_rows, needed_bytes, solve_into
+from soup_nlp.report.pairs import (
+    PAIRS,
+    ROWS,
+    fitting,
+    head,
+    kept_rows,
+    needed_bytes,
+    places,
+    solve_into,
+)
 from soup_nlp.sequence.folder import CHAIN, SINGLE, chain_files, read_pairs, write_chain
 from soup_nlp.sequence.frames import (
     DEPTHS,
@@ -32,6 +41,7 @@ from soup_nlp.sequence.frames import (
     find_images,
     is_video,
     numbered_files,
+    pair_name,
     video_frames,
 )
 from soup_nlp.sequence.links import make_chain
@@ -127,8 +137,8 @@ def solve_chain(
     chosen = replace(chosen, files=files, keys=common, overrides=overrides)
     # a wrong key or scene is found before the first pair is solved
     chosen.problem(0)
-    # nothing is called so, but no file or link of the user may be in its way
-    claim(folder, [*chain_files(count), f"{PAIRS}/-"], overwrite, subject, ROWS)
+    names = places(map(pair_name, range(count - 1)))
+    claim(folder, [*chain_files(count), *names], overwrite, subject, ROWS)
     chosen = one_camera(chosen)
     problems = {one.name: one for one in map(chosen.problem, range(count - 1))}
     # a pair that is solved otherwise ends the chain that it was part of
@@ -285,7 +295,7 @@ def _frames(
     if not isinstance(source, str | Path):
         images = _files(source, out)[::stride][:most]
     elif is_video(path := as_path(source, "frames", home=True)):
-        images = video_frames(path, out / "frames", stride, most)
+        images = video_frames(path, _written_frames(out), stride, most)
     else:
         images = find_images(path)[::stride][:most]
         depths = [] if "undistort" in camera else find_depths(images)
@@ -310,8 +320,14 @@ def _files(frames: Sequence[ImageLike], folder: Path) -> list[Path]:
         if any(str(frame).startswith(SCENE) for frame in frames):
             raise DataError("a rendered scene is a sequence by itself", found=[*frames])
         return [as_path(frame, "image", home=True) for frame in frames]
-    names = [f"{k:04d}.png" for k in range(len(frames))]
-    with staged(folder / "frames", whole=True) as new:
+    names, place = [f"{k:04d}.png" for k in range(len(frames))], _written_frames(folder)
+    with staged(place, whole=True) as new:
         for name, frame in zip(names, frames):
             write_png(new / name, image_of(frame, f"frame {name}"))
-    return [folder / "frames" / name for name in names]
+    return [place / name for name in names]
+
+
+def _written_frames(folder: Path) -> Path:
+    """Folder of frames that are written for a chain; DataError if a file or link is in its way."""
+    claim(folder, ["frames/-"], overwrite=True)
+    return folder / "frames"

@@ -200,6 +200,16 @@ def test_the_index_says_what_problem_sets_say(folder):
     assert easy["sha256"][:16] in (folder / "README.md").read_text()
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["{}", "[]", '{"instances": 5}', '{"instances": [{"name": "x"}]}', '{"instances": [1]}'],
+)
+def test_a_damaged_index_is_refused(text, tmp_path, capsys):
+    (tmp_path / "index.json").write_text(text)
+    assert main(["solvers", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert "index of the family" in capsys.readouterr().err
+
+
 def test_a_best_point_is_read_back_as_an_answer(folder):
     # the proposal stands for the best point here: on the constraints, but no minimum
     text, good = check_sol(folder / "SOUP-room-unit-offset-smooth-N100.sol")

@@ -12,6 +12,7 @@ from helpers_files import sets
 from helpers_result import CAMERA, CERTAINTY, toy_pairs
 
 import soup_nlp
+from soup_nlp.batches import run as batches
 from soup_nlp.cli.main import main
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
@@ -236,24 +237,40 @@ def ended(*_, **__):
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("kind", ["rows", "link of rows", "link of pairs"])
-def test_a_chain_does_not_write_into_what_is_the_users(kind, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("kind", ["rows", "pairs.jsonl", "pairs", "pairs/001_002"])
+@pytest.mark.parametrize("command", ["chain", "batch"])
+def test_no_command_writes_into_what_is_the_users(command, kind, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(solving, "each", None)
+    monkeypatch.setattr(batches, "each", None)
     out, mine = tmp_path / "out", tmp_path / "mine"
-    out.mkdir()
+    link = out / ("pairs.jsonl" if kind == "rows" else kind)
+    link.parent.mkdir(parents=True)
     if kind == "rows":
-        (out / "pairs.jsonl").write_text("mine")
-    elif kind == "link of rows":
-        mine.write_text("mine")
-        (out / "pairs.jsonl").symlink_to(mine)
+        link.write_text("mine")
     else:
-        mine.mkdir()
-        (out / "pairs").symlink_to(mine)
+        if kind == "pairs.jsonl":
+            mine.write_text("mine")
+        else:
+            mine.mkdir()
+        link.symlink_to(mine)
+    problem = tmp_path / "pair.yaml"
+    problem.write_text("name: 001_002\ninput: {kind: scene, scene: street}\n")
+    words = {"chain": ["scene:street", "--frames", "3"], "batch": [str(problem)]}
     before = sorted(tmp_path.rglob("*"))
     for more in ([], ["--overwrite"]):
-        assert main(["chain", "scene:street", "--frames", "3", "-o", str(out), "-q", *more]) == 2
+        assert main([command, *words[command], "-o", str(out), "-q", *more]) == 2
         assert str(out) in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_frames_are_not_written_through_a_link(tmp_path):
+    out, mine = tmp_path / "out", tmp_path / "mine"
+    out.mkdir()
+    mine.mkdir()
+    (out / "frames").symlink_to(mine)
+    with pytest.raises(DataError, match="link"):
+        soup_nlp.chain([np.zeros((48, 64, 3), np.uint8)] * 2, out, fov=60)
+    assert not any(mine.iterdir())
 
 
 def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch, capsys):
