@@ -15,10 +15,11 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Set
+from collections.abc import Iterable, Iterator, Mapping, Set
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 from typing import NamedTuple
 
 from soup_nlp.errors import DataError, printable
@@ -29,6 +30,8 @@ SUMS = "SHA256SUMS"
 """File with the SHA-256 of the files that the program made in a folder."""
 _HEAD = "# soup-nlp "
 """First line of SUMS, before the subject; `sha256sum -c` ignores it."""
+_NEXT = "# next "
+"""Before a line of SUMS for a file that is listed only once it is in its place."""
 UNFINISHED = "unfinished-soup-nlp-"
 """First part of the names of temporary folders; one of a process that was killed stays."""
 
@@ -50,15 +53,20 @@ def read_sums(folder: Path) -> Sums | None:
     head, _, lines = text.partition("\n")
     if not head.startswith(_HEAD):
         return None
-    rows = re.findall(r"^([0-9a-f]{64})  (\S.*)$", lines, re.MULTILINE)
-    # a damaged list must not name files outside the folder
-    inside = {n: d for d, n in rows if not PurePosixPath(n).is_absolute() and ".." not in n}
-    return Sums(inside, head.removeprefix(_HEAD).strip())
+    rows = re.findall(rf"^({_NEXT})?([0-9a-f]{{64}})  (\S.*)$", lines, re.MULTILINE)
+    files: dict[str, str] = {}
+    for coming, digest, name in rows:
+        # a damaged list must not name files outside the folder
+        inside = not PurePosixPath(name).is_absolute() and ".." not in name
+        if inside and (not coming or _state(folder, name, {name: digest}) == "made"):
+            files[name] = digest
+    return Sums(files, head.removeprefix(_HEAD).strip())
 
 
-def write_sums(folder: Path, sums: Sums) -> None:
-    """Write the list of a folder, see `read_sums`."""
+def write_sums(folder: Path, sums: Sums, coming: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Write the list of a folder, see `read_sums`; `coming` are files that will be put there."""
     lines = [f"{digest}  {name}" for name, digest in sorted(sums.files.items())]
+    lines += [f"{_NEXT}{digest}  {name}" for name, digest in sorted(coming.items())]
     write_text(folder / SUMS, "\n".join([f"{_HEAD}{printable(sums.subject)}", *lines, ""]))
 
 
@@ -213,6 +221,9 @@ def _commit(new: Path, target: Path, whole: bool, subject: str) -> None:
     if whole and before is not None and not Path.cwd().is_relative_to(target):
         _exchange(new, target, {*digests, *gone, SUMS})
         return
+    # a kill from here on leaves files of both, of which every one is listed as it is
+    write_sums(new.parent, Sums(made, subject or old), digests)
+    os.replace(new.parent / SUMS, target / SUMS)
     for name in gone:
         (target / name).unlink()
     for name in (*names, SUMS):

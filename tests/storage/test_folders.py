@@ -1,5 +1,6 @@
 """Output folders are written whole or not at all, and what is the user's stays."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -342,6 +343,32 @@ def test_a_kill_leaves_the_old_or_the_new_result(moves, tmp_path):
     found = content(aside / "old" if moves == 1 else target)
     found.pop("mine", None)
     assert found == ({"a": "1", "b": "1"} if moves < 2 else {"a": "2", "c": "2", "d": "2"})
+
+
+@pytest.mark.parametrize("moves", range(5))
+def test_a_kill_between_files_leaves_them_the_programs(moves, tmp_path, monkeypatch):
+    """In a folder that goes on: before the list of both, files a and b, the list, never."""
+    target, left, replace = tmp_path / "out", moves, os.replace
+    write(target, a="1", c="1")
+
+    def ended(source, place):
+        nonlocal left
+        if not left:
+            raise KeyboardInterrupt
+        left -= 1
+        replace(source, place)
+
+    with monkeypatch.context() as patch, contextlib.suppress(KeyboardInterrupt):
+        patch.setattr(os, "replace", ended)
+        with staged(target) as new:
+            put(new, {"a": "2", "b": "2"})
+    there = content(target)
+    assert there == {"a": "12"[moves > 1], "c": "1"} | ({"b": "2"} if moves > 2 else {})
+    assert read_sums(target).files == {name: digest_of(target / name) for name in there}
+    claim(target, ["a", "b", "c"])
+    with staged(target) as new:
+        put(new, {"a": "3"})
+    assert read_sums(target).files == {name: digest_of(target / name) for name in there}
 
 
 WRITER = """
