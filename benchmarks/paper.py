@@ -117,7 +117,7 @@ STUDIES: Mapping[str, tuple[str, Mapping[str, Overrides]]] = {
 LENGTHS = ("energy.weights.arap", "energy.weights.cont")
 """Weights of the preset that are proportional to 1 / N, since `sum lam = 1`."""
 JOINT = (
-    ("start.method", "start.samples", "start.threshold_px", "start.ground"),
+    ("start.method", "start.ground"),
     (
         *("energy.units", "energy.weights.arap", "energy.weights.proj", "energy.weights.cont"),
         *("energy.weights.orient", "energy.weights.sigma_cont", "energy.weights.sigma_arap"),

@@ -1,16 +1,15 @@
 """Parts that commands share: common options, lists in options, progress."""
 
 import json
-import logging
 import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -21,7 +20,7 @@ from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, StoppedError, printable
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.progress import Progress
-from soup_nlp.storage.rows import Row, failed, reason
+from soup_nlp.storage.rows import Row, Say, failed, reason
 
 
 def option(text: str, *names: str, panel: str | None = None, **rules: Any) -> Any:
@@ -97,9 +96,20 @@ def given(**values: object) -> dict[str, Any]:
 
 
 def changed(
-    preset: str | None, overrides: Sequence[str] | None, short: Mapping[str, object]
+    preset: str | None,
+    overrides: Sequence[str] | None,
+    superpixels: int | None = None,
+    neighbours: int | None = None,
+    max_size: float | None = None,
+    **keys: object,
 ) -> list[str]:
     """Overrides of a preset, of `--set`, which can undo it, and of options that stand for keys."""
+    short = {
+        "segmentation.superpixels": superpixels,
+        "segmentation.neighbours": neighbours,
+        "max_size": max_size,
+        **keys,
+    }
     first, last = ([f"{k}={v}" for k, v in given(**x).items()] for x in ({"preset": preset}, short))
     return [*first, *(overrides or []), *last]
 
@@ -112,17 +122,6 @@ def located(name: str | None, what: str) -> str | None:
 def listed(text: str) -> list[str]:
     """Different names of a comma-separated list."""
     return list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-
-
-def sizes(
-    superpixels: int | None, neighbours: int | None, max_size: float | None
-) -> dict[str, object]:
-    """Keys of the options that `solve` and `chain` share."""
-    return {
-        "segmentation.superpixels": superpixels,
-        "segmentation.neighbours": neighbours,
-        "max_size": max_size,
-    }
 
 
 def camera(text: str | None) -> list[float] | str | None:
@@ -159,58 +158,37 @@ def resumable(kept: str, where: object) -> Iterator[None]:
         raise StoppedError(f"interrupted: {kept}", where=where, hint=hint) from None
 
 
-class RowProgress:
-    """Prints finished rows: one updated line on a terminal, else a line per row."""
+def row_progress(quiet: bool, result_of: Callable[[Row], str] = lambda row: "done") -> Say:
+    """A function that prints finished rows: one updated line on a terminal, else a line per row.
 
-    def __init__(self, quiet: bool, result_of: Callable[[Row], str] = lambda row: "done") -> None:
-        """Make it; `result_of` makes a short text from a row that did not fail."""
-        self.quiet, self.result_of = quiet, result_of
-        self.live = sys.stderr.isatty()
+    `result_of` makes a short text from a row that did not fail.
+    """
+    live = sys.stderr.isatty()
 
-    def __call__(self, done: int, total: int, row: Row) -> None:
-        """Print a new row."""
-        if self.quiet:
-            return
-        result = f"failed: {reason(row)}" if failed(row) else self.result_of(row)
+    def say(done: int, total: int, row: Row) -> None:
+        result = f"failed: {reason(row)}" if failed(row) else result_of(row)
         line = f"{done}/{total}  {row['key']}  {result}  {row.get('seconds') or 0:.0f} s"
-        start, end = ("\r\x1b[2K", "\n" if done == total else "") if self.live else ("", "\n")
+        start, end = ("\r\x1b[2K", "\n" if done == total else "") if live else ("", "\n")
         print(f"{start}{line}", end=end, file=sys.stderr, flush=True)
 
-
-PACKAGE = "soup_nlp"
-"""Logger whose messages are printed."""
+    return (lambda *_: None) if quiet else say
 
 
-class SolveLog(logging.Handler):
-    """Lines for the terminal and for log.txt, and the present iteration, as a context manager.
+class SolveLog:
+    """Lines for the terminal and for log.txt, and the present iteration.
 
     Attributes:
         lines: All lines, for log.txt.
+        now: The present iteration on a terminal, a context manager; None elsewhere.
     """
 
     def __init__(self, quiet: bool, verbose: bool = False) -> None:
         """Make the log; `verbose` prints all lines."""
-        super().__init__(logging.INFO)
         self.console = Console(stderr=True, highlight=False)
         self.quiet, self.verbose = quiet, verbose
         self.lines: list[str] = []
-        self._detail, self._announced, self._mark = "", set[str](), time.perf_counter()
-        self._now = self.console.status("")
-        self._live = self.console.is_terminal and not quiet
-
-    def __enter__(self) -> Self:
-        self._logger = logging.getLogger(PACKAGE)
-        self._level = self._logger.level
-        self._logger.setLevel(logging.INFO)
-        self._logger.addHandler(self)
-        if self._live:
-            self._now.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._now.stop()
-        self._logger.removeHandler(self)
-        self._logger.setLevel(self._level)
+        self.now = self.console.status("") if self.console.is_terminal and not quiet else None
+        self._detail, self._warned, self._mark = "", set[str](), time.perf_counter()
 
     @property
     def listeners(self) -> dict[str, Any]:
@@ -237,28 +215,21 @@ class SolveLog(logging.Handler):
         now = time.perf_counter()
         self._print(f"{name:<13}{now - self._mark:6.1f} s  {self._detail}".rstrip())
         self._mark, self._detail = now, ""
-        if self._live:
-            self._now.update("")
+        if self.now:
+            self.now.update("")
 
     def iteration(self, progress: Progress) -> None:
         """Add an iteration of presolve, Ipopt or TRW-S."""
         self.lines.append(str(progress))
-        if self._live:
-            self._now.update(f"{progress.stage}, iteration {progress.iteration}")
+        if self.now:
+            self.now.update(f"{progress.stage}, iteration {progress.iteration}")
 
     def _warn(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-        if issubclass(category, DataWarning):
-            self._announce_once(f"warning: {printable(message)}", warning=True)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Print a message of the logger of the package, unless it was printed before."""
-        self._announce_once(printable(record.getMessage()))
-
-    def _announce_once(self, line: str, warning: bool = False) -> None:
-        if line not in self._announced:
-            self._announced.add(line)
+        line = f"warning: {printable(message)}"
+        if issubclass(category, DataWarning) and line not in self._warned:
+            self._warned.add(line)
             self.lines.append(line)
-            self._print(line, even_if_quiet=warning)
+            self._print(line, even_if_quiet=True)
 
     def interrupted(self, line: str) -> None:
         """Print a line from a signal handler, where Python's streams cannot be used."""

@@ -52,7 +52,7 @@ def show(
             )
         print(PRESET_FILES[preset].read_text("utf-8"), end="")
         return
-    chosen = load_problem(problem, options.changed(preset, overrides, {}))
+    chosen = load_problem(problem, options.changed(preset, overrides))
     footer = "" if all_options else "# all other options have their defaults: soup-nlp show --all\n"
     print(f"{dump_problem(chosen, all_options)}{footer}# hash {chosen.digest()}")
 
@@ -82,8 +82,7 @@ def export(
     quiet: options.Quiet = False,
 ) -> None:
     """Write the NLP as .nl for other solvers, started at the initialisation."""
-    size = [] if superpixels is None else [f"segmentation.superpixels={superpixels}"]
-    chosen = load_problem(problem, [*(overrides or []), *size])
+    chosen = load_problem(problem, options.changed(None, overrides, superpixels))
     out = out or default_folder(f"export-{chosen.name}", chosen.subject)
     # check the folder before the work
     claim(out, EXPORT_FILES, overwrite, chosen.subject)

@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -81,7 +81,6 @@ def solve(
         )
     source_of_flow = options.located(flow, "flow") if flow and is_path(flow) else json.dumps(flow)
     keys = {
-        **options.sizes(superpixels, neighbours, max_size),
         "refine.enabled": "false" if no_refine else None,
         "refine.from_start": "true" if no_nlp else None,
         "flow.source": source_of_flow if flow else None,
@@ -90,7 +89,7 @@ def solve(
         "depth_prior.source": options.located(depth_prior, "depth prior"),
         "depth_prior.kind": depth_prior_kind,
     }
-    changes = options.changed(preset, overrides, keys)
+    changes = options.changed(preset, overrides, superpixels, neighbours, max_size, **keys)
     camera = options.camera(intrinsics)
     pair = options.given(intrinsics=camera, fov=fov, depth=depth, undistort=undistort or None)
     words = source or []
@@ -158,7 +157,7 @@ def solve_problem(
         # then the start follows, which is kept
         interrupt.at_once = stage in ("load", "flow")
 
-    with interrupt as stop, log.warnings(), log, scratch() as temporary:
+    with interrupt as stop, log.warnings(), log.now or nullcontext(), scratch() as temporary:
         ipopt_log = temporary / "ipopt.log"
         try:
             listeners = {**log.listeners, "on_stage": on_stage}
@@ -249,11 +248,10 @@ def chain(
     name, subject = named(frames_of)
     out = out or default_folder(f"chain-{name}", subject)
 
-    short = options.sizes(superpixels, neighbours, max_size)
     flows = options.given(source=flow, backward=flow_backward)
     prior = options.given(source=depth_prior, kind=depth_prior_kind)
     sections: dict[str, Any] = options.given(flow=flows or None, depth_prior=prior or None)
-    progress, solved = options.RowProgress(quiet), list[Row]()
+    progress, solved = options.row_progress(quiet), list[Row]()
 
     def say(done: int, total: int, row: Row) -> None:
         solved.append(row)
@@ -271,7 +269,7 @@ def chain(
             frames=frames,
             depth_scale=depth_scale,
             **sections,
-            overrides=options.changed(preset, overrides, short),
+            overrides=options.changed(preset, overrides, superpixels, neighbours, max_size),
             workers=workers,
             overwrite=overwrite,
             say=say,
@@ -304,7 +302,6 @@ def batch(
     quiet: options.Quiet = False,
 ) -> int:
     """Solve many pairs, each into a folder of its own; goes on where it was stopped."""
-    short = options.sizes(superpixels, neighbours, max_size)
 
     def mre(row: options.Row) -> str:
         known = row.get("mre")
@@ -314,12 +311,12 @@ def batch(
         done = solve_batch(
             pairs,
             out,
-            overrides=options.changed(preset, overrides, short),
+            overrides=options.changed(preset, overrides, superpixels, neighbours, max_size),
             workers=workers,
             cluster=cluster,
             retry_failed=retry_failed,
             overwrite=overwrite,
-            say=options.RowProgress(quiet, mre),
+            say=options.row_progress(quiet, mre),
         )
     print(summary(done.rows, len(done.rows)))
     print(f"files       {out}/: {', '.join(FILES)}, pairs/")

@@ -4,7 +4,6 @@ See docs/confidence.md. All standard deviations are of log depth, the global sca
 factors are fitted by `python -m benchmarks sigma`, which leaves out one family after the other.
 """
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from soup_nlp.arrays import Float, Image, Mask
+from soup_nlp.data.formats.images import warn
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import ModelError
 from soup_nlp.evaluation.evidence import Evidence, evidence
@@ -26,7 +26,6 @@ from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
 from soup_nlp.start.scales import displacement, log_pace
 
-log = logging.getLogger(__name__)
 
 FACTORS = {
     "flow": 2.5,
@@ -248,7 +247,7 @@ def confidence(
         spread = spread_in_image(info, variances.plane, labels, pair.K_ref)
     except (ModelError, ArithmeticError) as error:
         # a foreign solver may return an answer without finite information
-        log.warning("no uncertainty can be computed, all depth counts as drawn: %s", error)
+        warn("sigma", f"no uncertainty can be computed, all depth counts as drawn: {error}")
         variances = Marginals(
             np.full((len(rec.soup), 3, 3), np.inf),
             np.full(int(start.component.max()) + 1, np.inf),

@@ -29,7 +29,7 @@ from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import covering
 from soup_nlp.start.prior_evidence import LEAST_SIGMA, PIECES, PriorEvidence, judged
 from soup_nlp.start.propose import Start, propose
-from soup_nlp.start.start_options import SeededStart
+from soup_nlp.start.start_options import HOMOGRAPHY, SeededStart
 from soup_nlp.start.views import FlowFit
 from soup_nlp.storage.progress import Watch
 from soup_nlp.storage.system import require_memory
@@ -141,7 +141,8 @@ def _segmented(problem: Problem, pair: Pair, labels: Labels) -> Segmentation:
 def _flow_fit(problem: Problem, pair: Pair, seg: Segmentation) -> FlowFit:
     """The flow of a pair as affine maps."""
     assert pair.flow is not None
-    options = SeededStart(**dict(problem.start), seed=problem.seed)
+    own = HOMOGRAPHY if problem.start.method == "homography" else {}
+    options = SeededStart(**dict(problem.start), **own, seed=problem.seed)
     return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, options)
 
 
@@ -240,7 +241,7 @@ def with_flow(problem: Problem, full: Pair, pair: Pair, log: Callable[[str], Non
     flow = flow or problem.flow.load(pair, problem.path)
     pair = pair.with_flow(flow)
     computed = is_named(flow.source) and not flow.source.startswith("truth")
-    behind = see_through(pair, problem.seed) if problem.flow.see_through and computed else None
+    behind = see_through(pair, problem.seed) if problem.flow.consistency and computed else None
     if behind is None:
         return pair
     if log:

@@ -11,10 +11,6 @@ class StartOptions(Section):
     method: Literal["shared", "homography"] = "shared"
     """shared (every superpixel takes one of the motions of the whole image) or homography (the
     paper's: epipolar geometry and homography of every superpixel, equal scales)."""
-    samples: Whole = 40
-    """Sampled pixels per superpixel."""
-    threshold_px: NonNegative = 1.0
-    """Inlier distance of a motion, pixels."""
     bending: bool = True
     """Whether surfaces may bend; if false, everything is rigid."""
     upright: bool = True
@@ -25,10 +21,18 @@ class StartOptions(Section):
     depths and components below it are lifted."""
 
 
+HOMOGRAPHY = {"samples": 100, "threshold_px": 0.5}
+"""Values of `SeededStart` for the paper's method."""
+
+
 class SeededStart(StartOptions):
     """StartOptions with the seed, which a problem has once, and what is no option of a problem."""
 
     seed: Seed = 0
     """Seed of sampling and RANSAC."""
+    samples: Whole = 40
+    """Sampled pixels per superpixel."""
+    threshold_px: NonNegative = 1.0
+    """Inlier distance of a motion, pixels."""
     discontinuity_px: NonNegative = 1.0
     """Jump of the flow between two neighbours at which a surface ends, pixels."""

@@ -81,7 +81,7 @@ def test_images_without_a_layer_are_left_alone(street: Pair):
 def test_true_flow_is_believed(reflecting: Pair):
     """The correction applies to computed flow only, and an option disables it."""
     memory = {"input": {"kind": "memory", "hash": "0"}}
-    for source, options in (("truth", {}), ("dis", {"see_through": False})):
+    for source, options in (("truth", {}), ("dis", {"consistency": False})):
         reflected = given(reflecting, still=True, source=source)
         problem = make_problem({**memory, "flow": options})
         believed = with_flow(problem, reflected, reflected, None)

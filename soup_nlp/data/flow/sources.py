@@ -107,10 +107,8 @@ class FlowOptions(Section):
     black for unusable."""
     consistency: bool = True
     """Weight a vector of DIS, or of a file with a backward flow, by how well its round trip closes;
-    if false, all vectors that stay in the image have the same weight, as in the paper."""
-    see_through: bool = True
-    """Search for the flow behind a layer that stands still before the scene, such as a reflection
-    in a windscreen, if the flow is computed."""
+    if false, all vectors that stay in the image have the same weight, as in the paper, and no flow
+    is searched for behind a layer that stands still, such as a reflection in a windscreen."""
 
     def load(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
         """The flow of a pair.
