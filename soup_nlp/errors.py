@@ -89,11 +89,7 @@ class StoppedError(SoupError):
 
 
 def one_line(value: object, what: str, where: str) -> str:
-    """A text that names something, if it fits on a line of a file, a page or a terminal.
-
-    Raises:
-        DataError: it is no text of 1 to 100 printable characters.
-    """
+    """A text of 1 to 100 printable characters, for one line of a terminal; else DataError."""
     if not (isinstance(value, str) and 0 < len(value) <= 100 and value.isprintable()):
         raise DataError(
             f"{what} is no short text",
@@ -106,13 +102,9 @@ def one_line(value: object, what: str, where: str) -> str:
 
 
 def expect(value: object, kinds: type | tuple[type, ...], what: str, make: str) -> None:
-    """Raise DataError unless an argument has an accepted type.
+    """Raise DataError unless an argument, called `what`, has an accepted type.
 
-    Args:
-        value: The argument.
-        kinds: Accepted types, as for isinstance().
-        what: Name and meaning of the argument.
-        make: How to make such an argument.
+    `make` says how to make such an argument.
     """
     if not isinstance(value, kinds):
         names = kinds if isinstance(kinds, tuple) else (kinds,)
@@ -133,15 +125,7 @@ def repr_of(value: object) -> str:
 
 
 def optional(package: str, extra: str) -> Any:
-    """An optional package.
-
-    Args:
-        package: Its name for `import`.
-        extra: The extra of soup-nlp that installs it.
-
-    Raises:
-        ConfigError: it is not installed; the message names the extra.
-    """
+    """An optional package by its name for `import`; without it ConfigError names the extra."""
     try:
         return import_module(package)
     except ModuleNotFoundError as error:

@@ -21,15 +21,11 @@ TABLE = "a first line with names of columns: ref and next, or problem; name, int
 
 
 def problems_of(pairs: Source, overrides: Sequence[str] = ()) -> dict[str, Problem]:
-    """Problems by name, which is that of their folder.
+    """Problems by name, which is that of their folder; SoupError if there is none, or one is wrong.
 
     A table has a line for each pair. Its columns are `problem` (a problem file), or `ref` and
     `next` with the other keys of two image files (`intrinsics`, `fov`, `depth`, ...), or any dotted
     key of a problem file (`flow.source`, `segmentation.superpixels`); `name` is optional.
-
-    Raises:
-        ConfigError: a key or a value is wrong.
-        DataError: there is no pair, or a table or its line is wrong.
     """
     found = list(_listed(pairs, overrides))
     if not found:

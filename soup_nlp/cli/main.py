@@ -66,11 +66,7 @@ def report_bug(error: BaseException) -> int:
 
 
 def refuse_odd(words: Sequence[str]) -> None:
-    """Reject empty arguments, which unset shell variables cause, and control characters.
-
-    Raises:
-        ConfigError: an argument is empty or holds a control character.
-    """
+    """ConfigError for control characters and empty arguments, which unset shell variables cause."""
     for word in words:
         if not word.strip() or re.fullmatch(r"--[a-z-]+=\s*", word):
             raise ConfigError("an argument is empty", where=word or "command line", found=words)

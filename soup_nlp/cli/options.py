@@ -125,11 +125,7 @@ def listed(text: str) -> list[str]:
 
 
 def camera(text: str | None) -> list[float] | str | None:
-    """Value of the key `intrinsics`: numbers, or the name of a file; None without a text.
-
-    Raises:
-        ConfigError: there are not four numbers.
-    """
+    """Value of the key `intrinsics`, four numbers or the name of a file; None without a text."""
     try:
         numbers = [] if text is None else [float(x) for x in text.split(",")]
     except ValueError:
@@ -146,11 +142,7 @@ def camera(text: str | None) -> list[float] | str | None:
 
 @contextmanager
 def resumable(kept: str, where: object) -> Iterator[None]:
-    """Context in which Ctrl-C ends the block with a message on the results that are kept.
-
-    Raises:
-        StoppedError: there was a Ctrl-C.
-    """
+    """Context that Ctrl-C ends with a StoppedError, which says what results are kept."""
     try:
         yield
     except KeyboardInterrupt:

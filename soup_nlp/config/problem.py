@@ -141,9 +141,6 @@ class Problem(Section):
 
         Names and places of files do not count: a data set that was moved is the same, a file that
         was replaced under its name is another one. Of data sets the pair that they hold counts.
-
-        Raises:
-            SoupError: the pair cannot be loaded, or a file cannot be read.
         """
         tree = self.model_dump(mode="json", exclude={"name", "base", "preset", "expected"})
         if self.input.kind not in ("files", "scene"):
@@ -172,11 +169,7 @@ class Problem(Section):
         return " ".join([*words, *(f"{key} {options[key]}" for key in keys if key in options)])
 
     def load_pair(self) -> Pair:
-        """The frame pair, without its flow.
-
-        Raises:
-            SoupError: a file is missing, damaged, or does not fit, or the pair was in memory only.
-        """
+        """The frame pair, without its flow; SoupError if a file is missing or damaged."""
         self.depth_prior.require_prior()
         return replace(self.input.load(self.path), name=self.name)
 
@@ -198,7 +191,7 @@ def shipped_problems() -> dict[str, Path]:
 def load_problem(
     path: str | Path, overrides: Sequence[str] = (), *, solved: bool = True
 ) -> Problem:
-    """Read a problem file.
+    """Read a problem file, which is a ConfigError if it is missing or has a mistake.
 
     Args:
         path: YAML file, or the bare name of a problem of the package, such as "street", whose
@@ -206,10 +199,6 @@ def load_problem(
         overrides: `a.b=value` with the value in YAML.
         solved: Whether Ipopt may run. If so, the file must not name libraries or files of Ipopt,
             since whoever wrote it would decide which code runs and which file is overwritten.
-
-    Raises:
-        ConfigError: the file is missing or not YAML, a key is unknown or given twice, a value is
-            of the wrong type or out of range.
     """
     path, base = _find(as_path(path, "problem file", error=ConfigError))
     text = read_text(path, "problem file", error=ConfigError)
@@ -261,18 +250,10 @@ def make_problem(
     where: str = "problem",
     lines: Mapping[Keys, str] | None = None,
 ) -> Problem:
-    """Check a mapping of sections and its overrides; see `load_problem`.
+    """Check a mapping of sections and its overrides, which both lie above the preset.
 
-    The options of `preset` lie below both.
-
-    Args:
-        raw: Sections by name.
-        overrides: `a.b=value` with the value in YAML.
-        where: Source of the mapping, for messages.
-        lines: Where in the source each key is, for messages.
-
-    Raises:
-        ConfigError: as `load_problem`.
+    `where` is the source of the mapping, and `lines` is where in it each key is, for messages; see
+    `load_problem`.
     """
     expect(raw, Mapping, "problem", "a dict of sections: {'input': {'kind': 'motorcycle'}}")
     expect(overrides, (list, tuple), "overrides", "a list such as ['solver.max_iter=200']")

@@ -88,16 +88,10 @@ def array_of(
     axes: str = "",
     hint: str | None = None,
 ) -> NDArray[Any]:
-    """An object as NumPy array, or a DataError with its name, origin, expectation and hint.
+    """An object as NumPy array; DataError if it is none, or of another kind of numbers or shape.
 
-    Args:
-        value: The object.
-        what: Its name, for the message.
-        where: Its origin, for the message.
-        expected: What it should be, for the message.
-        kinds: Accepted kinds of NumPy's data types, a letter each.
-        axes: Its shape, such as "(H, W, 2)"; any shape if empty.
-        hint: What to try, for the message.
+    `kinds` are the accepted kinds of NumPy's data types, a letter each; `axes` is the shape, such
+    as "(H, W, 2)", any if empty. The other arguments are for the message.
     """
     try:
         array = np.asarray(value)

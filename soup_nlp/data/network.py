@@ -106,11 +106,8 @@ class Network:
 def learned_flow(source: str, image_ref: Image, image_next: Image) -> Flow:
     """Flow of a network in both directions, with forward-backward confidence.
 
-    Args:
-        source: Path of an .onnx file. Of its outputs the largest flow (1, 2, h, w) in pixels is
-            used, and the last one of equal size.
-        image_ref: (H, W, 3) uint8 RGB reference image.
-        image_next: (H, W, 3) uint8 RGB next image of the same size.
+    Of the outputs of the .onnx file for two images (H, W, 3) of one size the largest flow
+    (1, 2, h, w) in pixels is used, and the last one of equal size.
     """
     if image_ref.shape != image_next.shape:
         shapes = f"{image_ref.shape} and {image_next.shape}"

@@ -132,21 +132,19 @@ ROWS = 128
 def full_depth(
     labels: Labels, small: Image, image: Image, normal: Float, offset: Float, K: Float
 ) -> FloatMap:
-    """Depth of planes at the size of a large image, borders of superpixels along its edges.
+    """Depth (H, W) of planes at the size of a large image, borders of superpixels along its edges.
 
     Joint bilateral upsampling (Kopf et al., 2007) of labels: near a border the 3 x 3 nearest pixels
-    of the small image vote, with more weight the closer they are in position and colour.
+    of the small image vote, with more weight the closer they are in position and colour. It is NaN
+    where the label is -1, which is a label too, or a plane turns away.
 
     Args:
-        labels: (h, w) superpixel of every pixel of the small image; -1 is a label too.
+        labels: (h, w) superpixel of every pixel of the small image.
         small: (h, w, 3) small image.
         image: (H, W, 3) large image.
         normal: (N, 3) normals of the planes `normal . X + offset = 0`, towards the camera.
         offset: (N,) offsets.
         K: (3, 3) intrinsics of the large image.
-
-    Returns:
-        (H, W) z; NaN where the label is -1 or a plane turns away.
     """
     (h, w), (height, width) = labels.shape, image.shape[:2]
     # pixels with more than one label among the 3 x 3 pixels around them

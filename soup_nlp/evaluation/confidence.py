@@ -26,7 +26,6 @@ from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
 from soup_nlp.start.scales import displacement, log_pace
 
-
 FACTORS = {
     "flow": 2.5,
     "scale": 1.5,

@@ -12,15 +12,7 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float:
 
 
 def rays(K: Float, uv: ArrayLike) -> Float:
-    """Rays `K^-1 (u, v, 1)` of pixels.
-
-    Args:
-        K: (3, 3) intrinsics.
-        uv: (..., 2) pixels.
-
-    Returns:
-        (..., 3) rays whose third component is 1.
-    """
+    """Rays (..., 3), `K^-1 (u, v, 1)`, of pixels (..., 2)."""
     uv = np.asarray(uv, float)
     y = (uv[..., 1] - K[1, 2]) / K[1, 1]
     x = (uv[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]

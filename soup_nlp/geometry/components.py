@@ -124,15 +124,8 @@ def find_components(
     """One rigid motion for every group of superpixels; groups with the same motion are joined.
 
     A motion is fitted to the anchors and rims as their superpixels' motions move them: least
-    absolute distances in the next image by re-weighted Procrustes fits.
-
-    Args:
-        soup: Solved state.
-        seg: Superpixels.
-        group: (N,) groups, such as the components of the start; the first is the background.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        K_next: (3, 3) intrinsics of the next frame.
-        borrowed: (N,) superpixels with the depth of neighbours; None for none.
+    absolute distances in the next image by re-weighted Procrustes fits. The first of the groups
+    (N,) is the background; `borrowed` (N,) marks superpixels with the depth of neighbours.
     """
     ray = rays(K_ref, np.concatenate([seg.anchors[:, None], seg.rim], axis=1))
     before = soup.points(ray)

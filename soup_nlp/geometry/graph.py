@@ -83,17 +83,11 @@ def build_segmentation(
     neighbours: int = 15,
     boundary_samples: int | None = 3,
 ) -> Segmentation:
-    """Graphs and weights of a segmentation.
+    """Graphs and weights of superpixels 0..N-1, labels (H, W), of an RGB image.
 
-    Args:
-        labels: (H, W) superpixel labels 0..N-1.
-        image: (H, W, 3) uint8 RGB.
-        neighbours: K of the K-NN graph; at most N - 1 (a larger K is an error).
-        boundary_samples: Boundary points kept per pair, evenly spaced; None takes as many as the
-            longest boundary has (shorter ones repeat their points, nearly evenly).
-
-    Raises:
-        DataError: K >= N.
+    K = `neighbours` is at most N - 1, else DataError. `boundary_samples` points, evenly spaced, are
+    kept of every shared boundary; None takes as many as the longest boundary has (shorter ones
+    repeat their points, nearly evenly).
     """
     n = int(labels.max()) + 1
     if n > 1 and not 1 <= neighbours < n:

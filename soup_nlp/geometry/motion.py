@@ -30,11 +30,7 @@ class RigidMotion:
     __repr__ = __str__
 
     def __call__(self, points: Float) -> Float:
-        """The points (..., 3), moved.
-
-        Raises:
-            DataError: the points are not numbers of shape (..., 3).
-        """
+        """The points (..., 3), moved; DataError for what is no array of points."""
         try:
             x = np.asarray(points, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
@@ -83,12 +79,9 @@ class RigidMotion:
 
 
 def fit_motion(before: Float, after: Float, weight: Float) -> RigidMotion:
-    """The rigid motion of least weighted squares between points (M, 3) (Procrustes).
+    """The rigid motion of least squares between points (M, 3) and the same, moved (Procrustes).
 
-    Args:
-        before: (M, 3) points.
-        after: (M, 3) the same points, moved.
-        weight: (M,) not negative, not all 0.
+    Weights (M,) are not negative, and not all 0.
     """
     share = weight / weight.sum()
     a, b = share @ before, share @ after

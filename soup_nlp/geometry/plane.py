@@ -46,14 +46,8 @@ def about_anchor(Z: Float, g: Float, anchor_ray: Float) -> Float:
 def tilt_to_camera(soup: Soup, anchor_ray: Float, visibility_ray: Float, min_facing: float) -> Soup:
     """The soup with planes that break visibility tilted about their anchors until they satisfy it.
 
-    The depth at the anchor, which is positive, is kept. A plane parallel to the image satisfies
-    every row.
-
-    Args:
-        soup: State.
-        anchor_ray: (N, 3).
-        visibility_ray: (N, V, 3) rays v of `-n . v >= min_facing`.
-        min_facing: Least cosine, times the length of v.
+    It is `-n . v >= min_facing` at rays v (N, V, 3). The depth at the anchor rays (N, 3), which is
+    positive, is kept. A plane parallel to the image satisfies every row.
     """
     Z, g = at_anchor(inverse_depth(soup.n, soup.distance), anchor_ray)
     share = np.ones(len(soup))

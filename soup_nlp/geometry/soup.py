@@ -173,14 +173,10 @@ def reconstruct(
     K_next: Float,
     size_next: tuple[int, int] | None = None,
 ) -> Reconstruction:
-    """Dense reconstruction of both frames.
+    """Dense reconstruction of both frames, whose cameras are (3, 3).
 
-    Args:
-        soup: State of N superpixels.
-        labels: (H, W) superpixel of every pixel, 0..N-1.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        K_next: (3, 3) intrinsics of the next frame.
-        size_next: (height, width) of the next frame; default as the reference.
+    `labels` (H, W) are the superpixels of the pixels, `size_next` is the (height, width) of the
+    next frame, by default that of the reference.
     """
     height, width = labels.shape
     uv = pixel_grid(height, width)
@@ -201,15 +197,9 @@ def reconstruct(
 def nearest_on_top(target: Float, z: Float, size: tuple[int, int]) -> Int:
     """Reference pixel that every pixel of the next frame shows: that of the nearest surface.
 
-    Cracks of one pixel in a stretched surface are closed.
-
-    Args:
-        target: (H, W, 2) pixel in the next frame of every reference pixel.
-        z: (H, W) its depth there.
-        size: (height, width) of the next frame.
-
-    Returns:
-        (height, width) index of the reference pixel in row order, -1 where nothing lands.
+    From the target (H, W, 2) and depth there (H, W) of the reference pixels it is (height, width)
+    indices in row order, -1 where nothing lands. Cracks of one pixel in a stretched surface are
+    closed.
     """
     height, width = size
     ok = np.flatnonzero((np.isfinite(target).all(-1) & (z > 0)).ravel())

@@ -30,19 +30,11 @@ def segment(
     count: int,
     method: Literal["slic", "grid"] = "slic",
 ) -> Labels:
-    """Superpixel labels of an image.
+    """Superpixel labels (H, W) of an RGB image, each connected (4-neighbourhood) and not empty.
 
-    Args:
-        image: (H, W, 3) uint8 RGB.
-        count: Wanted number of superpixels; the answer differs by at most 3 %, or by one. A grid
-            has a whole number of rows and columns.
-        method: "slic" (Achanta et al. 2012, skimage) or "grid" (the paper's worst case).
-
-    Returns:
-        (H, W) int32 labels 0..N-1, each connected (4-neighbourhood) and not empty.
-
-    Raises:
-        DataError: count is not between 1 and a quarter of the pixels.
+    The number differs from `count`, 1 to a quarter of the pixels, by at most 3 %, or by one; a grid
+    has a whole number of rows and columns. The method is "slic" (Achanta et al. 2012, skimage) or
+    "grid" (the paper's worst case).
     """
     height, width = image.shape[:2]
     if not 1 <= count <= height * width // 4:

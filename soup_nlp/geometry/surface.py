@@ -34,9 +34,9 @@ def hidden(rec: Reconstruction) -> Mask:
 def joined(
     planes: Float, labels: NDArray[np.integer], group: NDArray[np.integer], K: Float
 ) -> tuple[Mask, Mask]:
-    """Whether neighbouring pixels lie on one continuous surface.
+    """Whether pixels are on one continuous surface with those to the right, (H, W - 1), and below.
 
-    They do within a superpixel, and across the border of two superpixels of one group whose planes
+    They are within a superpixel, and across the border of two superpixels of one group whose planes
     meet there.
 
     Args:
@@ -44,9 +44,6 @@ def joined(
         labels: (H, W) superpixels.
         group: (H, W) groups such as rigid components.
         K: (3, 3) intrinsics, pixels.
-
-    Returns:
-        (H, W - 1) for every pixel and the one to its right, (H - 1, W) and the one below.
     """
     ray = rays(K, pixel_grid(*labels.shape))
     out = []
@@ -77,11 +74,8 @@ def at_jumps(right: Mask, below: Mask) -> Mask:
 def whole_cells(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Mask:
     """((H - 1) / step, (W - 1) / step) cells of `step` pixels that no break of the surface crosses.
 
-    Args:
-        right: (H, W - 1) whether the surface continues to the right, see `joined`.
-        below: (H - 1, W) whether it continues downwards.
-        keep: (H, W) pixels that are part of the surface.
-        step: Pixels of a side of a cell.
+    `right` and `below` say where it continues, see `joined`; `keep` (H, W) are the pixels that are
+    part of it.
     """
     height, width = keep.shape
     if min(height, width) <= step:

@@ -52,9 +52,6 @@ def prepare(
         log: Called with a line after every stage.
         on_stage: Called with the name of a stage at its end: "load", "flow", "segmentation",
             "start".
-
-    Raises:
-        SoupError: the input cannot be used.
     """
 
     def done(stage: str, line: object = None) -> None:
@@ -89,11 +86,7 @@ def prepare(
 
 
 def observed_pair(problem: Problem) -> Pair:
-    """The pair of a problem with its flow, its focal length by the flow where it was a guess.
-
-    Raises:
-        SoupError: the input cannot be used.
-    """
+    """The pair of a problem with its flow, and the focal length by it where it was a guess."""
     return _observed(problem, None, None, lambda *_: None)[1]
 
 

@@ -98,8 +98,7 @@ class CheckReport:
 def check_folder(folder: str | Path) -> CheckReport:
     """Recompute energy, constraints, depth and scores of a result, and compare everything else.
 
-    Raises:
-        DataError: a file, a claim or an array is missing or malformed.
+    A file, a claim or an array that is missing or malformed is a DataError.
     """
     stored = Stored.read(folder)
     try:

@@ -52,11 +52,8 @@ def prepare_folder(
 ) -> Path:
     """Check that a result can be written into a folder, before anything is computed.
 
-    `inputs` are files and folders of the problem, which may not lie in it; for `overwrite` and
-    `subject` see `storage.folders.claim`.
-
-    Raises:
-        DataError: the folder cannot be written, or holds a file that must not be overwritten.
+    `inputs` are files and folders of the problem, which may not lie in it; for `overwrite`,
+    `subject` and errors see `storage.folders.claim`.
     """
     folder = as_path(folder, "output folder")
     # realpath, unlike resolve, accepts a link to itself

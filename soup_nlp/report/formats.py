@@ -42,12 +42,7 @@ class Format(NamedTuple):
 def write_formats(folder: Path, chain: Chain, names: Sequence[str]) -> list[str]:
     """Write a chain, or a pair as one, in several formats into an existing folder.
 
-    Returns:
-        Names of the files and folders that were written.
-
-    Raises:
-        ConfigError: a format is not known.
-        DataError: a file cannot be written, or a package is missing.
+    Returns the names of the files and folders that were written.
     """
     chosen, files = [FORMATS[name] for name in check_formats(names)], list[str]()
     for k, frame in enumerate(chain):
@@ -67,11 +62,7 @@ def write_formats(folder: Path, chain: Chain, names: Sequence[str]) -> list[str]
 
 
 def check_formats(names: Sequence[str]) -> list[str]:
-    """Check names of formats and return them without repetitions.
-
-    Raises:
-        ConfigError: a name is unknown, there is no name, or it is not a list of names.
-    """
+    """Check names of formats and return them without repetitions; ConfigError for unknown ones."""
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise ConfigError(
             "formats are no list of names",
@@ -171,9 +162,6 @@ def _write_recording(path: Path, chain: Chain) -> None:
     """Write images, depth, cameras, points and components of all frames, on a timeline `frame`.
 
     The world is the first camera (x right, y down, z ahead); the static scene does not move.
-
-    Raises:
-        ConfigError: the package rerun-sdk is not installed.
     """
     rr = optional("rerun", "rerun")
     out = rr.RecordingStream("soup_nlp")

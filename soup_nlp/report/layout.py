@@ -207,11 +207,7 @@ def result_tree(run: Run) -> ReadTree:
 
 
 def require_layout(tree: ReadTree) -> None:
-    """Check every stored array against its row of `TABLE`.
-
-    Raises:
-        DataError: an array has a wrong shape or type, or indices out of range.
-    """
+    """DataError unless every stored array fits its row of `TABLE`: axes, type, range of indices."""
     # of the shared axes, as the first array has them
     sizes: dict[str, int] = {}
     for path, row in LAYOUT.items():
@@ -255,11 +251,7 @@ class Stored:
 
     @classmethod
     def read(cls, folder: str | Path) -> Self:
-        """Those of a folder, whose arrays fit `TABLE`.
-
-        Raises:
-            DataError: the folder holds no result, or a damaged one.
-        """
+        """Those of a folder; DataError if it holds no result whose arrays fit `TABLE`."""
         folder = as_path(folder, "result folder")
         tree = read_h5(folder / "result.h5")
         claims = read_json(folder / "summary.json", "summary.json", Summary)

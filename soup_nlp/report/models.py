@@ -41,15 +41,9 @@ def write_ply(
 ) -> int:
     """Write a coloured point cloud (binary little endian, float32 and uchar); returns its size.
 
-    Points with a number that is not a finite float32 are left out.
-
-    Args:
-        path: File to write; its folder must exist.
-        xyz: (..., 3) positions.
-        rgb: (..., 3) uint8 colours.
-        normals: (..., 3) unit normals.
-        scalars: (...) numbers by the name of their property, such as "component".
-        comments: Lines of the header.
+    Positions, colours (uint8) and unit normals are (..., 3), scalars (...) by the name of their
+    property, such as "component"; comments are lines of the header. Points with a number that is
+    not a finite float32 are left out.
     """
     parts = [np.reshape(part, (-1, 3)) for part in (xyz, normals) if part is not None]
     parts += [np.reshape(part, (-1, 1)) for part in (scalars or {}).values()]
@@ -229,8 +223,7 @@ VISIBLE = 0.03
 def write_views(folder: Path, chain: Chain) -> None:
     """Write `images/`, and `masks/` that are black where something moves by itself.
 
-    Raises:
-        DataError: a camera has skew, which the models of other programs do not have.
+    A camera with skew, which the models of other programs do not have, is a DataError.
     """
     for frame in chain:
         if frame.K[0, 1] != 0:

@@ -29,14 +29,10 @@ def explain(
     source: str,
     lines: Mapping[Keys, str],
 ) -> ConfigError:
-    """The first mistake as a ConfigError, with the number of further mistakes.
+    """The first mistake of a validation as a ConfigError, with the number of further ones.
 
-    Args:
-        error: Error of pydantic with all mistakes.
-        model: Model of the whole problem.
-        tree: The problem before validation, overrides included.
-        source: Name of the file, or "command line".
-        lines: Origin of a key in the source, such as "line 7" or "--set", by its path.
+    `tree` is the problem before validation, overrides included; `source` and `lines`, the origin of
+    a key by its path such as "line 7" or "--set", tell where a key is.
     """
     by_key: dict[Keys, list[Any]] = {}
     for item in error.errors():

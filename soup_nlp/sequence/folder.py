@@ -35,11 +35,7 @@ SINGLE = CHAIN, "trajectory.tum", PAGE
 
 
 def is_chain(folder: Path) -> bool:
-    """Whether a folder is that of a chain.
-
-    Raises:
-        DataError: it is, but the chain is not finished.
-    """
+    """Whether a folder is that of a chain, which is a DataError if it is not finished."""
     if is_file(folder / CHAIN) or not is_file(folder / ROWS):
         return is_file(folder / CHAIN)
     rows = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
@@ -69,11 +65,7 @@ def load(folder: str | Path) -> Result | Chain:
 
 
 def read_chain(folder: Path) -> Chain:
-    """The chain of a folder, made again from its pairs.
-
-    Raises:
-        DataError: a pair is missing or damaged.
-    """
+    """The chain of a folder, made again from its pairs; DataError if one is missing or damaged."""
     contents = read_json(folder / CHAIN, CHAIN, Contents)
     return make_chain(read_pairs(folder, len(contents["scales"])), contents)
 
@@ -84,11 +76,7 @@ def read_pairs(folder: Path, count: int) -> Lazy[Result]:
 
 
 def check(folder: Path) -> CheckReport:
-    """Recompute every claim of a result, or of the pairs of a chain with its scales and poses.
-
-    Raises:
-        DataError: the folder holds neither, or a damaged one.
-    """
+    """Recompute every claim of a result, or of the pairs of a chain with its scales and poses."""
     if not is_chain(folder):
         return check_folder(folder)
     chain, claims = read_chain(folder), []
@@ -118,20 +106,10 @@ def chain_of(folder: Path) -> Chain:
 def convert(
     folder: Path, formats: Sequence[str], out: Path | None = None, overwrite: bool = False
 ) -> list[str]:
-    """Write the result or the chain of a folder in other formats.
+    """Write the result or the chain of a folder in `formats.FORMATS`; returns names of the files.
 
-    Args:
-        folder: The folder.
-        formats: See `formats.FORMATS`.
-        out: Output folder; None for the same folder.
-        overwrite: Overwrite files that the program did not make.
-
-    Returns:
-        Names of the files and folders.
-
-    Raises:
-        ConfigError: a format is not known.
-        DataError: there is no result, or the output folder cannot be written.
+    They go into the same folder unless `out` is another one; files that the program did not make
+    are overwritten with `overwrite` only.
     """
     names, chain = check_formats(formats), chain_of(folder)
     with staged(folder if out is None else out, overwrite=overwrite) as new:
@@ -139,11 +117,7 @@ def convert(
 
 
 def renew_page(folder: Path) -> Path:
-    """Make the page of a result or a chain again from its arrays; returns it.
-
-    Raises:
-        DataError: the folder holds neither or a page that was changed, or cannot be written.
-    """
+    """Make the page of a result or a chain again, unless it was changed; returns its path."""
     found = chain_of(folder)
     with staged(folder) as new:
         try:
@@ -162,14 +136,8 @@ def chain_files(count: int) -> list[str]:
 def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -> Chain:
     """Write every file of a chain, `chain_files`, into an existing folder.
 
-    Args:
-        folder: The folder.
-        chain: The chain.
-        name: Name of the sequence.
-        sources: Path or description of every frame.
-
-    Returns:
-        The chain with the contents of its chain.json.
+    `sources` are the paths or descriptions of the frames. Returns the chain with the contents of
+    its chain.json.
     """
     scale = depth_png_scale(chain.depths)
     (folder / "depth").mkdir(exist_ok=True)

@@ -90,12 +90,9 @@ def pair_name(k: int) -> str:
 
 
 def find_images(source: Path) -> list[Path]:
-    """Images of a folder or of a pattern such as `clip/*.jpg`, in the order of their numbers.
+    """Images, two at least, of a folder or pattern such as `clip/*.jpg`, in order of their numbers.
 
     In a folder with images named frame_*, only these are used. Hidden files are no images.
-
-    Raises:
-        DataError: there are fewer than two.
     """
     source = as_path(source, "frames")
     root = next(folder for folder in (source, *source.parents) if folder.is_dir())
@@ -137,10 +134,7 @@ def numbered_files(folder: Path, kinds: Sequence[str], what: str, first: str = "
     """Files of a folder, or of a pattern such as `flow/*.flo`, in the order of their numbers.
 
     `kinds` are their suffixes, `what` says in messages what they hold, and those that match the
-    pattern `first` are preferred.
-
-    Raises:
-        DataError: there is none.
+    pattern `first` are preferred. None is a DataError.
     """
     folder = as_path(folder, f"folder of {what}", home=True)
     found = folder.glob("*") if folder.is_dir() else folder.parent.glob(folder.name)
@@ -152,11 +146,7 @@ def numbered_files(folder: Path, kinds: Sequence[str], what: str, first: str = "
 
 
 def check_sizes(images: Sequence[Path], turn: bool) -> None:
-    """Read all pictures of a sequence, which must have one size; `turn` as for `read_image`.
-
-    Raises:
-        DataError: one is damaged, or they differ in size.
-    """
+    """Read all pictures of a sequence, which must have one size; `turn` as for `read_image`."""
     sizes: dict[tuple[int, int], Path] = {}
     for path in images:
         height, width = read_image(path, turn=turn).shape[:2]
@@ -178,11 +168,7 @@ def is_video(path: Path) -> bool:
 
 
 def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = None) -> list[Path]:
-    """Write every `stride`-th frame of a video as PNG into a folder; returns their paths.
-
-    Raises:
-        DataError: the video cannot be read, or the folder holds other files of these names.
-    """
+    """Write every `stride`-th frame of a video as PNG into a folder; returns their paths."""
     # FFmpeg takes a name such as 10:05:07.mp4 for an address, and reads text as pictures of it
     path = require_file(path, "video").absolute()
     expected = "a video that FFmpeg reads, of two frames at least"
@@ -218,9 +204,8 @@ def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = N
 def in_order(paths: Sequence[Path]) -> list[Path]:
     """Files by the numbers in their names.
 
-    Raises:
-        DataError: digits around a point may be a decimal (9.25, 9.5) or two numbers (0.9, 0.10),
-            and the orders differ.
+    DataError if digits around a point may be a decimal (9.25, 9.5) or two numbers (0.9, 0.10) and
+    the orders differ.
     """
     decimals, numbers = (
         sorted(paths, key=lambda path: [_by_number(part, digits) for part in path.parts])

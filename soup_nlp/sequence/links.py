@@ -85,11 +85,7 @@ def near_link(pairs: Sequence[Result], a: int) -> Link | None:
 
 
 def chained_scales(total: int, links: Sequence[Link]) -> Float:
-    """(total,) scales of pairs, 1 for the first: links in a row, a bridge before flagged ones.
-
-    Raises:
-        DataError: a pair is linked to none before it.
-    """
+    """(total,) scales of pairs, 1 for the first: links in a row, a bridge before flagged ones."""
     out, ending = np.ones(total), dict[int, list[Link]]()
     for one in links:
         ending.setdefault(one.second, []).append(one)
@@ -102,14 +98,10 @@ def chained_scales(total: int, links: Sequence[Link]) -> Float:
 
 
 def make_chain(pairs: Sequence[Result], summary: Mapping[str, Any] | None = None) -> Chain:
-    """Determine a common scale of consecutive pairs, the camera path, and tracks of components.
+    """A common scale of pairs, the frames (0, 1), (1, 2) ..., camera path and tracks of components.
 
-    Args:
-        pairs: Results of the frames (0, 1), (1, 2), ..., at least one.
-        summary: Contents of chain.json.
-
-    Raises:
-        DataError: a pair shares no pixel with those before it.
+    `summary` has the contents of chain.json. A pair that shares no pixel with those before it is a
+    DataError.
     """
     near, bridges, matches, briefs = list[Link | None](), list[Link | None](), [], list[Brief]()
     # every pair is read once

@@ -158,11 +158,7 @@ def true_poses(chain: Chain) -> Float | None:
 
 
 def read_path(path: Path) -> Float:
-    """(M, 4, 4) world_from_camera of a trajectory of TUM (8 numbers a line) or KITTI (12).
-
-    Raises:
-        DataError: the file is neither.
-    """
+    """(M, 4, 4) world_from_camera of a trajectory of TUM (8 numbers a line) or KITTI (12)."""
     try:
         rows = np.loadtxt(read_text(path, "trajectory").splitlines(), ndmin=2)
         out = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -180,17 +176,10 @@ def read_path(path: Path) -> Float:
 def path_errors(chain: Chain, poses: Float) -> dict[str, float] | None:
     """Errors of the camera's path after the best similarity, as evo computes them.
 
-    Args:
-        chain: The chain.
-        poses: (K + 1, 4, 4) true world_from_camera.
-
-    Returns:
-        "ate": root mean square of the distances of the cameras. "rpe", "rpe_degrees": of the shifts
-        and turns by which motions from frame to frame differ. "length" of the true path; "share" is
-        "ate" over it. None for fewer than three frames, or a path of no length.
-
-    Raises:
-        DataError: there is not one pose for each frame.
+    `poses` are the true world_from_camera (K + 1, 4, 4), one for each frame. "ate" is the root mean
+    square of the distances of the cameras, "rpe" and "rpe_degrees" those of the shifts and turns by
+    which motions from frame to frame differ, "length" that of the true path, and "share" is "ate"
+    over it. None for fewer than three frames, or a path of no length.
     """
     if len(poses) != len(chain):
         raise DataError("path and chain differ in length", found=len(poses), expected=len(chain))

@@ -162,12 +162,7 @@ def solve_chain(
 
 
 def _files_of_pairs(keys: Raw, count: int, stride: int) -> dict[tuple[str, str], list[Path]]:
-    """Files of every pair, by section and key of the problem that name their folder or pattern.
-
-    Raises:
-        ConfigError: frames are left out between those that the files are of.
-        DataError: there are fewer files than pairs.
-    """
+    """Files of every pair, by section and key of the problem that name their folder or pattern."""
     out = {}
     for (section, key), kinds in FILES.items():
         name = (keys.get(section) or {}).get(key)
@@ -190,17 +185,10 @@ def solve_pairs(
     workers: int = 1,
     say: Say | None = None,
 ) -> None:
-    """Solve pairs in parallel processes into `pairs/000_001/` ...; those that are kept are not.
+    """Solve the pairs that are not kept into `pairs/000_001/` ...; SolverError if one fails.
 
-    Args:
-        problems: Problems of the pairs, by the name of their folder.
-        heads: `head` of every problem.
-        folder: Output folder.
-        workers: Number of processes; fewer run where their memory would not suffice.
-        say: Called with (done, total, row) after every solve.
-
-    Raises:
-        SolverError: a pair cannot be solved.
+    Problems and their `head` are by name of the folder. Fewer than `workers` processes run where
+    their memory would not suffice. `say` is called with (done, total, row) after every solve.
     """
     done = {k: row for k, row in kept_rows(folder, heads).items() if not failed(row)}
     todo = {

@@ -54,10 +54,6 @@ def each(
         cluster: Address of the scheduler of a Dask cluster, tcp://HOST:PORT, instead.
         fresh: A new process for every job, also with one worker.
         seconds: Wall time after which the process of a job is killed.
-
-    Raises:
-        ConfigError: Dask is not installed.
-        DataError: the scheduler of the cluster is lost.
     """
     if cluster is not None:
         yield from _on_cluster(jobs, cluster)

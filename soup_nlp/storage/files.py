@@ -125,8 +125,7 @@ def read_text(
 def parse_json(text: str) -> Any:
     """The value of a JSON text; its strings are made printable on one line.
 
-    Raises:
-        ValueError: it is not JSON, is nested too deeply, or has a number that is no float64.
+    ValueError if it is not JSON, is nested too deeply, or has a number that is no float64.
     """
     try:
         return _printable(json.loads(text, parse_constant=_constant))
@@ -183,9 +182,8 @@ def _printable(value: Any) -> Any:
 def compose_yaml(text: str) -> yaml.Node | None:
     """The nodes of a YAML text without aliases and tags; None for an empty one.
 
-    Raises:
-        ValueError: it is not YAML (its cause is the YAML error), too long, nested too deeply, or
-            has an alias, by which a short text may have many values, or a tag.
+    ValueError if it is not YAML (its cause is the YAML error), too long, nested too deeply, or has
+    an alias, by which a short text may have many values, or a tag.
     """
     if len(text) > MOST_YAML:
         raise ValueError(f"{len(text)} characters, at most {MOST_YAML} are read")

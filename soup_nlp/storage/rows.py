@@ -70,19 +70,12 @@ def measure_all(
     after: Callable[[list[Row]], None] | None = None,
     **options: Any,
 ) -> list[Row]:
-    """The row of every job, from the file or else measured.
+    """The row of every job, from the JSON-lines file or else measured by `each` with its options.
 
     A stored row is used for a job of the same name and code version unless the row failed. Every
     new row is appended as soon as it is measured, so that an interrupted run can be continued.
-
-    Args:
-        jobs: Jobs to measure.
-        path: JSON-lines file.
-        workers: See `each`.
-        say: Called with (done, total, row) after every new row.
-        after: Called with all rows so far, in the order of the jobs, after every new row and at the
-            end.
-        options: Further options of `each`.
+    `say` is called with (done, total, row) after every new row, and `after` with all rows so far,
+    in the order of the jobs, after every new row and at the end.
     """
     code = code_version()
     job_of = {_identity(entries, entries): (entries, work) for entries, work in jobs}

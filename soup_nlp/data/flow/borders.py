@@ -31,20 +31,12 @@ def follow_flow(
     flow: Flow,
     margin_px: float = 1.0,
 ) -> Labels:
-    """Move the borders of superpixels to discontinuities of the flow.
+    """Move borders of superpixels, labels (H, W), to discontinuities of the flow.
 
     In every sweep a border pixel changes to the neighbour whose affine flow (see `fit_affine`) is
     nearest to the flow of the pixel, if it is nearer than that of its superpixel by more than the
-    margin. Pixels without confidence do not change.
-
-    Args:
-        labels: (H, W) superpixel labels 0..N-1.
-        flow: Flow with confidence.
-        margin_px: Smallest reduction of the residual by a change, pixels.
-
-    Returns:
-        (H, W) int32 labels 0..N'-1, each connected (4-neighbourhood) and not empty; N' may differ
-        from N.
+    margin. Pixels without confidence do not change. Each new label 0..N'-1 is connected
+    (4-neighbourhood) and not empty; N' may differ from N.
     """
     current = labels.astype(np.int64)
     count = int(current.max()) + 1
@@ -73,17 +65,10 @@ def follow_flow(
 
 
 def follow_depth(labels: NDArray[np.integer], log_depth: Float) -> Labels:
-    """Move the borders of superpixels to steps of a depth, as `follow_flow` does for a flow.
+    """Move borders of superpixels to steps of a log depth (H, W), NaN where borders stay.
 
     A plane across a step has the depth of one side alone. Log depth in units of `LEAST_STEP`
-    takes the place of the flow.
-
-    Args:
-        labels: (H, W) superpixel labels 0..N-1.
-        log_depth: (H, W) log depth; NaN where borders stay.
-
-    Returns:
-        (H, W) int32 labels as those of `follow_flow`.
+    takes the place of the flow of `follow_flow`.
     """
     finite = np.isfinite(log_depth)
     units = np.where(finite, log_depth, 0.0) / LEAST_STEP
@@ -122,18 +107,12 @@ class AffineFlow:
 
 
 def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Float]:
-    """Fit by iteratively re-weighted least squares with Cauchy weights `1 / (1 + (r / s)^2)`.
+    """Affine flow of superpixels, and last weights (P,) of the pixels with positive confidence.
 
-    s is the larger of `SCALE_PX` and 1.48 times the weighted mean absolute residual of the
-    superpixel. The first weights follow from the distance to its median flow, since plain least
-    squares would fit a slope across two motions without outliers.
-
-    Args:
-        flow: Flow, whose confidence multiplies the weights.
-        labels: (H, W) superpixel labels 0..N-1.
-
-    Returns:
-        The fits, and the last weights (P,) of the pixels with positive confidence.
+    Least squares are re-weighted by the confidence times Cauchy's `1 / (1 + (r / s)^2)`. s is the
+    larger of `SCALE_PX` and 1.48 times the weighted mean absolute residual of the superpixel. The
+    first weights follow from the distance to its median flow, since plain least squares would fit a
+    slope across two motions without outliers.
     """
     v, u = np.nonzero(flow.confidence > 0)
     which, n = labels[v, u].astype(np.int64), int(labels.max()) + 1

@@ -28,15 +28,10 @@ MOST = 5.0
 
 
 def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
-    """Distance of each pixel to its image under the forward and then the backward flow.
+    """(H, W) distance of each pixel to its image under the forward, then the backward flow, pixels.
 
-    Args:
-        forward: (H, W, 2) flow from the first to the second image, pixels.
-        backward: (H', W', 2) flow from the second to the first image, pixels.
-
-    Returns:
-        (H, W) float32, pixels; infinite where the forward flow leaves the second image or one of
-        the flows is not finite.
+    It is infinite where the forward flow (H, W, 2) leaves the second image, or where it or the
+    backward flow (H', W', 2) is not finite.
     """
     height, width = forward.shape[:2]
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -68,12 +63,8 @@ def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.boo
 def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:
     """(H, W) confidence in [0, 1] of a round-trip error.
 
-    With e the error and E the larger of e and the mean of min(e, `MOST`) over a window, the
-    confidence is `exp(-E^2)`, E in pixels, and 0 where E > `LIMIT`.
-
-    Args:
-        gap: (H, W) round-trip error, pixels; infinite where the flow leaves the next image.
-        support: Side of the window for the mean error, odd, pixels.
+    With e the error and E the larger of e and the mean of min(e, `MOST`) over a window of `support`
+    pixels (odd), the confidence is `exp(-E^2)`, E in pixels, and 0 where E > `LIMIT`.
     """
     gap = np.maximum(gap, cv2.blur(np.minimum(gap, MOST), (support, support)))
     confidence = np.exp(-np.square(np.minimum(gap, LIMIT)), dtype=np.float32)
@@ -93,15 +84,9 @@ MOST_PIXELS = 250_000
 def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
     """Compare the images of a pair along a flow that was not computed here.
 
-    Args:
-        flow: The flow.
-        pair: Its images.
-        backward: The flow is from the next to the reference image. It may be wrong in parts, which
-            the round trip finds.
-
-    Raises:
-        DataError: the flow is in another order, direction or unit, leads out of the image, or is
-            worse than no flow.
+    It is a DataError if it is in another order, direction or unit, leads out of the image, or is
+    worse than no flow. One from the next to the reference image, `backward`, may be wrong in parts,
+    which the round trip finds.
     """
     if backward:
         pair = Pair(pair.image_next, pair.image_ref, pair.K_next, pair.K_ref)

@@ -30,15 +30,9 @@ _GREY_CAP, _PER_GREY = 30.0, 0.05  # cap of a difference in grey levels; pixels 
 
 
 def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> list[Float]:
-    """Up to `count` homographies that fit most of a flow, found one after the other (MAGSAC).
+    """Up to `count` homographies (3, 3) that fit most of a flow, one after the other (MAGSAC).
 
-    Args:
-        flow: (H, W, 2), pixels.
-        confidence: (H, W), in [0, 1].
-        count: Largest number of homographies.
-
-    Returns:
-        (3, 3) maps from reference to next pixels, the dominant one first.
+    They map reference to next pixels of the flow (H, W, 2) with this confidence (H, W).
     """
     height, width = confidence.shape
     v, u = np.mgrid[0:height:_STEP, 0:width:_STEP]
@@ -64,17 +58,8 @@ def guided_flow(
 
     The score of a flow is the mean over a window of its round-trip error and of the grey-level
     difference between a pixel and its target. A flow under a homography must be better than the
-    first flow by a margin.
-
-    Args:
-        ref: (H, W) grey reference image.
-        nxt: (H', W') grey next image.
-        match: The flow method.
-        forward: (H, W, 2) first flow.
-        backward: (H', W', 2) first flow in the other direction.
-
-    Returns:
-        (H, W, 2) flow and (H, W) its round-trip error, both in pixels.
+    first flow, `forward` (H, W, 2) and `backward` (H', W', 2), by a margin. Images are grey.
+    Returns the flow and its round-trip error (H, W).
     """
     gap = round_trip_error(forward, backward)
     maps = dominant_homographies(forward, confidence_of(gap, support=5), PLANES)
@@ -136,23 +121,16 @@ _WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padde
 
 
 def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> Flow:
-    """Dense inverse search flow (Kroeger et al., ECCV 2016) with forward-backward confidence.
+    """Dense inverse search flow (Kroeger et al., ECCV 2016) of two RGB images, of any two sizes.
 
     The flow is computed in both directions, and again after each of the dominant homographies
     (`PLANES`) has aligned the images. The better one is used for each pixel (`guided_flow`), since
     displacements near a driving camera are too large for a coarse-to-fine search alone.
 
-    The confidence follows from the round-trip error (`confidence_of`). A wrong but consistent flow,
-    as on weak texture, keeps its confidence. An image without contrast (standard deviation below
-    one grey level) gives a zero flow with confidence 0.
-
-    Args:
-        image_ref: (H, W, 3) uint8 RGB reference image.
-        image_next: (H', W', 3) uint8 RGB next image; it may differ in size.
-        consistency: If false, the confidence is 1 wherever the round trip stays in the images.
-
-    Raises:
-        DataError: an image is too small.
+    The confidence follows from the round-trip error (`confidence_of`); without `consistency` it is
+    1 wherever the round trip stays in the images. A wrong but consistent flow, as on weak texture,
+    keeps its confidence. An image without contrast (standard deviation below one grey level) gives
+    a zero flow with confidence 0.
     """
     for where, image in (("image_ref", image_ref), ("image_next", image_next)):
         if min(image.shape[:2]) < MIN_SIDE:

@@ -90,18 +90,10 @@ def corrected(
 ) -> Flow | None:
     """The flow corrected where it follows a static layer instead of the scene.
 
-    Args:
-        ref: (H, W) grey reference image without the layer (`without_still_layer`).
-        nxt: (H', W') grey next image without the layer.
-        flow: Flow of the original images.
-        R: (3, 3) rotation of the rigid motion of the pixels that do not follow the layer.
-        t: (3,) unit translation of that motion.
-        K_ref: (3, 3) intrinsics of the reference frame.
-        K_next: (3, 3) intrinsics of the next frame.
-
-    Returns:
-        The corrected flow; its confidence at corrected pixels decreases with the distance in pixels
-        from the epipolar line. None if too few static pixels are contradicted.
+    `ref` and `nxt` are grey images without the layer (`without_still_layer`); R (3, 3) and the unit
+    translation t (3,) are the rigid motion of the pixels that do not follow it. The confidence at
+    corrected pixels decreases with the distance in pixels from the epipolar line. None if too few
+    static pixels are contradicted.
     """
     height, width = nxt.shape
     census_ref = np.ascontiguousarray(census(ref)[:, ::STRIDE, ::STRIDE])

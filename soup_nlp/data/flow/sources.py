@@ -41,11 +41,7 @@ BLACK = 24
 
 
 def load_flow(path: PathLike) -> Flow:
-    """A Flow of a file (.flo, KITTI .png, .npy) with confidence 1 where known, else 0.
-
-    Raises:
-        DataError: the file is malformed, or all pixels are unknown.
-    """
+    """The Flow of a file (.flo, KITTI .png, .npy), confidence 1 where known; some must be known."""
     flow = Flow(read_flow(path).astype(np.float32), source=Path(path).name)
     if not flow.confidence.any():
         raise DataError("flow file marks every pixel as unknown", where=path)
@@ -53,17 +49,11 @@ def load_flow(path: PathLike) -> Flow:
 
 
 def flow_from_truth(pair: Pair, source: str = "truth") -> Flow:
-    """The true flow of a pair, with confidence 0 where it is unknown.
+    """The true flow of a pair, with confidence 0 where it is unknown; DataError without one.
 
-    Args:
-        pair: Its truth has a flow.
-        source: "truth", or with Gaussian noise such as "truth+noise:0.5". The number is the
-            standard deviation of either component, pixels. The noise is correlated over a few
-            pixels, like errors of real flows: white noise would average out within a superpixel.
-            Every call adds the same noise.
-
-    Raises:
-        DataError: the pair has no true flow, or the source has no such number.
+    The source is "truth", or with Gaussian noise such as "truth+noise:0.5", the standard deviation
+    of either component in pixels. The noise is correlated over a few pixels, like errors of real
+    flows: white noise would average out within a superpixel. Every call adds the same noise.
     """
     if pair.truth is None or pair.truth.flow is None:
         raise DataError(
@@ -111,15 +101,7 @@ class FlowOptions(Section):
     is searched for behind a layer that stands still, such as a reflection in a windscreen."""
 
     def load(self, pair: Pair, path: Callable[[str], Path]) -> Flow:
-        """The flow of a pair.
-
-        Args:
-            pair: Images, and the truth where `source` is "truth".
-            path: Resolves the name of a file.
-
-        Raises:
-            DataError: the source is unknown, or its flow is damaged or has another size.
-        """
+        """The flow of a pair, see `resolve_flow`; `path` resolves the name of a file."""
         source = str(path(self.source)) if is_path(self.source) else self.source
         if self.backward or self.confidence:
             return self._with_confidence(pair, source, path)
@@ -192,16 +174,10 @@ def is_network(source: str) -> bool:
 
 
 def resolve_flow(pair: Pair, source: str, consistency: bool = True) -> Flow:
-    """The flow of a pair from a named source.
+    """The flow of a pair from a named source; DataError if it is unknown, fails, or does not fit.
 
-    Args:
-        pair: The pair; its `flow` is ignored.
-        source: "dis", "truth", "truth+noise:SIGMA" (`flow_from_truth`), the name of a plug-in, the
-            path of a network (.onnx) or of a flow file.
-        consistency: Whether DIS weights its flow by the forward-backward consistency.
-
-    Raises:
-        DataError: the source is unknown or fails, or its flow has another size.
+    The source is "dis", "truth", "truth+noise:SIGMA" (`flow_from_truth`), the name of a plug-in, or
+    the path of a network (.onnx) or of a flow file. For `consistency` see `dis_flow`.
     """
     if source == "dis":
         return _without_bars(dis_flow(pair.image_ref, pair.image_next, consistency), pair)

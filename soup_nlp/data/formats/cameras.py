@@ -27,12 +27,10 @@ def estimated_cameras(
     """Intrinsics (3, 3) of pictures, and the standard deviation of the log focal length.
 
     Pixels are square, and the principal point is in the middle. The focal length is that of the
-    horizontal field of view `fov` (degrees) of the first picture, or else of EXIF, or else `GUESS`.
-    The deviation is 0 where `fov` or EXIF gives it. A picture without EXIF, or without a file
-    (None), gets the focal length of another one, relative to the longer side.
-
-    Warns:
-        DataWarning: the origin of a focal length without `fov`; one that is implausible.
+    horizontal field of view `fov` (degrees) of the first picture, or else of EXIF, or else `GUESS`;
+    a warning names its origin. The deviation is 0 where `fov` or EXIF gives it. A picture without
+    EXIF, or without a file (None), gets the focal length of another one, relative to the longer
+    side.
     """
     exif_focals = [exif_focal(path) for path in paths]
     first_exif = next((focal for focal in exif_focals if focal), None)
@@ -101,12 +99,10 @@ RESIZED, ALIKE = 1.25, 1.1
 def check_cameras(
     cameras: Sequence[Float], images: Sequence[Image], names: Sequence[object], cropped: bool
 ) -> None:
-    """Warn of implausible intrinsics (3, 3) of the frames, and of their likely cause.
+    """Warn of implausible intrinsics (3, 3) and of their likely cause.
 
-    Principal points of `cropped` images, which are parts of larger ones, may be anywhere.
-
-    Raises:
-        DataError: a principal point is outside of the image.
+    A principal point outside of its image is a DataError. Those of `cropped` images, which are
+    parts of larger ones, may be anywhere.
     """
     alike = images[0].shape == images[1].shape and np.array_equal(cameras[0], cameras[1])
     for K, image, where in list(zip(cameras, images, names))[: 1 if alike else 2]:
