@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.accuracy import BASELINES, comparison, read_pages, suite_page, write_suite
-from benchmarks.scores import METHODS, measure_pair, moving, sigma_scores, split
+from benchmarks.accuracy import comparison, read_pages, suite_page, write_suite
+from benchmarks.scores import METHODS, measure_pair, moving, sigma_scores
 from benchmarks.suites import SUITES
 from benchmarks.table import Cell, Item, frame_of
 from soup_nlp import Pair, Truth
@@ -90,14 +90,6 @@ def test_sigma_is_scored_by_what_it_says():
     assert sigma_scores(np.zeros(20), np.ones(20))["wrong_sure"] is None
 
 
-def test_what_is_seen_is_scored_under_the_scale_of_all():
-    gt = np.full((10, 10), 4.0)
-    gt[0] = np.nan
-    depth, part = np.where(np.arange(10) < 6, 2.0, 3.0) * np.ones((10, 1)), np.zeros((10, 10), bool)
-    part[:, :6] = True
-    assert split(Truth(depth_ref=gt), depth, part, 2.0) == {"share": 0.6, "mre": 0.0, "rest": 0.5}
-
-
 def test_moving_pixels_are_told_apart_under_one_scale():
     label = np.zeros((40, 60), np.int32)
     label[5:15, 5:25], label[30:, 50:] = 1, 2
@@ -127,36 +119,6 @@ def solved(suite: str, pair: str = "p", family: str = "s", mre: float = 0.03) ->
         **{"family": family, "flow": "dis", "status": "x", "code": "c", "overrides": []},
         **{"metrics": metrics, "cpu_seconds": 1.0, "settings": "0"},
     }
-
-
-def test_pairs_of_one_name_are_told_apart_by_their_suite():
-    text = text_of(solved("kitti2012"), solved("kitti2015"))
-    assert all(f"| kitti{year} p, dis |" in text for year in (2012, 2015))
-
-
-def test_one_rigid_motion_is_compared_on_its_own_pixels():
-    row = solved("shared")
-    metrics = row["metrics"]
-    metrics |= {"rigid": {"mre": 0.025, "coverage": 0.6}, "solution_rigid": {"mre": 0.02}}
-    assert "beats every baseline on 1 of 1" in text_of(row)
-    metrics["solution_rigid"]["mre"] = 0.026
-    assert "beats every baseline on 0 of 1" in text_of(row)
-    assert set(BASELINES) <= set(METHODS)
-
-
-def test_sigma_has_columns_and_a_picture_of_its_curves(tmp_path):
-    rows = [solved("shared", p) | {"family": p, "drawn": 0.1} for p in ("a", "b")]
-    write_suite(tmp_path / "without.md", frame_of(rows))
-    assert not (tmp_path / "without.png").exists()
-    error = np.linspace(0, 0.3, 40)
-    for row in rows:
-        row["sigma"] = sigma_scores(error, error + 0.01)
-    write_suite(tmp_path / "shared.md", frame_of(rows))
-    text = (tmp_path / "shared.md").read_text()
-    assert "| pair, flow | NLL | within 1 | within 2 | sure and wrong | AUSE | drawn |" in text
-    assert "| NLL | flat | within 1 | within 2 | sure and wrong | wrong and sure |" in text
-    assert "](shared.png)" in text
-    assert (tmp_path / "shared.png").stat().st_size > 5000
 
 
 def test_two_pages_are_compared_by_family_and_half(tmp_path):

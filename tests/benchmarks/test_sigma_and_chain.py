@@ -4,16 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.chain import chain_page, measure_chain, sequences
-from benchmarks.sigma import HEAVY, fitted, loss, write_sigma
+from benchmarks.sigma import fitted, write_sigma
 from benchmarks.table import Cell, frame_of
 from soup_nlp.evaluation.confidence import ADDED, FACTORS
-
-
-def test_large_errors_count_linearly():
-    one = np.array([1.0])
-    slope = loss(np.array([HEAVY + 2]), one) - loss(np.array([HEAVY + 1]), one)
-    assert slope == pytest.approx(HEAVY)
-    assert loss(np.array([2.0]), one) == pytest.approx(2.0)
 
 
 def no_terms(count):

@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.family import write
 from benchmarks.family.instances import STANDARD, VERSION, select
+from benchmarks.family.write import write_family
 from benchmarks.solvers import by_start, cost_table, frame_of_runs, profile, write_results
 from soup_nlp.storage.rows import read_rows
 
@@ -82,14 +82,13 @@ open(stub + ".sol", "w").write("\\n".join(map(str, [*head, *values, "objno 0 0"]
 
 
 @pytest.mark.slow
-def test_a_solver_of_ones_own_is_a_command_line(record, tmp_path, monkeypatch, capsys):
+def test_a_solver_of_ones_own_is_a_command_line(tmp_path, monkeypatch, capsys):
     """The recipe of docs/adding.md: a program that reads .nl, found by its name on the PATH."""
     program = tmp_path / "mine"
     program.write_text(PROGRAM.format(python=sys.executable))
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    monkeypatch.setattr(write, "load_frozen", lambda scene, size: record)
-    write.write_family(tmp_path / "set", select([100], ["room"], [STANDARD], ["hard"]), str)
+    write_family(tmp_path / "set", select([100], ["orbit"], [STANDARD], ["hard"]), str)
     out = tmp_path / "out"
     # a false claim is no verified run
     words = ["solvers", str(tmp_path / "set"), "-o", str(out), "--solvers", "mine fast=1"]

@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.suites import HALF_B, SINGLE, SUITES, Options, every_pair, list_suite, spread
+from benchmarks.suites import SUITES, Options, every_pair, list_suite, spread
 
 
 def test_suites_list_the_papers_pairs(tmp_path):
@@ -49,32 +49,9 @@ def test_a_pair_is_listed_with_every_flow_that_it_has(tmp_path):
     }  # fmt: skip
 
 
-def test_sintel_needs_cameras_except_for_the_known_scene(tmp_path):
-    for i in every_pair("sintel", tmp_path, Options()):
-        if i.family in ("alley_1", "temple_2"):
-            for path in i.needs:
-                if path.suffix == ".png":
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    path.touch()
-    assert {i.family for i in list_suite("sintel", tmp_path)} == {"alley_1"}
-    camera = tmp_path / "camdata_left" / "temple_2"
-    camera.mkdir(parents=True)
-    for frame in range(1, 51):
-        (camera / f"frame_{frame:04d}.cam").touch()
-    assert len(list_suite("sintel", tmp_path)) == 48
-
-
 @pytest.mark.parametrize("name", [n for n, s in SUITES.items() if s.layout])
 def test_a_missing_dataset_says_where_to_get_it(name, tmp_path, capsys):
     assert main(["accuracy", "--suite", name, "--data", str(tmp_path)]) == 2
     text = capsys.readouterr().err
     assert "get it from" in text
     assert "expected:" in text
-
-
-def test_the_shared_pairs_are_split_in_two_halves_by_family(tmp_path):
-    items = list(every_pair("shared", tmp_path, Options(flows=("dis",))))
-    families = {i.family for i in items}
-    assert len({i.key for i in items}) == len(items)
-    assert {*SINGLE, *HALF_B} <= families
-    assert {i.name for i in items if i.family == "kitti2012_074"} == {"kitti2012 000074"}

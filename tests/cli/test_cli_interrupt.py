@@ -11,12 +11,9 @@ from helpers_files import sets
 
 from soup_nlp.cli import main as cli
 from soup_nlp.cli import solve as solve_module
-from soup_nlp.config.problem import load_problem
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import SceneInput
-from soup_nlp.errors import StoppedError
 from soup_nlp.pipeline import case as cases
-from soup_nlp.pipeline.run import run
 from soup_nlp.report import folder as folders
 from soup_nlp.storage.folders import SUMS
 from soup_nlp.storage.progress import interruptible
@@ -161,16 +158,6 @@ def test_files_that_are_being_written_are_written(earlier, monkeypatch, capfd):
     assert seen == [True]
     assert all((earlier / name).is_file() for name in folders.FILES)
     assert "files are being written" in capfd.readouterr().err
-
-
-def test_a_run_of_python_says_it_too():
-    problem = load_problem("orbit", [word for word in SMALL if word != "--set"])
-    with interruptible() as stop:
-        ctrl_c()
-        with pytest.raises(StoppedError, match="load"):
-            run(problem, stop=stop)
-        with pytest.raises(KeyboardInterrupt):
-            ctrl_c()
 
 
 def test_a_second_signal_while_the_first_is_handled_ends_at_once(monkeypatch):

@@ -71,11 +71,6 @@ def test_flow_of_a_batch_says_how_to_take_it_out():
         soup_nlp.Flow(np.zeros((1, 2, 48, 64)))
 
 
-def test_truth_of_float32_is_no_warning():
-    truth = soup_nlp.Truth(depth_ref=np.ones((4, 5), np.float32))
-    assert truth.depth_ref.dtype == np.float64
-
-
 @pytest.mark.slow
 def test_options_may_be_records_and_progress_is_reported(capsys):
     pair, seen = render_scene("orbit", 0, 64, 48), []
@@ -175,26 +170,6 @@ def test_a_run_survives_a_pickle(run):
     assert again.problem == run.problem
     assert again.energy == run.energy
     np.testing.assert_array_equal(again.reconstruction.depth_ref, run.reconstruction.depth_ref)
-
-
-def test_arrays_of_truth_and_history_are_described(run, saved):
-    with h5py.File(saved[0] / "result.h5") as file:
-        stored = file["truth/scene_flow"]
-        np.testing.assert_array_equal(stored[:], run.pair.truth.scene_flow)
-        assert stored.attrs["units"] == run.pair.truth.unit
-        for name, stage in file["iterations"].items():
-            assert "barrier" in stage["mu"].attrs["description"], name
-            assert "inertia" in stage["regularization_size"].attrs["description"], name
-
-
-def test_a_run_prints_itself_in_five_lines(run):
-    lines = repr(run).splitlines()
-    assert len(lines) == 5
-    assert max(map(len, lines)) <= 110
-    assert f"MRE {run.metrics['solution'].mre:.4f}" in repr(run)
-    records = run.pair, run.segmentation, run.start, run.solution, run.soup, run.reconstruction
-    for record in (*records, run.components, run.camera, run.data):
-        assert len(repr(record)) < 300, type(record)
 
 
 def test_a_run_saves_itself_and_is_converted(run, saved, tmp_path, capsys):

@@ -9,17 +9,13 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers_files import sets
-from helpers_nl import ReadBack, close
 
 from benchmarks.family.sol import write_sol
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ExportError
-from soup_nlp.export.foreign import import_sol, sol_table
+from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.program import file_orders
-from soup_nlp.export.verify import Limits, examine, violations
-from soup_nlp.geometry.constraints import kind, table
-from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.stages import solve_soup
 
@@ -47,23 +43,6 @@ def problem_of(folder: Path):
     case = prepare(load_problem(folder / "problem.yaml"))
     nlp, layout = case.nlp(case.formulation(coordinates=manifest["coordinates"]))
     return case, nlp, layout, file_orders(nlp), manifest
-
-
-@pytest.mark.slow
-def test_the_file_and_its_manifest_are_those_of_the_nlp(exported):
-    case, nlp, _, (v, r), manifest = problem_of(exported)
-    back = ReadBack(exported / "soup.nl")
-    assert manifest["sizes"]["variables"] == len(back.x0) == nlp.nx
-    assert manifest["sizes"]["jacobian_nonzeros"] == nlp.nnzj
-    close(back.x0, nlp.x0[v])
-    rng = np.random.default_rng(0)
-    x = np.clip(nlp.x0 + 0.05 * rng.normal(size=nlp.nx), nlp.lbx, nlp.ubx)
-    close(back.values(x[v])[0], nlp.value(x))
-    close(back.values(x[v])[1], nlp.constraints(x)[r])
-    close(back.values(x[v])[2], nlp.gradient(x)[v])
-    assert manifest["objective_at_start"] == nlp.value(nlp.x0)
-    exact = oracle.energy(case.soup, case.data, case.weights)["total"]
-    assert manifest["exact_energy_at_start"]["total"] == pytest.approx(exact, rel=1e-12)
 
 
 def answer(folder: Path, name: str, move: float = 0.0, code: int = 0) -> Path:
@@ -123,21 +102,6 @@ def test_verified_means_optimal(exported, optimum, capsys):
 
 
 @pytest.mark.slow
-def test_a_point_with_nan_is_not_verified(exported, optimum):
-    _, nlp, _, _, _ = problem_of(exported)
-    x, lam = optimum
-    assert examine(nlp, x, lam).within(Limits())
-    # multipliers that are not numbers are not used
-    assert examine(nlp, x, np.nan * lam).multipliers == "least squares"
-    bad = x.copy()
-    bad[3] = np.nan
-    assert violations(nlp, bad)["bounds"].max() == np.inf
-    found = examine(nlp, bad, lam)
-    assert (found.primal, found.dual, found.multipliers) == (np.inf, np.inf, "none")
-    assert not found.within(Limits())
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e20, 1e300])
 def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, capsys):
     _, nlp, _, (v, r), _ = problem_of(exported)
@@ -153,22 +117,6 @@ def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, c
     assert code == (1 if size == 1e20 else 2)
     assert (tmp_path / "r").exists() == (size == 1e20)
     assert (exported / "manifest.json").read_text() == before
-
-
-@pytest.mark.slow
-def test_the_worst_superpixel_is_named(exported):
-    _, nlp, layout, (v, r), _ = problem_of(exported)
-    x = nlp.x0.copy()
-    x[layout.of(np.array([7]))[0, 5]] += 1e-2
-    write_sol(exported / "seven.sol", x, None, v, r)
-    imported = import_sol(exported, exported / "seven.sol")
-    rows = sol_table(imported)
-    so3 = next(row for row in rows if row.name == "so3")
-    assert so3.worst[0][0] == 7
-    assert so3.beyond == 1
-    assert not so3.ok
-    assert "7 (" in table(rows)
-    assert kind("normal", np.array([0.0, np.nan]), 1e-6).largest == np.inf
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ import pytest
 
 import soup_nlp
 from soup_nlp.errors import ModelError
-from soup_nlp.geometry.constraints import constraints
 from soup_nlp.model import oracle
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.stages import solve_soup
@@ -41,19 +40,6 @@ def test_nlpsol_finds_the_minimum_of_solve():
     assert own.converged
     assert reached == pytest.approx(own.energy["total"], rel=1e-4)
     assert reached < 0.9 * own.energy_start["total"]
-
-
-@pytest.mark.slow
-def test_casadi_derives_the_constrained_nlp_by_itself():
-    nlp = soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL, presolve=True)
-    careful = {"ipopt.mu_init": 1e-6, "ipopt.bound_push": 1e-8, "ipopt.nlp_scaling_method": "none"}
-    solver = ca.nlpsol("s", "ipopt", nlp.problem, {**QUIET, **careful})
-    answer = solver(**nlp.start)
-    assert solver.stats()["success"]
-    found = constraints(nlp.soup(answer["x"]), nlp.case.data.rim_ray, 1e-3).largest
-    assert max(found.values()) < 1e-6
-    first = nlp.record.value(nlp.record.x0)
-    assert float(answer["f"]) == pytest.approx(first, rel=1e-4)
 
 
 @pytest.mark.slow

@@ -210,29 +210,3 @@ def test_what_is_shown_is_saved_for_other_viewers(browser, small_run, tmp_path, 
     assert depth == pytest.approx(np.median(own[:, 2]), rel=0.05)
     colours = found.colors if points else found.visual.vertex_colors
     assert np.std(colours[:, :3]) > 10
-
-
-def test_keys_and_the_edge_between_the_frames(browser):
-    browser.value("soupView.setTime(0.5); document.activeElement.blur()")
-    press = (
-        "document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: '{}', bubbles: true}}))"
-    )
-    browser.value(press.format("ArrowRight"))
-    assert float(browser.value("document.getElementById('time').value")) == pytest.approx(0.6)
-    browser.value(press.format(" "))
-    assert browser.value("document.getElementById('play').textContent") == "\u25a0"
-    browser.value(press.format(" "))
-    assert browser.value("document.getElementById('play').textContent") == "\u25b6"
-    assert browser.value("document.getElementById('before').naturalWidth") > 0
-    browser.value("const e = document.getElementById('edge'); e.value = 80; e.oninput()")
-    assert "20%" in browser.value("document.getElementById('before').style.clipPath")
-
-
-def test_the_address_opens_a_view_while_the_page_is_shown(browser):
-    browser.value("location.hash = 'mode=normals&time=0.5&view=top'")
-    browser.wait("document.querySelector('#modes .on').value == 'normals'")
-    assert browser.value("document.getElementById('time').value") == "0.5"
-    eye = browser.value("soupView.eye.position.toArray()")
-    assert eye[1] > 3 * abs(eye[0])
-    browser.value("location.hash = ''")
-    browser.wait("document.querySelector('#modes .on').value == 'image_ref'")

@@ -17,15 +17,9 @@ from soup_nlp.config.problem import Problem, load_problem, make_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluation.metrics import UNSCALED, depth_metrics
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.model.energy_options import BENDING_ARAP
 from soup_nlp.pipeline.case import build_energy, prepare, solver_options
 from soup_nlp.pipeline.record import Case
-from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import (
-    ANY_TURN,
-    AT_REST,
-    LEAST_GAP,
     REFERENCE,
     constant_depth,
     fit_turn,
@@ -113,20 +107,6 @@ def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least,
     assert least <= start.bends.mean() <= most
 
 
-@pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="the whole image bends: the price of simpler surfaces")
-@pytest.mark.parametrize(
-    ("seed", "least"),
-    # small jumps join the banner of 1 to its room; the outline of 3 has no discontinuity: a
-    # compromise motion has more inliers than that of the room
-    [(1, 0.3), (3, 0.25)],
-)
-def test_a_rigid_room_does_not_bend_with_its_banner(seed, least):
-    banner = problem("banner", f"input.seed={seed}")
-    start = prepare(banner, pair=banner.load_pair()).start
-    assert least < start.bends.mean() < 0.4
-
-
 def test_a_bending_region_whose_flow_jumps_is_torn():
     seg = squares(6, 20)
     column = seg.anchors[:, 0] // 8
@@ -173,22 +153,6 @@ def test_a_bending_surface_is_found_beside_rigid_ones():
     assert (start.motion[start.bends] == -1).all()
     assert (start.motion[~start.bends] == 0).mean() > 0.9
     assert not case("banner", "start.bending=false").start.bending
-
-
-def test_regions_that_bend_have_their_own_weights_in_one_energy():
-    c, rigid = case("banner"), case("banner", "start.bending=false")
-    weights, bends = c.weights, c.start.bends
-    assert weights == rigid.weights
-    assert c.data.arap_at_anchors
-    focal = float(c.data.K_next[0, 0])
-    any_end = bends[c.data.edges].any(axis=1)
-    np.testing.assert_allclose(c.data.rotation_scale, np.where(any_end, 1e-3, focal))
-    both = bends[c.data.pairs].all(axis=1)
-    orient_ratio = 4.0 * len(c) / 1000 / weights.orient
-    np.testing.assert_allclose(c.data.orient_weight, np.where(both, 2.0 * orient_ratio, 2.0))
-    # elsewhere the weights are those of a scene without bending
-    outside = ~bends[c.data.pairs].any(axis=1)
-    np.testing.assert_array_equal(c.data.pair_weight[outside], c.segmentation.pair_weight[outside])
 
 
 def test_depth_starts_on_one_plane_where_the_camera_is_at_rest():
@@ -246,36 +210,6 @@ def test_depth_that_explains_the_flow_is_no_turn():
     assert turn_alone(flow._replace(views=still), choice) is not None
 
 
-def test_depth_within_three_noises_of_the_flow_is_not_seen():
-    c = case("orbit")
-    flow = fit(c)
-    choice = labelled(flow, [dominant(flow)], connected_labels(flow.jump < 1, flow.seg))
-    choice = replace(choice, label=np.zeros(len(c), int), excess=0)
-    error = float(np.quantile(fit_turn(flow.views, ANY_TURN)[1], AT_REST))
-    assert error > 320 / 512  # 1 px at 512 columns
-    # the residual of affine flows is part of the error
-    part = np.sqrt(REFERENCE / len(c))
-    for share, sees in ((0.95, True), (1.05, False)):
-        residual = np.full(len(c), share * error / (LEAST_GAP + part) * part)
-        assert (turn_alone(flow._replace(residual=residual), choice) is None) == sees
-
-
-def test_a_stabilised_turn_is_a_turn():
-    """The next image is moved back by stabilisation; the rotation is that of the plain turn."""
-    c = case("orbit")
-    flow = fit(c)._replace(residual=np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c))))
-    choice = labelled(flow, [dominant(flow)], connected_labels(flow.jump < 1, flow.seg))
-    target = flow.views.ray @ rotation.exp(np.array([0.02, -0.2, 0.05])).T
-    target = 1.03 * target / target[..., 2:] + np.array([0.2, 0.02, 0.0])
-    target[..., 2] = 1.0
-    stabilised = flow._replace(views=replace(flow.views, target=target))
-    turn = turn_alone(stabilised, choice)
-    assert turn is not None
-    plain, error = fit_turn(stabilised.views)
-    assert np.median(error) > 1.0
-    np.testing.assert_allclose(turn, plain, atol=0.01)
-
-
 def test_noise_where_surfaces_bend_is_that_of_affine_flows():
     """The error of a start without relief is no noise."""
     quiet = case("sheet", "segmentation.superpixels=100").start
@@ -302,26 +236,6 @@ def test_bending_surfaces_have_a_narrower_presolve_of_two_strategies(scene, widt
     options = case(scene, *overrides).options
     assert options.presolve_eps == widths
     assert options.untruncated == (scene == "sheet")
-
-
-def test_only_the_truncation_changes_where_the_whole_image_bends():
-    weights, usual = case("sheet").weights, case("room").weights
-    assert weights == usual.replace(**BENDING_ARAP)
-
-
-def test_the_order_by_occlusion_leaves_a_sheet_its_relief():
-    # without E_prior, which flattens relief
-    flat = "segmentation.superpixels=80", "energy.weights.prior=0.0"
-    c, ordered = case("sheet", *flat, UNORDERED), case("sheet", *flat)
-    assert own_relief(ordered) < 1.1 * own_relief(c)
-
-
-def own_relief(c: Case) -> float:
-    """Mean relative error of the sheet's depth in its own median scale."""
-    answer = solve_soup(c.soup, c.data, c.weights, c.formulation(), c.options)
-    z = reconstruct(answer.soup, c.segmentation.labels, c.pair.K_ref, c.pair.K_next).depth_ref
-    gt = c.pair.truth.depth_ref
-    return depth_metrics(z, np.where(c.pair.truth.components == 1, gt, np.nan)).mre
 
 
 @pytest.mark.parametrize(

@@ -163,15 +163,6 @@ def test_a_swinging_object_comes_before_the_wall(swing):
     assert not (start.tie[main] == TIES.index("occlusion")).any()
 
 
-@pytest.mark.slow
-def test_an_image_without_discontinuities_keeps_its_start(swing):
-    pair, seg = swing
-    still = pair.with_flow(Flow(0 * pair.flow.uv, pair.flow.confidence, "zero"))
-    start, same = propose(fitted(still, seg)), ordered(seg, still)
-    np.testing.assert_array_equal(same.soup.distance, start.soup.distance)
-    assert same.order is None
-
-
 OPTIONS = ("segmentation.superpixels=48", "segmentation.neighbours=6", "refine.enabled=false")
 
 
