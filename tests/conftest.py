@@ -5,7 +5,6 @@ import hashlib
 import pickle
 from collections.abc import Callable
 from functools import lru_cache, wraps
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -26,8 +25,6 @@ from soup_nlp.start import camera_error
 # drawn cases are the same in every run, without a time limit on a busy machine
 settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("fixed")
-
-SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 
 
 def once(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -63,14 +60,6 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 10, 5)
-
-
-@pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """Folder of the real pairs; tests that use it carry `pytest.mark.shared`."""
-    if not SHARED_DATA.is_dir():
-        pytest.skip(f"the real pairs are not here: no folder {SHARED_DATA.resolve()}")
-    return SHARED_DATA.resolve()
 
 
 @lru_cache

@@ -22,7 +22,6 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.storage.each import each
 from soup_nlp.storage.rows import read_rows
 
 TINY = [
@@ -300,20 +299,3 @@ def test_a_cluster_survives_the_loss_of_a_worker(four, tmp_path, cluster):
     assert done.good
     assert len(killed) == 1
     assert len(rows_of(tmp_path / "out")) == 4
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_the_loss_of_the_scheduler_ends_the_command(cluster):
-    address, started = cluster
-
-    # pickled by value: the workers do not know this module
-    def later() -> dict[str, int]:
-        time.sleep(0.5)
-        return {}
-
-    rows = each({str(k): later for k in range(8)}, cluster=address)
-    assert next(rows)[1]["ok"]
-    started[0].kill()
-    with pytest.raises(DataError, match="scheduler of the cluster is lost"):
-        list(rows)

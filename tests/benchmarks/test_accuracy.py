@@ -59,20 +59,6 @@ def test_a_pair_that_cannot_be_measured_has_a_reason(tmp_path):
     assert "## Failed" in text
 
 
-def test_a_row_is_identified_by_settings_and_input():
-    def identity(root: str, *overrides: str) -> Row:
-        raw = {"kind": "sintel", "root": root, "scene": "alley_1", "frame": 2}
-        return Cell(Item("sintel", "alley_1", "alley_1-0002", "dis", raw), overrides).identity()
-
-    here, final = identity("/a"), identity("/a", "input.render=final")
-    assert here == identity("/b")
-    assert here["settings"] == final["settings"]
-    assert here["input"] != final["input"]
-    assert here["settings"] == Cell(item(), ("flow.source=dis",)).identity()["settings"]
-    assert here["settings"] != Cell(item()).identity()["settings"]
-    assert here["settings"] != identity("/a", "energy.weights.cont=9.0")["settings"]
-
-
 def test_sigma_is_scored_by_what_it_says():
     # half of the pixels are exact and sure, half are off by a factor of 2
     error = np.repeat([0.0, np.log(2.0)], 50)

@@ -38,17 +38,6 @@ def test_a_suite_lists_the_pairs_whose_files_exist(tmp_path):
     assert [i.input["frame"] for i in listed] == frames[:1]
 
 
-def test_a_pair_is_listed_with_every_flow_that_it_has(tmp_path):
-    flows = [i.flow for i in list_suite("rendered", None, Options(only=("street",)))]
-    assert flows == ["truth", "dis"]
-    (tmp_path / "tum_fr1").mkdir()
-    (tmp_path / "tum_fr1" / "frame_0.png").touch()
-    listed = list_suite("shared", tmp_path)
-    assert {(i.name, i.flow) for i in listed} == {
-        ("motorcycle", "truth"), ("motorcycle", "dis"), ("tum_fr1", "dis"),
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize("name", [n for n, s in SUITES.items() if s.layout])
 def test_a_missing_dataset_says_where_to_get_it(name, tmp_path, capsys):
     assert main(["accuracy", "--suite", name, "--data", str(tmp_path)]) == 2

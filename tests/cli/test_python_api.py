@@ -2,7 +2,6 @@
 
 import pickle
 import shutil
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +13,6 @@ from PIL.Image import open as open_image
 import soup_nlp
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem, SegmentationOptions, load_problem
-from soup_nlp.data.formats.cameras import GUESS_SIGMA
-from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
@@ -40,47 +37,9 @@ def saved(run, tmp_path_factory) -> tuple[Path, list[str]]:
     return out, run.save(out, formats=["npy", "tum"])
 
 
-def test_float_and_channels_first_images_are_the_same():
-    image = render_scene("orbit", 0, 64, 48).image_ref
-    for other in (image / 255.0, (image / 255.0).astype(np.float32), image.transpose(2, 0, 1)):
-        pair = soup_nlp.Pair(other, image, (70, 70, 31, 24))
-        np.testing.assert_array_equal(pair.image_ref, image)
-    with pytest.raises(DataError, match=r"floats from 0 to 1(?s:.*)image / 255"):
-        soup_nlp.Pair(image.astype(float), image, (70, 70, 31, 24))
-
-
-def test_a_camera_is_a_field_of_view_or_guess():
-    image = render_scene("orbit", 0, 64, 48).image_ref
-    pair = soup_nlp.Pair(image, image, fov=90)
-    assert pair.K_ref[0, 0] == pytest.approx(32)
-    np.testing.assert_array_equal(pair.K_next, pair.K_ref)
-    with pytest.warns(DataWarning, match="no intrinsics; focal length 77 px"):
-        pair = soup_nlp.Pair(image, image)
-    assert pair.focal_sigma == GUESS_SIGMA
-    # a copy keeps it
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        other = pair.with_flow(soup_nlp.Flow(np.zeros((48, 64, 2), np.float32)))
-    assert other.K_ref[0, 0] == pytest.approx(1.2 * 64)
-    with pytest.raises(DataError, match="two cameras"):
-        soup_nlp.Pair(image, image, (70, 70, 31, 24), fov=90)
-
-
 def test_flow_of_a_batch_says_how_to_take_it_out():
     with pytest.raises(DataError, match=r"\(1, 2, 48, 64\)(?s:.*)flow\[0\]"):
         soup_nlp.Flow(np.zeros((1, 2, 48, 64)))
-
-
-@pytest.mark.slow
-def test_options_may_be_records_and_progress_is_reported(capsys):
-    pair, seen = render_scene("orbit", 0, 64, 48), []
-    options = {"segmentation": SegmentationOptions(**SMALL), "refine": {"enabled": False}}
-    options["solver"] = {"presolve": False, "max_iter": 2}
-    run = soup_nlp.solve_pair(pair, progress=seen.append, **options)
-    assert len(run.segmentation) == 12
-    assert {p.stage for p in seen} >= {"constrained NLP"}
-    soup_nlp.solve_pair(pair, progress=True, **options)
-    assert "evaluation" in capsys.readouterr().err
 
 
 def test_editors_know_every_key_of_a_problem():

@@ -1,6 +1,5 @@
 """Flow sources: DIS with its confidence, files, truth, plug-ins."""
 
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,7 +10,6 @@ from helpers_files import raises, write_flo, write_kitti_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from soup_nlp.data.datasets.benchmarks import KittiInput
 from soup_nlp.data.flow import dis
 from soup_nlp.data.flow.consistency import (
     confidence_of,
@@ -213,28 +211,6 @@ def test_a_flow_source_is_an_entry_point(tmp_path: Path, monkeypatch: pytest.Mon
             resolve_flow(pair, name)
 
 
-@pytest.mark.slow
-@pytest.mark.shared
-def test_dis_on_kitti(shared_data: Path) -> None:
-    whole = KittiInput(kind="kitti2012", root=str(shared_data / "kitti2012"), index="27").load(Path)
-    middle = np.s_[:, 350:-350]
-    flow = dis_flow(whole.image_ref[middle], whole.image_next[middle])
-    error = np.linalg.norm(flow.uv - whole.truth.flow[middle], axis=2)
-    finite = np.isfinite(error)
-    assert np.median(error[finite]) < 0.4
-    assert (error[finite] > 3).mean() < 0.25
-    sure = finite & (flow.confidence > 0.5)
-    assert sure.sum() > 0.7 * finite.sum()
-    assert (error[sure] > 3).mean() < 0.05
-    edges = [-1.0, 0.0, 0.25, 0.5, 0.75, 0.9, 1.0]
-    bins = [
-        finite & (flow.confidence > low) & (flow.confidence <= high)
-        for low, high in pairwise(edges)
-    ]
-    medians = [np.median(error[bucket]) for bucket in bins]
-    assert medians == sorted(medians, reverse=True)
-
-
 # --- flow under dominant homographies -------------------------------------------------------------
 
 
@@ -301,16 +277,6 @@ def test_a_first_flow_that_is_half_wrong_is_completed(monkeypatch):
     monkeypatch.setattr(dis, "PLANES", 0)
     same, _ = guided_flow(ref, nxt, match, forward, backward)
     np.testing.assert_array_equal(same, forward)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("planes", "least", "most"), [(0, 0.0, 0.3), (4, 0.7, 1.0)])
-def test_only_homographies_find_large_displacements(planes, least, most, monkeypatch):
-    monkeypatch.setattr(dis, "PLANES", planes)
-    fast = 2 * ROAD - np.eye(3)
-    flow = dis.dis_flow(*images(fast))
-    right = np.linalg.norm(flow.uv - truth(fast), axis=-1) < 1
-    assert least <= (right & (flow.confidence > 0.5)).mean() <= most
 
 
 @pytest.mark.parametrize(("error", "taken"), [(0.2, False), (0.8, True)])

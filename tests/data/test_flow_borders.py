@@ -2,18 +2,12 @@
 
 import numpy as np
 import pytest
-from helpers_truth import assert_partition, majority
+from helpers_truth import assert_partition
 
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.borders import fit_affine, follow_depth, follow_flow
-from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Flow
-from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.pipeline.case import superpixels
 
-MEMORY = {"input": {"kind": "memory", "hash": "0"}}
 HEIGHT, WIDTH, EDGE = 48, 64, 26
 """EDGE is inside a column of cells of 8 pixels."""
 
@@ -89,14 +83,6 @@ def test_a_superpixel_without_flow_attracts_nothing():
     assert len(weight) == (~hole).sum()
 
 
-def test_random_flow_still_gives_a_partition():
-    uv = np.random.default_rng(3).uniform(-20, 20, (HEIGHT, WIDTH, 2)).astype(np.float32)
-    flow = Flow(uv, np.ones((HEIGHT, WIDTH), np.float32), "noise")
-    n = assert_partition(follow_flow(grid(), flow))
-    # no piece below a quarter of the mean area stays
-    assert 1 <= n <= 4 * 48
-
-
 def test_scattered_pixels_are_no_outliers():
     """The spread of a superpixel is the scale of its weights if it exceeds `SCALE_PX`."""
     v, u = np.mgrid[0:40, 0:80].astype(float)
@@ -112,18 +98,3 @@ def test_scattered_pixels_are_no_outliers():
     assert np.median(weight[labels == 0]) > 0.4
     assert weight[lone].max() < 0.1
     assert weight[(labels == 1) & ~lone].min() > 0.9
-
-
-@pytest.mark.slow
-def test_following_the_flow_leaves_fewer_mixed_superpixels():
-    """Superpixels of two components; the ratio is 0.35, as SLIC mixes few at the wanted number."""
-    pair = render_scene("orbit", 3, 384, 164)
-    pair = pair.with_flow(flow_from_truth(pair))
-    share = {}
-    for margin in (1.0, None):
-        cut = {"superpixels": 300, "follow_flow_px": margin}
-        labels = superpixels(make_problem({**MEMORY, "segmentation": cut}), pair)
-        purity = majority(pair.truth, build_segmentation(labels, pair.image_ref))[1]
-        share[margin] = float((purity < 0.95).mean())
-    np.testing.assert_array_equal(labels, segment(pair.image_ref, 300))
-    assert share[1.0] < 0.5 * share[None]

@@ -89,10 +89,3 @@ def test_arguments_of_other_types_are_refused(bad):
     ):
         with pytest.raises(DataError):
             make()
-
-
-def test_records_print_without_their_arrays():
-    flow = Flow(np.zeros((40, 60, 2)))
-    pair = Pair(IMAGE, IMAGE, K, flow=flow, name="x")
-    assert repr(flow) == str(flow) == "Flow(unknown, 60x40, 100.0% usable)"
-    assert repr(pair) == f"Pair(x, 60x40, {flow}, no truth)"

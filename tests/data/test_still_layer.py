@@ -73,11 +73,6 @@ def test_the_road_moves_behind_a_reflection(reflecting: Pair):
 
 
 @pytest.mark.slow
-def test_images_without_a_layer_are_left_alone(street: Pair):
-    assert see_through(given(street, still=False)) is None
-
-
-@pytest.mark.slow
 def test_true_flow_is_believed(reflecting: Pair):
     """The correction applies to computed flow only, and an option disables it."""
     memory = {"input": {"kind": "memory", "hash": "0"}}

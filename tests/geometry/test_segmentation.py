@@ -75,15 +75,6 @@ def test_filled_pieces_that_end_up_cut_off_become_their_own(seed):
     assert_partition(split_components(labels, int(rng.integers(2, 20))))
 
 
-def test_small_pieces_join_what_is_next_to_them():
-    labels = np.zeros((6, 8), np.int32)
-    labels[:, 4:] = 1
-    labels[2, 6] = 0  # an island of one pixel, with the label of the other side
-    np.testing.assert_array_equal(
-        split_components(labels, 3), np.arange(8)[None] // 4 * np.ones((6, 1))
-    )
-
-
 # --- graphs ------------------------------------------------------------------------------------
 
 

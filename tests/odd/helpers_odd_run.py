@@ -16,7 +16,6 @@ import h5py
 from helpers_odd_world import CAMERA, SET, World
 
 from soup_nlp.cli.main import main
-from soup_nlp.errors import SoupError
 
 LONGEST = 6000
 """Characters that an error message may have."""
@@ -30,17 +29,14 @@ class Case:
 
     Attributes:
         name: Unique name of the case.
-        do: Prepares the input and returns the words of a command line, or calls the Python API
-            and returns None.
+        do: Prepares the input and returns the words of a command line.
         codes: Exit codes that are right for a command line.
-        quiet: Whether a call of the API may end without an error.
         solves: Whether it may get as far as a solve, which takes a second.
     """
 
     name: str
-    do: Callable[[World, Path], list[str] | None]
+    do: Callable[[World, Path], list[str]]
     codes: tuple[int, ...] = (2,)
-    quiet: bool = False
     solves: bool = False
 
 
@@ -51,14 +47,13 @@ value in the command line."""
 
 def cases(
     title: str,
-    do: str | Callable[[World, Path, Any], list[str] | None] | None,
+    do: str | Callable[[World, Path, Any], list[str]] | None,
     values: Collection[Any] | Mapping[str, Any],
     codes: tuple[int, ...] = (2,),
     *,
     make: Make | None = None,
     other: Mapping[str, tuple[int, ...]] | None = None,
     solves: bool | Collection[str] = False,
-    quiet: bool = False,
 ) -> Iterator[Case]:
     """A case for every value.
 
@@ -70,17 +65,16 @@ def cases(
         make: Prepares the input.
         other: Exit codes of single values, by name.
         solves: Whether the cases may solve, or the names of the values that may.
-        quiet: Whether the API may accept the value.
     """
     named = values if isinstance(values, Mapping) else {str(v): v for v in values}
     for name, value in named.items():
 
-        def run(w: World, o: Path, value=value, do=do or value) -> list[str] | None:
+        def run(w: World, o: Path, value=value, do=do or value) -> list[str]:
             x = value if make is None else make(w, o, value)
             return words(do, w, o, str(x)) if isinstance(do, str) else do(w, o, x)
 
         right = (other or {}).get(name, codes)
-        yield Case(title.format(name), run, right, quiet, solves is True or name in (solves or ()))
+        yield Case(title.format(name), run, right, solves is True or name in (solves or ()))
 
 
 def words(line: str, w: World, o: Path, x: str = "") -> list[str]:
@@ -174,10 +168,7 @@ def fault(case: Case, world: World, folder: Path, seconds: int = 60) -> str | No
     try:
         with redirect_stdout(out), redirect_stderr(err), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            argv = case.do(world, folder)
-            code = None if argv is None else main(argv)
-    except SoupError as error:
-        return _text_fault(str(error))
+            code = main(case.do(world, folder))
     except EndlessError:
         return "endless"
     except MemoryError:
@@ -189,8 +180,6 @@ def fault(case: Case, world: World, folder: Path, seconds: int = 60) -> str | No
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
-    if code is None:
-        return None if case.quiet else "no error"
     said, complaint = (s.buffer.getvalue().decode("utf-8") for s in (out, err))
     if code not in case.codes:
         return f"exit {code}, expected {case.codes}: {complaint[-200:]!r}"

@@ -13,9 +13,6 @@ import numpy as np
 import yaml
 
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import load_problem
-from soup_nlp.pipeline.record import Run
-from soup_nlp.report.folder import run
 
 SIZE = (48, 64)
 """Height and width of the tiny images."""
@@ -89,11 +86,6 @@ class World:
         depth = ["--depth", str(self.good("d.npy"))]
         assert main(["solve", *self.pair, *depth, *SET, "-o", str(out), "-q"]) in (0, 1)
         return out
-
-    @cached_property
-    def run(self) -> Run:
-        """The record of a solve of the tiny pair."""
-        return run(load_problem(self.good("p.yaml")))
 
     @cached_property
     def exported(self) -> Path:

@@ -8,7 +8,6 @@ from collections import defaultdict
 from itertools import chain
 
 import pytest
-from helpers_odd_api import api_cases
 from helpers_odd_commands import path_cases, text_cases, untrusted_cases
 from helpers_odd_files import array_cases, image_cases
 from helpers_odd_options import number_cases, option_cases, preset_cases
@@ -23,7 +22,7 @@ CASES: list[Case] = list(
         *(path_cases(), text_cases(), untrusted_cases()),
         *(number_cases(), preset_cases(), option_cases()),
         *(array_cases(), image_cases()),
-        *(result_cases(), chain_cases(), api_cases()),
+        *(result_cases(), chain_cases()),
     )
 )
 
@@ -41,7 +40,7 @@ def world(tmp_path_factory) -> World:
 
 
 def test_the_collection_is_large_and_its_names_are_unique():
-    assert sum(map(len, TABLES.values())) > 600
+    assert sum(map(len, TABLES.values())) > 400
     assert len({case.name for case in CASES}) == len(CASES)
 
 

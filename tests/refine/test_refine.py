@@ -117,17 +117,6 @@ def test_neighbours_on_one_plane_propose_that_plane(kind):
     assert same.mean() > 0.5
 
 
-def test_nearer_neighbours_are_taken_over_more_often():
-    tiny = Tiny("pixels")
-    maker, T = proposer(tiny.data), tiny.soup.translation
-    ranks = []
-    for _ in range(50):
-        taken = maker.propose(tiny.soup, "neighbour_motion", 1).T
-        ranks.append(np.abs(T[maker.near] - taken).max(axis=2).argmin(axis=1))
-    count = np.bincount(np.concatenate(ranks))
-    assert count[0] > 1.5 * count[-1]
-
-
 def test_planes_of_neighbours_keep_motion_or_anchor():
     tiny = Tiny("pixels")
     p = proposer(tiny.data).propose(tiny.soup, "neighbour_plane", 4)

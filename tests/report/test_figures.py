@@ -3,20 +3,15 @@ import matplotlib
 import numpy as np
 import pytest
 
-from soup_nlp.report import pictures
 from soup_nlp.report.figures import (
     UNKNOWN,
-    Legend,
-    Picture,
     colourise_depth,
     colourise_flow,
     colourise_normals,
     colourise_shares,
-    component_colours,
     depth_range,
     draw_superpixels,
     flow_limit,
-    strip,
     write_depth_png16,
 )
 
@@ -93,17 +88,6 @@ def test_no_scale_has_the_grey_of_the_unknown(name):
     assert np.abs(scale - UNKNOWN).max(axis=1).min() > 20
 
 
-def test_component_colours():
-    colours = component_colours(30).astype(int)
-    assert colours.shape == (30, 3)
-    assert component_colours(1).shape == (1, 3)
-    apart = np.abs(colours[:, None] - colours[None]).sum(-1) + 999 * np.eye(30, dtype=int)
-    assert apart[:10, :10].min() > 60
-    assert apart.min() > 10
-    # none is the grey of the unknown
-    assert np.ptp(colours, axis=1).min() > 20
-
-
 def test_the_limit_of_a_flow_ignores_outliers():
     uv = np.zeros((10, 100, 2))
     uv[..., 0] = np.linspace(0, 10, 1000).reshape(10, 100)
@@ -127,67 +111,6 @@ def test_superpixel_boundaries():
     want[:3, 2] = want[2] = True
     np.testing.assert_array_equal(edge, want)
     assert (image == 9).all()
-
-
-def flat(colour, name="", title="a title", height=30, width=60, legend=None):
-    image = np.full((height, width, 3), colour, np.uint8)
-    return Picture(name, title, image, legend)
-
-
-RED, BLUE = (200, 30, 30), (30, 30, 200)
-
-
-def area(image, colour):
-    """Pixels of a colour."""
-    return int((np.abs(image.astype(int) - colour).max(axis=2) < 3).sum())
-
-
-def test_strip():
-    panels = [
-        flat(RED, title="a red panel, 5 $ and 6 $"),
-        flat(BLUE, height=80, width=40),
-        flat(RED),
-    ]
-    image = strip(panels, "title with $x_1$", columns=2, panel_width=200)
-    assert image.shape == (42 + 400 + 100 + 2 * 36, 2 * 208 + 8, 3)
-    assert area(image, RED) == pytest.approx(2 * 200 * 100, rel=0.05)
-    assert area(image, BLUE) == pytest.approx(200 * 400, rel=0.05)
-
-
-@pytest.mark.parametrize(
-    "legend",
-    [
-        Legend(np.full((1, 8, 3), BLUE, np.uint8), ("0", "1 m")),
-        Legend(np.array([[BLUE, (255, 255, 255)]], np.uint8), ("a car", "none")),
-    ],
-    ids=["numbers", "classes"],
-)
-def test_a_legend_is_drawn_below_its_picture(legend):
-    image = strip([flat(RED, height=300, width=600, legend=legend)], "", panel_width=600)
-    bare = strip([flat(RED, height=300, width=600)], "", panel_width=600)
-    # at its own size, and not a pixel of it covered
-    assert abs(area(image, RED) - area(bare, RED)) < 600
-    assert area(bare, RED) == pytest.approx(300 * 600, rel=0.02)
-    rows = np.flatnonzero((np.abs(image.astype(int) - BLUE).max(axis=2) < 3).any(axis=1))
-    assert rows.min() > np.flatnonzero((np.abs(image.astype(int) - RED).max(2) < 3).any(1)).max()
-    assert area(bare, BLUE) == 0
-
-
-def test_a_title_that_is_too_long_is_made_smaller():
-    long = flat(RED, title="a title that is far too long for its picture " * 3)
-    image = strip([long, flat(BLUE)], "")
-    # the caption of the second panel begins with an empty margin
-    title = image[8:35, 428:432]
-    assert (title > 250).all()
-
-
-@pytest.mark.parametrize("count", [9, 10, 11, 12])
-def test_an_overview_has_no_gaps(count, monkeypatch):
-    seen = {}
-    monkeypatch.setattr(pictures, "strip", lambda panels, title: seen.update(p=panels))
-    found = {f"panel_{k}": flat(RED, f"panel_{k}") for k in range(count)}
-    pictures.overview(found, "")
-    assert [picture.name for picture in seen["p"]] == [*found][: 9 if count < 12 else 12]
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e5])

@@ -18,8 +18,8 @@ from soup_nlp.geometry.surface import whole_cells
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.findings import drawn_line
 from soup_nlp.report.folder import write_folder
-from soup_nlp.report.page import MODES, make_pair, make_scene, page
-from soup_nlp.report.pictures import _enlarged, pictures
+from soup_nlp.report.page import MODES, make_pair, page
+from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import result_of
 from soup_nlp.report.summary import summary
 
@@ -137,11 +137,6 @@ def test_large_images_are_thinned(shown):
     assert 0.5 < bits.mean() < 1
 
 
-def test_a_far_sky_is_left_out_at_first(shown):
-    scene = make_scene(Chain.of(shown))
-    assert scene["middle"] < scene["far"] <= 1.001 * scene["deepest"]
-
-
 @pytest.mark.slow
 def test_a_folder_makes_the_same_page_again(folder, capsys):
     written = (folder / "report.html").read_text()
@@ -158,21 +153,6 @@ def test_the_page_can_be_left_out(small_run, folder):
     assert "report.html" not in files
     assert not (folder / "report.html").exists()
     assert "overview.png" in files
-
-
-def test_a_component_whose_depth_is_drawn_is_striped(shown):
-    def stripes(kind):
-        own = pictures(Chain.of(replace(shown, kind=kind)))["components"]
-        return (own.image == 255).all(axis=2), own.title
-
-    kind = np.ones(shown.labels.shape, np.uint8)
-    white, title = stripes(kind)
-    assert "striped" not in title
-    assert white.mean() < 0.01
-    kind[shown.components.of_superpixel[shown.labels] == 0] = 2
-    white, title = stripes(kind)
-    assert "striped: most of its depth is drawn" in title
-    assert 0.3 < white[shown.components.of_superpixel[shown.labels] == 0].mean() < 0.45
 
 
 @pytest.mark.parametrize(("share", "said"), [(0.004, None), (0.3, "30%"), (1.0, "100%")])
@@ -194,15 +174,3 @@ def test_page_pictures_and_overview_begin_with_what_is_drawn(share, said, shown)
     assert pale[0].mean() == pytest.approx(share, abs=0.05)
     assert (f"<p><strong>{sentence}</strong> &middot; " in header) == bool(said)
     assert one.title == (f"{one.name}: {sentence}" if said else one.name)
-
-
-def test_sparse_truth_is_drawn_larger():
-    """Laser points on a tenth of the pixels are enlarged; a dense map does not change."""
-    sparse = np.full((9, 9), np.nan)
-    sparse[4, 4] = 2.0
-    grown = _enlarged(sparse)
-    assert (grown[3:6, 3:6] == 2).all()
-    assert np.isfinite(grown).sum() == 9
-    dense = np.ones((9, 9))
-    dense[0, 0] = np.nan
-    np.testing.assert_array_equal(_enlarged(dense), dense)

@@ -117,15 +117,6 @@ def test_meshes_have_no_curtains(result):
     assert len(faces) == 2 * (59 * 79 - (2 * (41 + 21) - 4))
 
 
-def test_large_meshes_are_thinned(result, monkeypatch):
-    monkeypatch.setattr("soup_nlp.report.models.CELLS", 60 * 80 // 4)
-    vertices, faces, pixels = surface_mesh(Chain.of(result)[0])
-    assert not (pixels % 2).any()
-    assert 0.7 * 60 * 80 / 2 < len(faces) < 60 * 80 / 2
-    np.testing.assert_allclose(np.unique(vertices[:, 2].round(9)), [BOARD_Z, WALL_Z])
-    assert (np.ptp(vertices[:, 2][faces], axis=1) < 1e-9).all()
-
-
 @pytest.mark.slow
 def test_colmap_models_are_read_by_pycolmap(tmp_path, result):
     pycolmap = pytest.importorskip("pycolmap")

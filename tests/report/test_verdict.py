@@ -8,69 +8,17 @@ import numpy as np
 import pytest
 
 from soup_nlp.evaluation.confidence import MOST_SIGMA
-from soup_nlp.geometry.constraints import DEFINITIONS, constraints
 from soup_nlp.pipeline.record import FullSize
 from soup_nlp.report import findings
-from soup_nlp.report.check import _constraints
-from soup_nlp.report.verdict import exit_code, facts
+from soup_nlp.report.verdict import exit_code
 from soup_nlp.start.camera_error import CameraError
 from soup_nlp.start.components import FIXED, SCENE
-
-
-def titles(text):
-    return [line[:12].strip() for line in text.splitlines() if not line.startswith(" ")]
-
-
-def test_the_answers_come_before_the_solver(small_run):
-    short, full = (facts(small_run, 0.5, details=details) for details in (False, True))
-    assert [t for t in titles(short) if t != "try"] == [
-        "status", "found", "certainty", "accuracy", "expected", "seconds",
-    ]  # fmt: skip
-    added = [t for t in titles(full) if t not in titles(short)]
-    assert added == ["flow", "energy", "residuals"]
-    assert set(short.splitlines()) <= set(full.splitlines())
-
-
-def test_what_moves_is_told_with_its_size_length_and_direction(small_run):
-    camera, *moving = findings.found_words(small_run)
-    centre = small_run.metrics["solution"].scale * small_run.camera.centre
-    # the camera of this scene moves sideways
-    way = "to the right" if centre[0] > 0 else "to the left"
-    assert camera.startswith(f"the camera moves by {np.linalg.norm(centre):.3g} m {way}")
-    shares = [part.pixels / small_run.segmentation.labels.size for part in small_run.components]
-    assert [f"{s:.0%} of the image moves" for s in shares[1:] if s >= 0.01] == [
-        line.partition(" by ")[0] for line in moving if "moves by itself" in line
-    ]
 
 
 def blamed(evidence, camera):
     """Evidence of a flow that shows an error of the camera, or of none."""
     errors = {camera: CameraError(0.1, 0.01, 0.1, 9.0)} if camera else {}
     return replace(evidence, errors=errors)
-
-
-def test_a_wrong_camera_may_look_like_motion(small_run):
-    sure = small_run.confidence
-    wrong = replace(sure, evidence=blamed(sure.evidence, "lens distortion"))
-    told = findings.found_words(replace(small_run, confidence=wrong))
-    words = "the flow suggests an error of lens distortion, which may look like such motion"
-    assert [line for line in told if line not in findings.found_words(small_run)] == [words]
-    moving = [k for k, line in enumerate(told) if "moves by itself" in line]
-    assert told.index(words) > moving[-1]
-
-
-@pytest.mark.parametrize(
-    ("vector", "way"),
-    [([0, -2, 1], "up"), ([0, 2, 1], "down"), ([0, 0, 3], "ahead"), ([-3, 0, 1], "to the left")],
-)
-def test_a_shift_has_a_length_and_a_direction(vector, way, small_run):
-    length, scale = np.linalg.norm(vector), small_run.metrics["solution"].scale
-    assert findings._shift(small_run, np.array(vector)) == f"{scale * length:.3g} m {way}"
-    # without a truth the length is relative
-    bare = replace(small_run, metrics={})
-    share = length / np.nanmedian(small_run.reconstruction.depth_ref)
-    expected = f"{share:.1%} of the median depth {way}"
-    assert findings._shift(bare, np.array(vector)) == expected
 
 
 def seen(run, confidence=None, focal=0.0, camera=None):
@@ -182,20 +130,3 @@ def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
     result = exit_code(fake, 0.2)
     assert result[0] == code
     assert part in result[1]
-
-
-@pytest.mark.parametrize("factor", [0.9, 1.1])
-def test_a_folder_has_the_limits_of_our_answers(factor):
-    # rotations that are off by so much, and a folder that says so
-    R = (1 + factor * DEFINITIONS["so3"].limit / 2) * np.eye(3)
-    soup = {"lam": [0.5, 0.5], "n": [[0, 0, -1.0]] * 2, "d": [1.0, 1.0], "R": [R, np.eye(3)]}
-    soup |= {"t": np.zeros((2, 3))}
-    tree = {"energy": {"rim_ray": np.ones((2, 1, 3))}, "weights": {"min_facing": 0.1}}
-    claims = {"residuals": constraints(soup).largest | {"visible": 0.0}, "status": "Skipped"}
-    claims |= {"delivered": "start"}
-    stored = SimpleNamespace(tree=tree, claims=claims, soup=lambda which: soup)
-    found = {claim.name: claim.ok for claim in _constraints(stored)}
-    assert found.pop("solution so3") == (factor < 1)
-    # |det R - 1| is three halves of it
-    found.pop("solution det")
-    assert all(found.values())

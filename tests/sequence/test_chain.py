@@ -10,7 +10,6 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.chain import Link
 from soup_nlp.report.formats import write_formats
-from soup_nlp.report.models import fuse
 from soup_nlp.sequence.links import chained_scales, follow, link, make_chain, number
 from soup_nlp.sequence.score import path_errors, read_path
 
@@ -76,19 +75,6 @@ def test_a_chain_has_one_scale_and_one_frame_of_reference():
     )
     # the static scene stands still in the world
     np.testing.assert_allclose(chain.motion(1, 0).matrix, np.eye(4), atol=1e-9)
-
-
-def test_the_static_scene_becomes_one_cloud():
-    chain = make_chain(toy_pairs())
-    cloud = fuse(chain)
-    both = sum(int(pair.static.sum()) for pair in chain.pairs)
-    # both pairs see the same wall: far fewer points than pixels, from either frame
-    assert 0 < len(cloud) <= both
-    assert set(cloud["frame"]) <= {0, 1}
-    # points of the second pair lie on the surface of the first
-    wall = chain.points(0)[chain.pairs[0].sure]
-    for point in cloud["points"][cloud["frame"] == 1][::50]:
-        assert np.linalg.norm(wall - point, axis=1).min() < 0.05 * np.linalg.norm(point)
 
 
 def test_a_pair_without_parallax_is_bridged():

@@ -130,17 +130,6 @@ def test_files_of_a_folder_that_are_frames(names, ordered, tmp_path):
         assert [p.name for p in find_images(source)] == ordered
 
 
-def test_a_pattern_may_match_folders(tmp_path):
-    for name in ("10", "9", ".hidden", "[9]"):
-        (tmp_path / name).mkdir()
-        write_png(tmp_path / name / "x.png", IMAGE)
-        write_png(tmp_path / name / "z.png", IMAGE)
-    found = find_images(tmp_path / "*" / "x.png")
-    assert [p.parent.name for p in found] == ["9", "10", "[9]"]
-    # brackets in the name of a folder that exists are no pattern
-    assert [p.name for p in find_images(tmp_path / "[9]" / "*.png")] == ["x.png", "z.png"]
-
-
 @pytest.mark.parametrize("kind", ["damaged", "heic", "turned"])
 def test_an_unreadable_frame_is_found_before_the_first_solve(kind, tmp_path, capsys, monkeypatch):
     def solve(*args):
@@ -166,10 +155,6 @@ def test_an_unreadable_frame_is_found_before_the_first_solve(kind, tmp_path, cap
     error = capsys.readouterr().err
     assert last.name in error
     assert {"damaged": "truncated", "heic": "convert it", "turned": "turned"}[kind] in error
-
-
-def test_frames_of_a_scene_follow_each_other():
-    assert Frames(("a",) * 4, scene="street").pair(2)["frame"] == 2
 
 
 def test_frames_of_another_sequence_are_left_alone(tmp_path, capsys):

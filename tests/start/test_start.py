@@ -138,19 +138,6 @@ def test_two_motions_are_told_apart():
 
 
 @pytest.mark.slow
-def test_noise_makes_it_worse_but_not_wild(room):
-    """Half a pixel of noise raises the errors, but to a limit."""
-    pair, seg, pure = room
-    noise = np.random.default_rng(99).normal(0, 0.5, pair.flow.uv.shape)
-    start = propose(fitted(with_uv(pair, pair.flow.uv + noise), seg))
-    assert_usable(start, seg)
-    e = compare(start, pair, seg, pure)
-    assert 1e-3 < np.median(e.depth()) < 0.05
-    assert 0.01 < np.median(e.direction) < 5
-    assert 0.3 < np.median(start.error) < 1.0
-
-
-@pytest.mark.slow
 def test_confident_pixels_decide(room):
     """Wrong flow with confidence 0 has no effect."""
     pair, seg, pure = room

@@ -72,25 +72,6 @@ def test_what_cannot_be_sent_is_a_failed_row():
     assert "pickle" in row["error"].lower()
 
 
-SCRIPT = """
-from functools import partial
-from soup_nlp.storage.each import each
-
-def square(number):
-    return {"square": number * number}
-
-print(sorted(row["square"] for _, row in each({str(k): partial(square, k) for k in range(3)}, 2)))
-"""
-
-
-@pytest.mark.slow
-def test_a_script_needs_no_guard(tmp_path):
-    (tmp_path / "script.py").write_text(SCRIPT)
-    words = [sys.executable, str(tmp_path / "script.py")]
-    ended = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert ended.stdout == "[0, 1, 4]\n"
-
-
 INTERRUPTED = """
 import os, signal, sys, time
 from functools import partial

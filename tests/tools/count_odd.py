@@ -32,7 +32,7 @@ def main() -> None:
     bad = 0
     with tempfile.TemporaryDirectory() as scratch:
         world = World(Path(scratch))
-        _ = world.result, world.exported, world.run
+        _ = world.result, world.exported
         for k, case in enumerate(cases):
             folder = Path(scratch) / f"case_{k}"
             folder.mkdir()
