@@ -3,8 +3,10 @@
 import gc
 import hashlib
 import pickle
+import re
 from collections.abc import Callable
 from functools import lru_cache, wraps
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,7 +25,7 @@ from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.start import camera_error
 
 # drawn cases are the same in every run, without a time limit on a busy machine
-settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=40)
+settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=20)
 settings.load_profile("fixed")
 
 
@@ -50,6 +52,14 @@ pipeline_case.follow_flow = once(pipeline_case.follow_flow)
 confidence.evidence, evidence.camera_errors = map(
     once, (evidence.evidence, camera_error.camera_errors)
 )
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Files of slow tests alone are not even imported where slow tests are left out."""
+    if config.option.markexpr == "not slow" and collection_path.suffix == ".py":
+        text = collection_path.read_text(encoding="utf-8")
+        return True if re.search(r"^pytestmark = \[?\s*pytest\.mark\.slow", text, re.M) else None
+    return None
 
 
 def pytest_collection_finish() -> None:

@@ -16,6 +16,8 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.storage.each import Row, attempt
 from soup_nlp.storage.rows import read_rows
 
+pytestmark = pytest.mark.slow
+
 QUICK = (
     "segmentation.superpixels=20",
     "segmentation.neighbours=4",
@@ -124,7 +126,6 @@ def test_two_pages_are_compared_by_family_and_half(tmp_path):
     assert main(["compare", str(tmp_path), str(tmp_path)]) == 2
 
 
-@pytest.mark.slow
 def test_a_suite_is_measured_once_with_every_number(tmp_path, capsys):
     words = ["accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
     words += ["--width", "128", "--out", str(tmp_path)]

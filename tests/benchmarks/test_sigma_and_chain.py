@@ -8,12 +8,13 @@ from benchmarks.sigma import fitted, write_sigma
 from benchmarks.table import Cell, frame_of
 from soup_nlp.evaluation.confidence import ADDED, FACTORS
 
+pytestmark = pytest.mark.slow
+
 
 def no_terms(count):
     return dict.fromkeys((*ADDED, "camera", "drawn"), np.zeros(count))
 
 
-@pytest.mark.slow
 def test_the_fit_finds_the_factor_of_normal_errors():
     rng = np.random.default_rng(0)
     terms = no_terms(4000)
@@ -57,7 +58,6 @@ SMALL = (
 )
 
 
-@pytest.mark.slow
 def test_a_chain_costs_the_difference_of_its_scales():
     cell = Cell(sequences(None)[0], SMALL)
     row = measure_chain(cell, frames=3)

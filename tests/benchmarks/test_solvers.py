@@ -12,6 +12,8 @@ from benchmarks.family.write import write_family
 from benchmarks.solvers import by_start, cost_table, frame_of_runs, profile, write_results
 from soup_nlp.storage.rows import read_rows
 
+pytestmark = pytest.mark.slow
+
 STUB = "SOUP-room-unit-offset-smooth-N100"
 
 
@@ -81,7 +83,6 @@ open(stub + ".sol", "w").write("\\n".join(map(str, [*head, *values, "objno 0 0"]
 """
 
 
-@pytest.mark.slow
 def test_a_solver_of_ones_own_is_a_command_line(tmp_path, monkeypatch, capsys):
     """The recipe of docs/adding.md: a program that reads .nl, found by its name on the PATH."""
     program = tmp_path / "mine"

@@ -7,6 +7,8 @@ from benchmarks.__main__ import main
 from benchmarks.speed import speed_cells
 from soup_nlp.storage.rows import read_rows
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_plan_has_every_run_once_small_ones_first():
     pairs = ["street", "motorcycle"], [3, 4], [512]
@@ -30,7 +32,6 @@ def test_bad_input_ends_with_2(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
 def test_a_real_run_and_its_table(tmp_path):
     size = ["--scenes", "street", "--superpixels", "12", "--neighbours", "4", "--widths", "64"]
     small = sets(

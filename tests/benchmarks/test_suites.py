@@ -5,6 +5,8 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.suites import SUITES, Options, every_pair, list_suite, spread
 
+pytestmark = pytest.mark.slow
+
 
 def test_suites_list_the_papers_pairs(tmp_path):
     assert set(SUITES) == {

@@ -1,13 +1,10 @@
 """The preset that is the method as printed: its options, its start, its unit, its proposals."""
 
-import re
 from operator import attrgetter
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.paper import printed
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
@@ -64,20 +61,6 @@ def test_the_preset_is_what_the_paper_prints():
     # E is printed with the factor 1 of E_arap, here 1 / alpha1 times as much: a pixel costs 1
     weights = problem.energy.weights
     assert (weights.arap, weights.proj, weights.cont, weights.orient) == (500.0, 1.0, 15.0, 0.1)
-
-
-def test_the_documented_departures_that_the_preset_keeps():
-    """The table of departures names their keys: the preset sets all but the listed ones."""
-    text = (Path(__file__).parents[2] / "docs" / "formulation.md").read_text()
-    table = text.split("| in the paper |")[1].split("\n\n")[0]
-    keys = set(re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)", table.replace("../soup_nlp", "")))
-    assert keys - printed().keys() == {
-        "flow.source",
-        "energy.pixel_samples",
-        "segmentation.boundary_samples",
-        "solver.eps",
-        "solver.presolve",
-    }
 
 
 def test_keys_of_the_file_and_overrides_lie_above_the_preset(tmp_path):

@@ -19,6 +19,8 @@ from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.pipeline.run import ProblemKeys
 from soup_nlp.report.check import check_folder
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"superpixels": 12, "neighbours": 4}
 
 

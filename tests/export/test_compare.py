@@ -96,6 +96,13 @@ def test_solvers_reach_a_verified_point(name, tmp_path):
     assert row["peak_bytes"] > 1e7
 
 
+def test_names_of_solvers(tmp_path):
+    with pytest.raises(SolverError, match="not here"):
+        find_solver("knitro_that_is_not_installed")
+    assert set(available()) >= {"ipopt", "ipopt-adaptive", "ipopt-tuned", "soup-nlp"}
+    assert callable(find_solver(str(program(tmp_path, "exit 0"))))
+
+
 @pytest.mark.slow
 def test_a_program_runs_in_a_folder_of_its_own(task, tmp_path, monkeypatch):
     mine = program(tmp_path, "exit 3")

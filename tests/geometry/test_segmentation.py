@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from helpers_truth import assert_partition
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import ndimage
@@ -54,7 +54,6 @@ def test_a_count_that_does_not_fit_is_an_error(count):
         segment(noise(48, 64), count)
 
 
-@settings(max_examples=60)
 @given(hnp.arrays(np.int32, (8, 9), elements=st.integers(0, 3)), st.integers(1, 12))
 def test_split_components_leaves_connected_pieces(labels, min_size):
     out = split_components(labels, min_size)

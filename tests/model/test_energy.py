@@ -49,7 +49,7 @@ def energies(soup: Soup, data: EnergyData, weights: Weights) -> np.ndarray:
 
 
 @pytest.mark.parametrize("units", UNITS)
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 10_000), scale=st.floats(1e-3, 1e3))
 def test_energy_knows_no_global_scale_and_no_gauge(units, seed, scale):
     problem, weights = tiny(units), weights_for(units)

@@ -28,7 +28,7 @@ from soup_nlp.model.programs import build_tangent_nlp, exact_chart
 
 
 @pytest.mark.parametrize("gauge", GAUGES)
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 10_000))
 def test_pack_and_unpack_are_inverse_of_each_other(gauge, seed):
     soup = random_soup(seed, 6)
@@ -45,7 +45,7 @@ def test_pack_and_unpack_are_inverse_of_each_other(gauge, seed):
 
 
 @pytest.mark.parametrize("chart", ["depth", "inverse-depth"])
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 10_000))
 def test_tangent_pack_and_unpack_are_inverse_of_each_other(chart, seed):
     problem = tiny()

@@ -52,7 +52,7 @@ def test_equals_plain_loops(seed, monkeypatch):
 
 @pytest.mark.parametrize("shape", ["tree", "graph", "parallel edges"])
 @given(seed=seeds)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15)
 def test_bound_brute_force_and_energy_in_this_order(shape, seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 7))
@@ -98,7 +98,6 @@ def test_larger_problem_float32_follows_float64():
 
 
 @given(seeds)
-@settings(max_examples=25, deadline=None)
 def test_levels_are_colours_and_hold_every_edge_twice(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 30))
