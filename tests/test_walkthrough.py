@@ -21,6 +21,8 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.scenes.catalogue import render_scene
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PAGES = [
@@ -72,7 +74,6 @@ def run_line(words):
     return subprocess.run([program, *words[1:]], check=False).returncode
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_runs_as_printed(page, monkeypatch):

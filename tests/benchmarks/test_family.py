@@ -175,8 +175,9 @@ def test_a_best_point_is_read_back_as_an_answer(folder):
 
 def test_an_answer_off_the_constraints_is_told(folder, tmp_path, capsys):
     text = (folder / "SOUP-orbit-unit-offset-smooth-N100.sol").read_text().splitlines()
-    first = text.index("Options") + 9
-    text[first] = repr(float(text[first]) + 0.5)
+    # the point is the last of the numbers
+    last = next(k for k, line in enumerate(text) if line.startswith("objno")) - 1
+    text[last] = repr(float(text[last]) + 0.5)
     path = tmp_path / "SOUP-orbit-unit-offset-smooth-N100-hard.sol"
     path.write_text("\n".join(text) + "\n")
     assert main(["check", str(path)]) == 1

@@ -91,6 +91,7 @@ def case() -> Case:
     return prepare(paper(flow={"source": "truth"}))
 
 
+@pytest.mark.slow
 def test_the_start_is_one_of_single_superpixels(case):
     """All anchors at one depth; in units of its translation, depth is right where nothing moves."""
     soup, truth = case.start.soup, case.pair.truth
@@ -118,6 +119,7 @@ def test_a_plane_follows_from_its_motion():
     assert np.allclose(plane_of(Motion(R, t), matched), m, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_unit_of_length_is_the_sum_of_translations(case):
     """E_cont without truncation is a length: in its unit times the unit it is always the same."""
     start, weights = case.start.soup, case.weights.replace(sigma_cont=np.inf)
@@ -131,6 +133,7 @@ def test_the_unit_of_length_is_the_sum_of_translations(case):
         assert total == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_pixel_of_smoothing_is_a_length_and_an_angle(case):
     """In the paper's units the widths of norms are those that eps pixels have on the scene."""
     f, unit = case.data.K_next[0, 0], case.data.edge_unit[0]

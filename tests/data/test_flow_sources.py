@@ -44,6 +44,7 @@ def test_noise_has_its_size_and_correlation_length(pair):
     assert not is_named("flow.flo")
 
 
+@pytest.mark.slow
 def test_black_bars_have_no_confidence(pair):
     above, left = 16, 24
 
@@ -194,6 +195,7 @@ def test_flows_that_do_not_fit_name_their_cause(tmp_path: Path) -> None:
             resolve_flow(pair, str(path))
 
 
+@pytest.mark.slow
 def test_a_backward_flow_is_compared_with_the_images_too(tmp_path: Path) -> None:
     pair = render_scene("orbit", 0, 256, 108)
     back = dis_flow(pair.image_next, pair.image_ref).uv

@@ -166,6 +166,7 @@ def test_8_bits_beside_16_are_stretched_alike(factor: int, tmp_path: Path) -> No
     np.testing.assert_array_equal(eight, image[:, :, ::-1])
 
 
+@pytest.mark.slow
 def test_an_interlaced_picture_gives_a_warning(tmp_path: Path) -> None:
     pair = render_scene("orbit", 0, 320, 136)
     both = pair.image_ref.copy()

@@ -47,6 +47,7 @@ def test_what_parallax_does_not_tell_is_inferred(name, small_run):
     assert (kinds(rec, small_run.pair.flow, start, ~none, given) == KINDS.index("drawn")).all()
 
 
+@pytest.mark.slow
 def test_before_a_camera_at_rest_all_is_drawn_but_what_is_given(small_run):
     at_rest = replace(small_run.start, at_rest=True)
     assert sure_of(small_run, at_rest).share("drawn") == 1.0
@@ -59,6 +60,7 @@ def test_before_a_camera_at_rest_all_is_drawn_but_what_is_given(small_run):
     assert (kind[~inside] == KINDS.index("drawn")).all()
 
 
+@pytest.mark.slow
 def test_what_is_as_uncertain_as_a_drawing_is_one(small_run):
     sure = small_run.confidence
     assert (sure.kind[sure.sigma >= FACTORS["drawn"]] == KINDS.index("drawn")).all()

@@ -175,6 +175,7 @@ def test_the_information_is_that_of_measured_pixels(small_room, monkeypatch):
     assert direction @ info.matrix @ direction == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("term", ["arap", "prior"])
 def test_a_smoothing_wider_than_all_errors_divides_the_information(term, small_room, monkeypatch):
     free = dict.fromkeys(("sigma_proj", "sigma_cont", "sigma_cont_ref", "sigma_arap"), np.inf)
@@ -235,6 +236,7 @@ def test_a_guessed_or_wrong_focal_length_makes_depth_unsure():
     assert within_two(GUESS_SIGMA) > 0.88
 
 
+@pytest.mark.slow
 def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
     K = small_room.pair.K_ref, small_room.pair.K_next
     rec = reconstruct(small_room.soup, small_room.segmentation.labels, *K)
@@ -266,6 +268,7 @@ def test_other_components_are_less_sure_than_the_scene(small_room, sure):
     np.testing.assert_allclose(sure.component_sigma, 1 / np.sqrt(raw**-2 + PRIOR**-2))
 
 
+@pytest.mark.slow
 def test_the_scale_of_what_moves_faster_than_the_scene_is_open(small_room, sure):
     labels, part = small_room.segmentation.labels, small_room.start.component
     moving = part == part[part != SCENE][0]
@@ -279,6 +282,7 @@ def test_the_scale_of_what_moves_faster_than_the_scene_is_open(small_room, sure)
     np.testing.assert_allclose(more[~inside], 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_relief_is_less_sure_the_less_of_the_flow_depth_explains(small_room, sure):
     gap = sure.evidence.gap[SCENE]
     assert gap > FACTORS["relief"] * small_room.start.noise
@@ -292,6 +296,7 @@ def test_relief_is_less_sure_the_less_of_the_flow_depth_explains(small_room, sur
     assert sure_of(loud).terms["relief"].max() <= 2 * most.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["rest", "fixed"])
 def test_drawn_depth_has_the_sigma_of_what_is_drawn(small_room, change):
     start, part = small_room.start, np.arange(len(small_room.soup)) < 5

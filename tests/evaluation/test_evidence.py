@@ -89,6 +89,7 @@ def test_a_turn_explains_a_stabilised_flow_with_all_parameters_only(small_room):
     assert error(ANY_TURN) < 0.02
 
 
+@pytest.mark.slow
 def test_an_uncertain_focal_length_counts_in_proportion(small_room):
     soup, data = scene(small_room, 0.3, (0.3, 0.0, 0.1))
     uncertain, doubled = (of_one(soup, data, x).sigma for x in (0.2, 0.4))

@@ -166,7 +166,7 @@ def test_flipped_bits_are_noticed(image, tmp_path):
     path, rng = tmp_path / "r.h5", np.random.default_rng(1)
     path.write_bytes(image)
     tree, noticed = read_h5(path), 0
-    for at in rng.integers(0, len(image), 60):
+    for at in rng.integers(0, len(image), 30):
         data = bytearray(image)
         data[at] ^= 1 << int(rng.integers(8))
         path.write_bytes(data)
@@ -175,7 +175,7 @@ def test_flipped_bits_are_noticed(image, tmp_path):
         except DataError:
             noticed += 1
     # what is not read is free space between the parts
-    assert noticed > 48
+    assert noticed > 24
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.999])
