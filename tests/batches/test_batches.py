@@ -201,16 +201,6 @@ def four(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_two_runs_in_one_folder_solve_no_pair_twice(four, tmp_path):
-    runs = [subprocess.Popen(command(four, tmp_path / "out")) for _ in range(2)]
-    assert [run.wait() for run in runs] == [0, 0]
-    rows = read_rows(tmp_path / "out" / "pairs.jsonl")
-    assert sorted(row["key"] for row in rows) == [f"orbit_{k}" for k in range(4)]
-    assert not list((tmp_path / "out" / "pairs").glob("*.claim"))
-    assert len(rows_of(tmp_path / "out")) == 4
-
-
-@pytest.mark.slow
 def test_a_killed_run_goes_on(four, tmp_path):
     out = tmp_path / "out"
     run = subprocess.Popen(command(four, out))

@@ -104,12 +104,6 @@ def test_dis_confidence_drops_where_nothing_matches() -> None:
     assert alike.confidence[35:55, 45:70].all()
 
 
-def test_an_image_that_is_too_small_for_dis() -> None:
-    good = np.zeros((20, 20, 3), np.uint8)
-    with raises(r"too small[\s\S]*20x15"):
-        dis_flow(good[:15], good)
-
-
 def test_a_consistent_round_trip_gives_confidence() -> None:
     forward = np.zeros((40, 60, 2), np.float32)
     forward[..., 0] = 2.0

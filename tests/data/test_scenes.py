@@ -18,9 +18,6 @@ from soup_nlp.data.scenes.surfaces import (
     Plane,
     Sheet,
     Texture,
-    fractal_noise,
-    pulse_coverage,
-    value_noise,
 )
 from soup_nlp.data.scenes.things import placed
 from soup_nlp.errors import ConfigError, DataError
@@ -190,30 +187,6 @@ def test_edge_pixels_mix_both_sides_by_their_share():
 
 
 # --- textures ---------------------------------------------------------------------------------
-
-
-def test_noise_is_smooth_and_limited_to_the_footprint():
-    rng = np.random.default_rng(2)
-    at = rng.uniform(-50, 50, (4000, 3))
-    noise = value_noise(at, 3)
-    assert abs(noise).max() <= 1
-    assert 0.2 < noise.std() < 0.6
-    np.testing.assert_allclose(value_noise(at + np.array([1e-4, 0, 0]), 3), noise, atol=1e-3)
-    fine = fractal_noise(at, np.full(4000, 0.01), cell=1.0, seed=3)
-    coarse = fractal_noise(at, np.full(4000, 0.7), cell=1.0, seed=3)
-    none = fractal_noise(at, np.full(4000, 5.0), cell=1.0, seed=3)
-    assert fine.std() > coarse.std() > none.std() == 0
-    assert 0.2 < fine.std() < 0.7
-
-
-def test_pulse_coverage_is_the_share_of_a_window():
-    x = np.linspace(-3, 3, 401)
-    fine = (np.arange(4000) + 0.5) / 4000 - 0.5
-    for width in (0.02, 0.3, 2.5):
-        window = x[:, None] + width * fine
-        share = np.mean(window - np.floor(window) < 0.35, axis=1)
-        got = pulse_coverage(x, 0.35, np.full(401, width))
-        np.testing.assert_allclose(got, share, atol=1e-3)
 
 
 # --- use --------------------------------------------------------------------------------------

@@ -201,16 +201,6 @@ def orbit():
 
 
 @pytest.mark.slow
-def test_two_scenes_are_drawn():
-    one, other = (
-        make_problem({"input": {**ORBIT, "scene": name}}).load_pair() for name in ("room", "street")
-    )
-    done, told = started(replace(one, flow=None, image_next=other.image_next))
-    assert not done.good
-    assert "same scene" in told
-
-
-@pytest.mark.slow
 def test_a_repeated_frame_is_drawn(orbit):
     done, told = started(replace(orbit, flow=None, image_next=orbit.image_ref))
     assert not done.good

@@ -99,16 +99,6 @@ def test_knn_is_brute_force_nearest_first_and_of_equal_distances_by_index(seg):
     np.testing.assert_array_equal(seg.knn, np.argsort(far, axis=1, kind="stable")[:, :7])
 
 
-def test_folded_edges_keep_every_direction(seg):
-    n, k = seg.knn.shape
-    directed = {(i, int(j)) for i in range(n) for j in seg.knn[i]}
-    assert seg.edge_multiplicity.sum() == n * k == len(directed)
-    assert (seg.edges[:, 0] < seg.edges[:, 1]).all()
-    assert len(np.unique(seg.edges, axis=0)) == len(seg.edges)
-    for (i, j), m in zip(seg.edges.tolist(), seg.edge_multiplicity):
-        assert m == ((i, j) in directed) + ((j, i) in directed)
-
-
 @pytest.mark.parametrize("beta", [0.02, 0.0, 0.3])
 def test_edge_weight_is_equation_2(seg, image, beta, monkeypatch):
     if beta != 0.02:  # the paper's

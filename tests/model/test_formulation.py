@@ -94,19 +94,6 @@ def test_names_are_unique_and_point_to_their_numbers(gauge):
         assert "7" in name.partition("[")[2].rstrip("]").split(",")[:2], name
 
 
-def test_sizes_are_those_of_the_formulation():
-    problem, n = tiny(), 12
-    nlp, _ = problem.nlp(PAPER, form())
-    sizes = nlp.sizes()
-    assert sizes["variables"] == 16 * n
-    assert sizes["equalities"] == 6 * n + n + 1
-    assert sizes["inequalities"] == 9 * n
-    other, _ = problem.nlp(PAPER, form(gauge="unit-translation"))
-    assert other.sizes()["variables"] == 17 * n + 1
-    assert other.sizes()["equalities"] == 8 * n + 2
-    assert sizes["jacobian_nonzeros"] == nlp.nnzj == nlp.jacobian(nlp.x0).nnz
-
-
 def test_a_table_must_fit_its_kernel_and_be_finite():
     nlp, _ = tiny().nlp(PAPER, form())
     group = next(g for g in nlp.groups if g.kernel.name == "normal")

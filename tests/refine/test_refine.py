@@ -143,16 +143,6 @@ def test_proposals_are_split_by_shares_and_limited_by_neighbours(total, near):
         assert abs(count - total * shares[kind] / sum(shares.values())) <= 1
 
 
-def test_neighbours_come_nearest_first():
-    tiny = Tiny()
-    near = neighbours(tiny.data.edges, tiny.data.anchor_ray)
-    gap = np.linalg.norm(tiny.data.anchor_ray[near] - tiny.data.anchor_ray[:, None], axis=2)
-    assert (np.diff(gap, axis=1) >= 0).all()
-    edges = {tuple(e) for e in tiny.data.edges}
-    assert all((min(i, k), max(i, k)) in edges for i in range(len(near)) for k in near[i])
-    assert neighbours(np.zeros((0, 2), int), tiny.data.anchor_ray).shape == (12, 0)
-
-
 @pytest.mark.parametrize("units", ["paper", "pixels"])
 def test_no_round_raises_the_energy_or_violates_constraints(units):
     tiny = Tiny(units, samples=6)

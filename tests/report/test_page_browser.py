@@ -72,15 +72,6 @@ def test_it_loads_without_an_error_and_fetches_nothing(browser):
     assert len(browser.requests) == 1
 
 
-def test_a_console_error_would_be_seen(browser):
-    browser.value("console.error('planted')")
-    browser.value("setTimeout(() => { throw new Error('thrown'); })")
-    browser.value("new Promise(done => setTimeout(done, 20))")
-    assert "planted" in browser.log[0]
-    assert "thrown" in browser.log[1]
-    browser.log.clear()
-
-
 def test_the_view_of_the_reference_camera_is_the_reference_image(browser, small_run):
     browser.value("document.getElementById('cameras').click()")
     browser.value("document.getElementById('paths').click()")
@@ -135,19 +126,6 @@ def test_every_mode_has_its_own_colours_and_legend(browser):
             assert apart(images[a], images[b]) > 0.01, (a, b)
 
 
-def test_switches(browser):
-    browser.value("soupView.setTime(1)")
-    before = canvas(browser)
-    for name in ("points", "cameras", "still"):
-        browser.value(f"document.getElementById('{name}').click()")
-        after = canvas(browser)
-        assert apart(before, after) > 0.001, name
-        browser.value(f"document.getElementById('{name}').click()")
-        np.testing.assert_array_equal(canvas(browser), before)
-    browser.value("soupView.setFar(0.01)")
-    assert drawn(canvas(browser)) < 0.01
-
-
 def test_a_click_tells_depth_sigma_and_component(browser, small_run):
     width = small_run.pair.size[1]
     # the middle of the view is the principal point
@@ -167,25 +145,6 @@ def test_a_click_tells_depth_sigma_and_component(browser, small_run):
     assert "superpixel" in said
     browser.value("soupView.tell(-1)")
     assert "No point" in browser.value("document.getElementById('picked').textContent")
-
-
-def test_the_least_confidence_hides_points(browser, small_run):
-    size = "soupView.ply().size"
-    before, whole = canvas(browser), browser.value(size)
-    assert whole > 15 * 0.9 * np.isfinite(small_run.reconstruction.depth_ref).sum()
-    browser.value("soupView.setLeast(0.98)")
-    assert browser.value(size) < whole
-    assert drawn(canvas(browser)) < drawn(before)
-    browser.value("soupView.setLeast(0)")
-    assert browser.value(size) == whole
-    click = "document.getElementById('drawn').click()"
-    browser.value(click)
-    share = small_run.confidence.share("drawn")
-    assert (browser.value(size) < whole) == (share > 0)
-    browser.value(click)
-    assert browser.value(size) == whole
-    browser.value("document.querySelectorAll('#modes button')[1].click()")
-    browser.wait("location.hash.startsWith('#mode=')")
 
 
 @pytest.mark.parametrize("points", [False, True])

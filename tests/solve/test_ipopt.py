@@ -2,7 +2,6 @@
 
 import os
 import signal
-import threading
 from functools import partial
 
 import casadi as ca
@@ -215,31 +214,6 @@ def test_the_time_limit_stops_and_keeps_the_best_iterate():
     assert not stage.converged
     assert np.isfinite(stage.x).all()
     assert stage.iterations <= 1
-
-
-def test_an_event_stops_and_keeps_the_best_iterate():
-    nlp, stop, seen = rosenbrock(10), threading.Event(), []
-
-    def listen(p: Progress) -> None:
-        seen.append(p.objective)
-        if p.iteration == 3:
-            stop.set()
-
-    stage = solve(nlp, watch=Watch(listen, stop))
-    assert stage.status == "Interrupted"
-    assert len(seen) == 4
-    assert stage.objective == min(seen)
-    assert nlp.value(stage.x) == pytest.approx(stage.objective)
-
-
-def test_a_listener_that_fails_ends_the_solve_with_its_message():
-    def listen(p: Progress) -> None:
-        raise ValueError("no more paper")
-
-    stage = solve(rosenbrock(10), watch=Watch(listen))
-    assert "no more paper" in stage.status
-    assert not stage.converged
-    assert np.isfinite(stage.x).all()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -28,7 +28,7 @@ from soup_nlp.start.bending import (
     turn_alone,
 )
 from soup_nlp.start.components import connected_labels
-from soup_nlp.start.labelling import LEAST_NOISE, dominant, labelled
+from soup_nlp.start.labelling import dominant, labelled
 from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow
@@ -208,18 +208,6 @@ def test_depth_that_explains_the_flow_is_no_turn():
     turned = flow.views.ray @ choice.motions[0].R.T
     still = replace(flow.views, target=turned / turned[..., 2:])
     assert turn_alone(flow._replace(views=still), choice) is not None
-
-
-def test_noise_where_surfaces_bend_is_that_of_affine_flows():
-    """The error of a start without relief is no noise."""
-    quiet = case("sheet", "segmentation.superpixels=100").start
-    assert quiet.noise == LEAST_NOISE
-    assert np.median(quiet.error) > LEAST_NOISE
-    raw = {"kind": "scene", "scene": "sheet", "seed": 0, "width": 768, "height": 327}
-    raw = {"input": raw, "flow": {"source": "truth+noise:0.11"}}
-    noisy = prepare(make_problem(raw, ["segmentation.superpixels=150"])).start
-    assert noisy.bending
-    assert 2 * LEAST_NOISE < noisy.noise < 0.5
 
 
 @pytest.mark.parametrize(
