@@ -1,17 +1,14 @@
 """Accuracy of pairs: contents of rows, scores of sigma, the page, comparison of two pages."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.accuracy import comparison, read_pages, suite_page, write_suite
-from benchmarks.scores import METHODS, measure_pair, moving, sigma_scores
+from benchmarks.scores import METHODS, measure_pair, sigma_scores
 from benchmarks.suites import SUITES
 from benchmarks.table import Cell, Item, frame_of
-from soup_nlp import Pair, Truth
 from soup_nlp.errors import ConfigError
 from soup_nlp.storage.each import Row, attempt
 from soup_nlp.storage.rows import read_rows
@@ -76,24 +73,6 @@ def test_sigma_is_scored_by_what_it_says():
     flat = sigma_scores(error, np.full(100, np.sqrt(np.mean(error**2))))
     assert flat["nll"] == pytest.approx(flat["flat"])
     assert sigma_scores(np.zeros(20), np.ones(20))["wrong_sure"] is None
-
-
-def test_moving_pixels_are_told_apart_under_one_scale():
-    label = np.zeros((40, 60), np.int32)
-    label[5:15, 5:25], label[30:, 50:] = 1, 2
-    label[:, 0] = -1
-    depth = np.full((40, 60), 4.0)
-    # the first component comes out at half of its depth, the second is exact
-    estimate = np.where(label == 1, 2.0, 4.0) / 7
-    pair = Pair(
-        *(np.zeros((40, 60, 3), np.uint8) for _ in range(2)),
-        *(np.array([[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]]) for _ in range(2)),
-        truth=Truth(depth_ref=depth, components=label),
-    )
-    errors = moving(pair, estimate)
-    assert (errors["mre"], errors["rest"]) == pytest.approx((0.5 * 200 / 300, 0.0), abs=1e-12)
-    still = replace(pair, truth=Truth(depth_ref=depth, components=0 * label))
-    assert moving(still, estimate) is None
 
 
 def solved(suite: str, pair: str = "p", family: str = "s", mre: float = 0.03) -> Row:

@@ -17,7 +17,7 @@ from soup_nlp.data.flow.consistency import (
     round_trip_error,
     standing_edges,
 )
-from soup_nlp.data.flow.dis import dominant_homographies, guided_flow
+from soup_nlp.data.flow.dis import guided_flow
 from soup_nlp.data.flow.sources import dis_flow, flow_sources, resolve_flow
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.report.findings import STANDING
@@ -81,14 +81,6 @@ def test_dis_without_contrast(level: int) -> None:
         flow = dis_flow(a, b)
         assert not flow.uv.any()
         assert not flow.confidence.any()
-
-
-def test_dis_images_of_different_size() -> None:
-    first, second = shifted(64, 90, 2, 0)
-    flow = dis_flow(first, second[:, :70])
-    assert flow.uv.shape == (64, 90, 2)
-    assert not flow.confidence[:, 72:].any()
-    assert (flow.confidence[10:-10, 10:60] > 0.5).mean() > 0.9
 
 
 def test_dis_confidence_drops_where_nothing_matches() -> None:
@@ -229,18 +221,6 @@ def match(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     method.setFinestScale(0)
     return method.calc(first, second, None), method.calc(second, first, None)
-
-
-def test_homographies_are_recovered_one_after_the_other():
-    left = np.arange(WIDTH) < WIDTH // 3
-    shift = np.array([[1.0, 0, 3], [0, 1, -2], [0, 0, 1]])
-    flow = np.where(left[None, :, None], truth(shift), truth(ROAD)).astype(np.float32)
-    homographies = dominant_homographies(flow, np.ones((HEIGHT, WIDTH), np.float32), 4)
-    assert len(homographies) == 2
-    for H, true in zip(homographies, (ROAD, shift)):
-        np.testing.assert_allclose(H / H[2, 2], true, atol=1e-3, rtol=1e-3)
-    assert dominant_homographies(flow, np.zeros((HEIGHT, WIDTH), np.float32), 4) == []
-    assert len(dominant_homographies(flow, np.ones((HEIGHT, WIDTH), np.float32), 1)) == 1
 
 
 def test_a_first_flow_that_is_half_wrong_is_completed(monkeypatch):

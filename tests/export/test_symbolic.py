@@ -14,6 +14,8 @@ from soup_nlp.model import oracle
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.stages import solve_soup
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = [
     "input.width=192", "input.height=96", "flow.source=truth",
@@ -22,7 +24,6 @@ SMALL = [
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 
-@pytest.mark.slow
 def test_nlpsol_finds_the_minimum_of_solve():
     nlp = soup_nlp.nlp(
         "orbit", superpixels=9, overrides=SMALL, coordinates="tangent", hessian="gauss-newton"
@@ -42,7 +43,6 @@ def test_nlpsol_finds_the_minimum_of_solve():
     assert reached < 0.9 * own.energy_start["total"]
 
 
-@pytest.mark.slow
 def test_the_sensitivity_of_the_guide_is_that_of_a_second_solve():
     nlp = soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL, presolve=True)
 
@@ -76,7 +76,6 @@ def test_the_sensitivity_of_the_guide_is_that_of_a_second_solve():
     np.testing.assert_allclose(names["change"], change, atol=0.02 * largest)
 
 
-@pytest.mark.slow
 def test_the_symbols_are_the_program():
     nlp = soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL)
     n = len(nlp.case)

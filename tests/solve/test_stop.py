@@ -15,6 +15,8 @@ from soup_nlp.config.problem import Problem, load_problem
 from soup_nlp.report.folder import WritableRun
 from soup_nlp.storage.progress import Progress, interruptible
 
+pytestmark = pytest.mark.slow
+
 SMALL = (
     "input.width=64 input.height=48 flow.source=truth segmentation.superpixels=10"
     " segmentation.neighbours=3 solver.presolve_iterations=2 solver.exact_iterations=2"
@@ -54,7 +56,6 @@ def stopped(way: str, last: int, monkeypatch) -> tuple[WritableRun, list[str]]:
         return soup_nlp.run(problem(), listener=listen, stop=event), seen
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("way", ["stop", "SIGINT", "SIGTERM", "time"])
 def test_a_stop_at_every_iteration_leaves_a_result(way, monkeypatch):
     stages = {"majorant 0.3", "Gauss-Newton 0.9", "exact", "constrained NLP", "refine 1"}

@@ -10,6 +10,8 @@ from soup_nlp.start.components import FIXED
 from soup_nlp.start.propose import propose
 from soup_nlp.start.views import FlowFit
 
+pytestmark = pytest.mark.slow
+
 K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
 H, W, TILE = 120, 160, 10
 AHEAD, TURN = np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.02, 0.0])
@@ -58,7 +60,6 @@ def clean(seg):
     return start_of(seg, scene_flow())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", STILL)
 def test_a_still_region_before_a_moving_camera_is_fixed(seg, clean, name):
     where, turn = STILL[name]
@@ -79,7 +80,6 @@ def test_a_still_region_before_a_moving_camera_is_fixed(seg, clean, name):
         assert np.median(np.abs(log - np.median(log))) < 0.02
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("what", ["far region", "resting camera", "mover"])
 def test_what_moves_or_is_far_is_not_fixed(seg, what):
     flow = scene_flow(np.zeros(3)) if what == "far region" else scene_flow()

@@ -190,22 +190,6 @@ def test_a_translation_with_points_in_front_is_cheaper():
 # --- surfaces that bend --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kept", [range(5), []])
-def test_planes_are_fitted_in_blocks(kept, monkeypatch):
-    random = np.random.default_rng(4)
-    ray = np.concatenate([random.uniform(-0.3, 0.3, (5, 9, 2)), np.ones((5, 9, 1))], axis=2)
-    depth = random.uniform(2, 4, (5, 1, 1))
-    weight, anchor = random.uniform(0.5, 1, (5, 9)), ray.mean(axis=1)
-    views = Views(ray, ray * depth + [0.1, 0, 0], weight, anchor, np.ones(5), np.full(2, FOCAL))
-    views = views.subset(np.array(kept, int))
-    motions = [Motion(np.eye(3), np.array(t)) for t in ([0.1, 0, 0], [0, 0.1, 0.0])]
-    whole = views.fit(motions)
-    monkeypatch.setattr("soup_nlp.start.views.CACHED", 36)
-    for name, values in vars(views.fit(motions)).items():
-        assert len(values) == len(kept)
-        np.testing.assert_allclose(values, getattr(whole, name), rtol=1e-9)
-
-
 def flat_views(target: np.ndarray, off_centre: np.ndarray, weight: np.ndarray) -> Views:
     """One superpixel around the optical axis, offsets and targets (S, 2) in ray units."""
     one = np.ones((len(target), 1))
