@@ -55,6 +55,8 @@ SMALL = (
     "segmentation.superpixels=40",
     "segmentation.neighbours=6",
     "refine.enabled=false",
+    "solver.presolve=false",
+    "solver.max_iter=1",
 )
 
 
