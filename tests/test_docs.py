@@ -194,6 +194,7 @@ def test_scores_are_those_of_the_stored_tables():
             assert fits(said, numbers) or (not said and flow == "truth"), (row, numbers)
 
 
-@pytest.mark.parametrize("mutant", [m for m, _ in MUTANTS], ids=lambda mutant: mutant.what)
-def test_a_mutant_of_a_constraint_changes_one_place(mutant):
-    assert (ROOT / "soup_nlp" / mutant.module).read_text().count(mutant.old) == 1
+def test_a_mutant_of_a_constraint_changes_one_place():
+    for mutant, _ in MUTANTS:
+        text = (ROOT / "soup_nlp" / mutant.module).read_text(encoding="utf-8")
+        assert text.count(mutant.old) == 1, mutant.what

@@ -102,13 +102,11 @@ MALFORMED = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "name", "content", "match"), MALFORMED)
-def test_a_malformed_file_is_refused(
-    kind: str, name: str, content: bytes | str | np.ndarray, match: str, tmp_path: Path
-) -> None:
-    with raises(match) as caught:
-        READERS[kind](stored(tmp_path / name, content))
-    assert name in str(caught.value)
+def test_a_malformed_file_is_refused(tmp_path: Path) -> None:
+    for kind, name, content, match in MALFORMED:
+        with raises(match) as caught:
+            READERS[kind](stored(tmp_path / name, content))
+        assert name in str(caught.value)
 
 
 def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:

@@ -34,20 +34,13 @@ def made(
     return Pair(image, image, K, K_next, flow), z, R, t
 
 
-@pytest.mark.parametrize(("dtype", "rtol"), [(np.float32, 5e-3), (np.float64, 1e-6)])
-@pytest.mark.parametrize(
-    ("fx", "fy", "skew", "cx", "cy"),
-    [
-        *((90, fy, 0, cx, 28) for fy in (92, 110) for cx in (41, 72)),
-        (140, 120, 1.5, 30, 35),
-    ],
-)
-def test_exact_flow_gives_exact_depth_whatever_the_second_camera(fx, fy, skew, cx, cy, dtype, rtol):
+@pytest.mark.parametrize("camera", [(90, 110, 0, 72, 28), (140, 120, 1.5, 30, 35)])
+def test_exact_flow_gives_exact_depth_whatever_the_second_camera(camera):
     """In double precision only rounding remains."""
+    fx, fy, skew, cx, cy = camera
     K_next = np.array([[fx, skew, cx], [0, fy, cy], [0, 0, 1.0]])
-    pair, z, _, t = made(K_next, dtype=dtype)
-    depth = rigid_depth(pair)
-    np.testing.assert_allclose(depth * np.linalg.norm(t), z, rtol=rtol)
+    pair, z, _, t = made(K_next, dtype=np.float64)
+    np.testing.assert_allclose(rigid_depth(pair) * np.linalg.norm(t), z, rtol=1e-6)
 
 
 def test_depth_without_parallax_is_unknown():
