@@ -9,7 +9,7 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.family.instances import STANDARD, VERSION, select
 from benchmarks.family.write import write_family
-from benchmarks.solvers import by_start, cost_table, frame_of_runs, profile, write_results
+from benchmarks.solvers import cost_table, frame_of_runs, profile
 from soup_nlp.storage.rows import read_rows
 
 pytestmark = pytest.mark.slow
@@ -47,27 +47,6 @@ def test_profiles_by_hand():
     assert share.index.tolist() == [1]
     assert share.to_numpy().tolist() == [[0]]
 
-
-def test_a_minimum_is_reached_when_it_is_verified_and_near(tmp_path):
-    rows = [row("one", "easy", 4.0001), row("two", "easy", 4.01), row("three", "easy", 3.0)]
-    rows += [row("three", "easy", 3.0, verified=False), {"solver": "x", "error": "died", **LABEL}]
-    frame = frame_of_runs(rows)
-    # a lower objective than the best known one is reached as well
-    assert frame["reached"].tolist() == [True, False, True, False, False]
-    text = by_start(frame)
-    assert "| one | 1 of 1 (1), 1.0 s |" in text
-    assert "| x | 0 of 1 (0) |" in text
-    write_results(tmp_path, rows, {"set": "SOUP"})
-    assert (tmp_path / "profiles.png").stat().st_size > 5000
-    plain = json.loads((tmp_path / "results.json").read_text())["results"][0]
-    # the fields that the README of the set asks for
-    asked = {"solver", "name", "n", "m", "status", "objective", "iterations", "time"}
-    assert asked <= plain.keys()
-    assert plain["reached"]
-
-
-LABEL = {"problem": "room easy", "superpixels": 100, "formulation": "f", "identity": 4}
-LABEL |= {"start": "easy", "name": f"{STUB}-easy", "best_known": 4.0}
 
 PROGRAM = """#!{python}
 # a solver that knows one iteration: it returns the start, and claims that it is optimal

@@ -79,21 +79,6 @@ def test_before_a_start_it_ends_at_once(owner, stage, tmp_path, monkeypatch, cap
     assert "interrupted" in (tmp_path / "out" / folders.FAILED).read_text()
 
 
-def test_an_interrupt_that_a_library_turns_into_another_error(tmp_path, monkeypatch, capfd):
-    def library(*_, **__):
-        try:
-            ctrl_c()
-        except KeyboardInterrupt:
-            raise SystemError("error return without exception set") from None
-
-    monkeypatch.setattr(cases, "build_segmentation", library)
-    assert solve(tmp_path / "out") == 130
-    assert "interrupted" in (tmp_path / "out" / folders.FAILED).read_text()
-    # also where a command has no answer to signals of its own
-    assert cli.main(["export", "orbit", "-o", str(tmp_path / "export"), *SMALL]) == 130
-    assert "bug" not in capfd.readouterr().err
-
-
 @pytest.mark.parametrize("command", ["batch", "chain"])
 def test_an_interrupt_says_what_is_kept(command, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(f"soup_nlp.{OWNER[command]}.each", lambda *_, **__: ctrl_c())

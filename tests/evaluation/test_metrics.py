@@ -170,15 +170,6 @@ def test_the_errors_themselves_are_a_perfect_uncertainty():
     assert len(curve.kept) == STEPS
 
 
-def test_the_area_of_a_linear_error():
-    """The mean error kept by the oracle is kept / 2, in the reverse order 1 - kept / 2."""
-    kept = np.linspace(1.0, LAST, STEPS)
-    worst = sparsification(ERROR, -ERROR)
-    np.testing.assert_allclose(worst.oracle, kept / 2, atol=2e-3)
-    np.testing.assert_allclose(worst.error, 1 - kept / 2, atol=2e-3)
-    assert worst.ause == pytest.approx(np.mean(1 - kept) / 0.5, abs=5e-3)
-
-
 def test_equal_uncertainties_are_chance_in_whatever_order_they_come():
     constant = sparsification(ERROR, np.ones(len(ERROR)))
     np.testing.assert_allclose(constant.error, ERROR.mean())
@@ -186,10 +177,6 @@ def test_equal_uncertainties_are_chance_in_whatever_order_they_come():
     forward, backward = (sparsification(ERROR[::k], half[::k]) for k in (1, -1))
     np.testing.assert_allclose(forward.error, backward.error)
     assert 0 < forward.ause < constant.ause
-
-
-def test_no_error_has_no_area():
-    assert sparsification(np.zeros(5), np.arange(5.0)).ause == 0.0
 
 
 def test_coverage_counts_what_lies_within():

@@ -132,12 +132,3 @@ def _option_case(command: str, word: str, name: str, value: str) -> Case:
     text = value if len(value) < 12 else f"{value[:6]}... of {len(value)}"
     title = f"option {command} {word or name.upper()} {text!r}"
     return Case(title, run, ANY, solves=command in SOLVING)
-
-
-PRESETS = ("", "Paper", "../paper", "paper,paper", "[paper]", "{a: 1}", "\x1b[31m", "3", "~")
-
-
-def preset_cases() -> Iterator[Case]:
-    yield from cases("preset {}", "show {p} --preset={x}", PRESETS, other={"~": (0,)})
-    fine = {"~": (0,), "": (0,)}
-    yield from cases("preset of a file {}", "show {p} --set preset={x}", PRESETS, other=fine)

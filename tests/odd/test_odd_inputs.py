@@ -10,7 +10,7 @@ from itertools import chain
 import pytest
 from helpers_odd_commands import path_cases, text_cases, untrusted_cases
 from helpers_odd_files import array_cases, image_cases
-from helpers_odd_options import number_cases, option_cases, preset_cases
+from helpers_odd_options import number_cases, option_cases
 from helpers_odd_results import chain_cases, result_cases
 from helpers_odd_run import Case, fault
 from helpers_odd_world import World
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 CASES: list[Case] = list(
     chain(
         *(path_cases(), text_cases(), untrusted_cases()),
-        *(number_cases(), preset_cases(), option_cases()),
+        *(number_cases(), option_cases()),
         *(array_cases(), image_cases()),
         *(result_cases(), chain_cases()),
     )

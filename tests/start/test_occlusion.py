@@ -12,8 +12,6 @@ from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.model import oracle
-from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.start.components import TIES
 from soup_nlp.start.occlusion import LEAST_ORDER, covering, vote
@@ -167,12 +165,3 @@ def test_the_nlp_keeps_the_order_and_is_unsure_of_it(covers):
     assert np.median(step) > 0.2
     assert done.energy["order"] >= 0
     assert (done.reconstruction.sigma_ref > MOST_SIGMA).all()
-
-
-@pytest.mark.slow
-def test_without_its_weight_nothing_is_placed_in_order():
-    problem, pair = made(True, "energy.weights.order=0")
-    case = prepare(problem, pair=pair)
-    assert case.start.order is None
-    assert not case.data.order_weight.any()
-    assert "order" not in oracle.energy(case.soup, case.data, case.weights)
