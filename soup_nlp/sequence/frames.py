@@ -1,16 +1,22 @@
 """Frames of a sequence, of image files, a video or a rendered scene."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import partial
 from glob import glob
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
+import PIL.Image
+from PIL import ImageSequence
 
+from soup_nlp.arrays import Image
 from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.formats.images import RAW, read_image
 from soup_nlp.errors import DataError
@@ -174,31 +180,46 @@ def video_frames(path: Path, folder: Path, stride: int = 1, most: int | None = N
     expected = "a video that FFmpeg reads, of two frames at least"
     refuse = partial(DataError, where=path, expected=expected, hint="give a folder of images")
     with path.open("rb") as file:
-        if b"\0" not in file.read(4096):
-            raise refuse("file is neither an image nor a video", found="text")
+        start = file.read(4096)
+    if b"\0" not in start:
+        found = "text" if start else "nothing"
+        raise refuse("file is neither an image nor a video", found=found)
     try:
         str(path).encode()
     except UnicodeEncodeError:
         # OpenCV would crash
         raise DataError("name of a video is not UTF-8", where=path, hint="rename it") from None
-    video = cv2.VideoCapture(str(path))
+    images = _of_gif(path, stride) if start.startswith(b"GIF8") else _of_video(path, stride)
     names: list[str] = []
-    index = 0
     with staged(folder, whole=True) as new:
-        while most is None or len(names) < most:
-            if not video.grab():
-                break
-            if index % stride == 0:
-                good, image = video.retrieve()
-                if not good:
-                    break
-                names.append(f"{len(names):04d}.png")
-                write_png(new / names[-1], cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-            index += 1
-        video.release()
+        for image in islice(images, most):
+            names.append(f"{len(names):04d}.png")
+            write_png(new / names[-1], image)
         if len(names) < 2:
             raise refuse("video has fewer than two readable frames", found=len(names))
     return [folder / name for name in names]
+
+
+def _of_video(path: Path, stride: int) -> Iterator[Image]:
+    """Every `stride`-th frame of a video up to the first that cannot be read."""
+    video = cv2.VideoCapture(str(path))
+    for index in count():
+        if not video.grab():
+            break
+        if index % stride == 0:
+            good, image = video.retrieve()
+            if not good:
+                break
+            yield np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    video.release()
+
+
+def _of_gif(path: Path, stride: int) -> Iterator[Image]:
+    """The same of a GIF by Pillow: FFmpeg ends at a frame without a duration."""
+    # decoders raise many types
+    with suppress(Exception), PIL.Image.open(path) as gif:
+        for image in islice(ImageSequence.Iterator(gif), 0, None, stride):
+            yield np.asarray(image.convert("RGB"))
 
 
 def in_order(paths: Sequence[Path]) -> list[Path]:

@@ -142,8 +142,9 @@ DEEPEST = 16
 """Largest number of nested groups."""
 LARGE = 16 << 20
 """Bytes of an array from which the free memory is looked at, which takes milliseconds."""
-MOST_COMPRESSION = 1100
-"""Largest ratio of an array's bytes to its stored ones: deflate reaches 1032."""
+MOST_COMPRESSION, MOST_OF_FILE = 1100, 100
+"""Largest ratio of an array's bytes to its stored ones, as deflate reaches 1032; of all arrays to
+the file, whose pictures, unlike masks, compress little."""
 BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError)
 """Exceptions that h5py raises for damaged files."""
 
@@ -158,14 +159,14 @@ def read_h5(path: PathLike) -> ReadTree:
     try:
         # file systems of clusters often have no locks
         with h5py.File(path, "r", locking=False) as file:
-            return _read_group(file, set())
+            return _read_group(file, {})
     except BROKEN as error:
         what, expected = "file is not a readable HDF5 file", "a result file written by soup_nlp"
         raise DataError(what, where=path, found=error, expected=expected) from error
 
 
-def _read_group(group: h5py.Group, seen: set[object], level: int = 0) -> ReadTree:
-    """Arrays of a group; `seen` are the places of the objects that were read."""
+def _read_group(group: h5py.Group, seen: dict[object, int], level: int = 0) -> ReadTree:
+    """Arrays of a group; `seen` are bytes by the place of the objects that were read."""
     out: ReadTree = {}
     for name in group:
         link: Any = group.get(name, getlink=True)
@@ -192,12 +193,12 @@ def _read_group(group: h5py.Group, seen: set[object], level: int = 0) -> ReadTre
     return out
 
 
-def _odd(item: Any, seen: set[object]) -> str:
+def _odd(item: Any, seen: dict[object, int]) -> str:
     """What no result has of an object; empty for nothing."""
     place = h5py.h5o.get_info(item.id).addr
     if place in seen:
         return "an object under two names"
-    seen.add(place)
+    seen[place] = 0
     if isinstance(item, h5py.Group):
         return ""
     if not isinstance(item, h5py.Dataset):
@@ -206,9 +207,12 @@ def _odd(item: Any, seen: set[object]) -> str:
         return "an array without values of its own"
     if item.dtype.kind not in "fiub" and not h5py.check_string_dtype(item.dtype):
         return f"type {item.dtype}"
-    stored = item.id.get_storage_size()
-    few = item.nbytes > MOST_COMPRESSION * stored
-    return f"{item.nbytes} bytes of which {stored} are stored" if few else ""
+    stored, whole = item.id.get_storage_size(), item.file.id.get_filesize()
+    seen[place] = item.nbytes
+    if item.nbytes > MOST_COMPRESSION * stored:
+        return f"{item.nbytes} bytes of which {stored} are stored"
+    arrays = sum(seen.values())
+    return f"arrays of {arrays} bytes in {whole}" if arrays > MOST_OF_FILE * whole else ""
 
 
 def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:

@@ -90,6 +90,18 @@ def test_any_file_that_is_no_image_is_read_as_a_video(name, tmp_path, monkeypatc
     assert len(video_frames(Path(name), tmp_path / "frames")) == 3
 
 
+def test_frames_of_a_gif_need_no_duration(tmp_path):
+    first, *others = (Image.new("RGB", (64, 48), (50 * k, 0, 0)) for k in range(5))
+    first.save(tmp_path / "a.gif", save_all=True, append_images=others)
+    found = video_frames(tmp_path / "a.gif", tmp_path / "frames", stride=2)
+    assert [cv2.imread(str(path))[0, 0].tolist() for path in found] == [
+        [0, 0, 0],
+        [0, 0, 100],
+        [0, 0, 200],
+    ]
+    assert len(video_frames(tmp_path / "a.gif", tmp_path / "two", most=2)) == 2
+
+
 @pytest.mark.parametrize(
     "names",
     [

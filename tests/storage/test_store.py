@@ -198,6 +198,7 @@ REFUSED: dict[str, Callable[[h5py.File], object]] = {
     "two names": lambda file: file.__setitem__("again", file["depth/ref"]),
     "external storage": lambda file: file.create_dataset("far", (4,), "f8", external=FAR),
     "virtual": virtual,
+    "zeros": lambda file: file.create_dataset("z", data=np.zeros(1 << 22), compression="gzip"),
 }
 """Structures that no result has, whatever they are in the place of."""
 
