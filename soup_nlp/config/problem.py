@@ -99,7 +99,7 @@ class Problem(Section):
     """The frames to solve, by kind of input."""
     max_size: Positive | None = 1.5
     """Largest reference image that is solved as it is, megapixels. A larger pair is solved at this
-    size, and its depth brought to the images' own size along their edges; null for no limit."""
+    size, and its depth brought to the images' own size; null for no limit."""
     seed: Seed = 0
     """Seed of every random draw."""
     segmentation: SegmentationOptions = SegmentationOptions()

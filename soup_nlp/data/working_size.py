@@ -7,14 +7,11 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
-from soup_nlp.arrays import Float, FloatMap, Image, Int, Labels
+from soup_nlp.arrays import Float, FloatMap, Labels
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import LEAST_FACING
-
-Size = tuple[int, int]
 
 ALIKE = 1.1
 """Largest ratio of two focal lengths between which flow methods are reliable."""
@@ -82,7 +79,7 @@ def resized(image: NDArray[Any], size: Sequence[int]) -> NDArray[Any]:
     return np.asarray(cv2.resize(image, (int(size[1]), int(size[0])), interpolation=how))
 
 
-def _nearest(values: NDArray[Any], size: Size) -> NDArray[Any]:
+def _nearest(values: NDArray[Any], size: Sequence[int]) -> NDArray[Any]:
     rows, columns = (
         ((np.arange(n) + 0.5) * old / n).astype(int) for n, old in zip(size, values.shape)
     )
@@ -119,68 +116,19 @@ def at_common_focal(pair: Pair) -> Pair:
     return _at_sizes(pair, np.minimum([ratio, 1 / ratio], 1.0))
 
 
-# --- depth at the size of the images --------------------------------------------------------------
-
-COLOUR = 0.1
-"""Standard deviation of colour differences, colours in [0, 1], of the weights of neighbours."""
-SPREAD = 0.7
-"""Standard deviation of distances, pixels of the small image."""
-ROWS = 128
-"""Rows per block of computation."""
-
-
 def full_depth(
-    labels: Labels, small: Image, image: Image, normal: Float, offset: Float, K: Float
+    labels: Labels, size: Sequence[int], normal: Float, offset: Float, K: Float
 ) -> FloatMap:
-    """Depth (H, W) of planes at the size of a large image, borders of superpixels along its edges.
+    """Depth (H, W) of the planes of superpixels (h, w) at the size of a larger image, camera K.
 
-    Joint bilateral upsampling (Kopf et al., 2007) of labels: near a border the 3 x 3 nearest pixels
-    of the small image vote, with more weight the closer they are in position and colour. It is NaN
-    where the label is -1, which is a label too, or a plane turns away.
-
-    Args:
-        labels: (h, w) superpixel of every pixel of the small image.
-        small: (h, w, 3) small image.
-        image: (H, W, 3) large image.
-        normal: (N, 3) normals of the planes `normal . X + offset = 0`, towards the camera.
-        offset: (N,) offsets.
-        K: (3, 3) intrinsics of the large image.
+    Planes are `normal . X + offset = 0`, (N, 3) and (N,), normals towards the camera. It is NaN
+    where the label is -1 or a plane turns away.
     """
-    (h, w), (height, width) = labels.shape, image.shape[:2]
-    # pixels with more than one label among the 3 x 3 pixels around them
-    border = ndimage.maximum_filter(labels, 3) != ndimage.minimum_filter(labels, 3)
-    x = (np.arange(width) + 0.5) * (w / width) - 0.5
-    column = np.rint(x).astype(np.int64).clip(0, w - 1)
-    out = np.empty((height, width), np.float32)
-    for top in range(0, height, ROWS):
-        rows = np.arange(top, min(top + ROWS, height))
-        y = (rows + 0.5) * (h / height) - 0.5
-        row = np.rint(y).astype(np.int64).clip(0, h - 1)
-        plane = labels[row[:, None], column]
-        v, u = np.nonzero(border[row[:, None], column])
-        position = np.stack([y[v], x[u]])
-        plane[v, u] = _voted(labels, small, image[top + v, u], position, row[v], column[u])
-        uv = np.stack(np.meshgrid(np.arange(width), rows), axis=-1)
-        facing = -np.einsum("hwc,hwc->hw", normal[plane], rays(K, uv))
+    plane, (height, width) = _nearest(labels, size), size
+    out, u = np.empty((height, width), np.float32), np.arange(width)
+    for v, row in enumerate(plane):
+        facing = -np.einsum("wc,wc->w", normal[row], rays(K, np.stack([u, 0 * u + v], axis=-1)))
         with np.errstate(divide="ignore", invalid="ignore"):
-            z = offset[plane] / facing
-        out[rows] = np.where((plane >= 0) & (facing > LEAST_FACING) & (z > 0), z, np.nan)
+            z = offset[row] / facing
+        out[v] = np.where((row >= 0) & (facing > LEAST_FACING) & (z > 0), z, np.nan)
     return out
-
-
-def _voted(
-    labels: Labels, small: Image, colour: Image, position: Float, row: Int, column: Int
-) -> Labels:
-    """(P,) label with the most votes for pixels of a colour (P, 3) at positions (2, P) (y, x)."""
-    h, w = labels.shape
-    votes, weights = [], []
-    for dv in (-1, 0, 1):
-        for du in (-1, 0, 1):
-            r, c = (row + dv).clip(0, h - 1), (column + du).clip(0, w - 1)
-            far = (position[0] - r) ** 2 + (position[1] - c) ** 2
-            difference = ((small[r, c].astype(np.float32) - colour) ** 2).sum(-1) / 255.0**2
-            weights.append(np.exp(-far / (2 * SPREAD**2) - difference / (2 * COLOUR**2)))
-            votes.append(labels[r, c])
-    score = [sum(w * (vote == candidate) for w, vote in zip(weights, votes)) for candidate in votes]
-    best = np.argmax(score, axis=0)
-    return np.asarray(np.stack(votes)[best, np.arange(len(best))], np.int32)

@@ -202,21 +202,18 @@ class Run(Case):
         return solved and (self.refined is None or self.refined.status != "interrupted")
 
 
-def full_size(full: Pair, small: Pair, result: Reconstruction) -> FullSize:
+def full_size(full: Pair, result: Reconstruction) -> FullSize:
     """Bring a reconstruction of a smaller pair to the pair's own size.
 
-    Superpixels grow along the edges of the images; planes are evaluated at every pixel, in the next
-    frame after their motions.
+    Planes are evaluated at every pixel, in the next frame after their motions.
     """
     soup = result.soup
-    images = small.image_ref, full.image_ref
-    depth_ref = full_depth(result.labels, *images, soup.n, soup.distance, full.K_ref)
+    depth_ref = full_depth(result.labels, full.size, soup.n, soup.distance, full.K_ref)
     # X' = R X + t carries n . X + D = 0 to (R n) . X' + D - (R n) . t = 0
     turned = np.einsum("nij,nj->ni", soup.R, soup.n)
     moved = soup.distance - np.einsum("ni,ni->n", turned, soup.translation)
     source = result.source_next
     shown = np.where(source >= 0, result.labels.ravel()[source], -1).astype(np.int32)
-    images = small.image_next, full.image_next
-    depth_next = full_depth(shown, *images, turned, moved, full.K_next)
+    depth_next = full_depth(shown, full.image_next.shape[:2], turned, moved, full.K_next)
     scores = score_depths(full.truth, {"full": depth_ref.astype(np.float64)})
     return FullSize(depth_ref, depth_next, scores.get("full"))

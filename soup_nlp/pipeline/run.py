@@ -161,7 +161,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     energy = data, case.weights, case.problem.formulation
     sure = confidence(after, pair, case.start, *energy, case.given)
     after = replace(after, sigma_ref=sure.sigma)
-    full = None if case.original is None else full_size(case.original, pair, after)
+    full = None if case.original is None else full_size(case.original, after)
     depths = {"solution": after.depth_ref, "start": dense(case.start.soup).depth_ref}
     if refined is not None and solution.stages:
         depths["nlp"] = unrefined.depth_ref
