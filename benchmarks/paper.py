@@ -123,7 +123,6 @@ JOINT = (
         *("energy.weights.orient", "energy.weights.sigma_cont", "energy.weights.sigma_arap"),
         "energy.weights.leak_arap",
     ),
-    ("formulation.min_facing", "formulation.depth_ratio"),
     ("refine.rounds", "refine.stagnation"),
 )
 """Options that are undone together."""

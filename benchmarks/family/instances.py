@@ -19,6 +19,7 @@ from soup_nlp.errors import ConfigError
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
+from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.nlp import NLP
@@ -177,7 +178,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     values = {f.name: np.asarray(getattr(data, f.name)) for f in fields(data)}
     reals: dict[str, Any] = {k: rounded(v) for k, v in values.items() if v.dtype == np.float64}
     data = replace(data, **reals)
-    weights = record.weights(energy.weights)
+    weights = record.weights(Weights(**dict(energy.weights)))
     return Case(problem, pair, seg, start, data, weights, start.soup, options)
 
 

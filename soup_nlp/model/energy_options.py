@@ -7,7 +7,7 @@ import numpy as np
 from soup_nlp.schema.section import NonNegative, Section, Share, Truncation, Whole
 
 
-class Weights(Section):
+class WeightOptions(Section):
     """Constants of E = E_arap + alpha1 E_proj + alpha2 E_cont + alpha3 E_orient + alpha4 E_prior,
     and of E_depth where a depth prior is given.
 
@@ -40,8 +40,6 @@ class Weights(Section):
     shows, relative to them, times the flow's noise; 0 leaves it out."""
     sigma_cont: Truncation = 1.0
     """Truncation of E_cont's second-frame gap (rho), length."""
-    sigma_cont_ref: Truncation = np.inf
-    """Truncation of E_cont's reference-frame gap; inf is the paper's form."""
     sigma_orient: Truncation = 0.5
     """Truncation n of rho_n."""
     sigma_arap: Truncation = 0.5
@@ -49,8 +47,15 @@ class Weights(Section):
     leak_arap: Share = 0.01
     """Share of an ARAP norm that is not truncated: it pulls a motion that no other term determines
     towards the motions of its neighbours."""
+
+
+class Weights(WeightOptions):
+    """WeightOptions with truncations that are no option of a problem."""
+
+    sigma_cont_ref: Truncation = np.inf
+    """Truncation of E_cont's reference-frame gap."""
     sigma_proj: Truncation = np.inf
-    """Truncation of a pixel's re-projection error, pixels; inf is the paper's form."""
+    """Truncation of a pixel's re-projection error, pixels."""
 
 
 # --- surfaces that bend ---------------------------------------------------------------------------
@@ -87,5 +92,5 @@ class EnergyOptions(Section):
     the scene with a flow and depth of their own; 0 is the paper's graph."""
     pixel_samples: Whole | Literal["all"] = 16
     """Pixels per superpixel in E_proj, or all."""
-    weights: Weights = Weights()
+    weights: WeightOptions = WeightOptions()
     """Factors of the terms and their truncations."""

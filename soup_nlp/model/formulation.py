@@ -15,14 +15,16 @@ class FormulationOptions(Section):
     gauge: Gauge = "unit-offset"
     """unit-offset or unit-translation."""
     min_facing: Annotated[float, Field(ge=0, le=0.5)] = 1e-3
-    """Visibility: lower bound c of -n . r."""
-    depth_ratio: Annotated[float, Field(ge=1.01, le=MOST)] = 5.0
-    """Depth at a rim pixel is at most this many times the anchor's (1 leaves one plane only)."""
+    """Visibility: lower bound c of -n . r; with 0 the depth at a rim pixel has no bound either."""
 
 
 Coordinates = Literal["matrix", "tangent"]
 """matrix: rotations, normals, scales and translations with their constraints. tangent: nine
 coordinates per superpixel about the proposal, in which SO(3) and unit normals hold."""
+
+
+UNBOUNDED = 1e6
+"""Of `depth_ratio`: no bound."""
 
 
 class Formulation(FormulationOptions):
@@ -34,6 +36,8 @@ class Formulation(FormulationOptions):
     """Share of curvature along a residual that the Gauss-Newton Hessian leaves out."""
     ridge: NonNegative = 1e-2
     """Added to the Gauss-Newton Hessian's diagonal."""
+    depth_ratio: Annotated[float, Field(ge=1.01, le=MOST)] = 5.0
+    """Depth at a rim pixel is at most this many times the anchor's (1 leaves one plane only)."""
     coordinates: Coordinates = "matrix"
     """matrix or tangent; a gauge is of matrices only."""
     eps: NonNegative = 1e-2

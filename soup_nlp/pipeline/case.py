@@ -20,7 +20,7 @@ from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import BENDING_ARAP, WIDEST_BENDING_EPS, Weights
 from soup_nlp.model.reweighting import Known, in_pixels, in_translations, weighted
 from soup_nlp.pipeline.record import Case
-from soup_nlp.solve.solver_options import Stages
+from soup_nlp.solve.solver_options import ITERATIONS, Stages
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.camera_error import camera_error
 from soup_nlp.start.components import TIES, TOO_FAST
@@ -79,7 +79,8 @@ def prepare(
     if not presolve:
         return case
     # a solve has at least one iteration of the constrained NLP
-    once = stages.replace(presolve=True, max_iter=1)
+    limit = stages.presolve_iterations or ITERATIONS
+    once = stages.replace(presolve_iterations=limit, max_iter=1)
     watch = Watch(say=log) if log else None
     answer = solve_soup(start.soup, data, weights, case.formulation(), once, watch=watch)
     return replace(case, soup=answer.soup)
@@ -189,7 +190,7 @@ def build_energy(
 ) -> tuple[EnergyData, Weights]:
     """The energy of a problem, on a pair that carries its flow."""
     assert pair.flow is not None
-    e = problem.energy
+    e, weights = problem.energy, Weights(**dict(problem.energy.weights))
     pixels = None if e.pixel_samples == "all" else e.pixel_samples
     bends = start.bends & (e.units == "pixel")
     anchors = bool(bends.any())
@@ -206,9 +207,9 @@ def build_energy(
     known = Known(start.component, bends, start.variance, start.noise, start.order, placed, prior)
     data = weighted(data, start.soup, known, e)
     if e.units == "paper":
-        return in_translations(data, start.soup), e.weights
+        return in_translations(data, start.soup), weights
     # what the truncation of E_arap is follows from all of the image
-    weights = e.weights.replace(**BENDING_ARAP) if bends.all() else e.weights
+    weights = weights.replace(**BENDING_ARAP) if bends.all() else weights
     return in_pixels(data, start.soup, seg, bends), weights
 
 

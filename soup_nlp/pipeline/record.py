@@ -21,7 +21,7 @@ from soup_nlp.geometry.soup import Reconstruction, Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.formulation import Formulation
+from soup_nlp.model.formulation import UNBOUNDED, Formulation
 from soup_nlp.model.layout import Layout, MatrixLayout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp, exact_chart
@@ -66,7 +66,8 @@ class Case:
     def formulation(self, **changes: object) -> Formulation:
         """The formulation and smoothing of the problem, with some fields changed."""
         options, eps = dict(self.problem.formulation), self.options.eps
-        return Formulation(**{**options, "eps": eps, "eps_pixel": eps, **changes})
+        free = {} if options["min_facing"] else {"depth_ratio": UNBOUNDED}
+        return Formulation(**{**options, **free, "eps": eps, "eps_pixel": eps, **changes})
 
     def nlp(self, form: Formulation) -> tuple[NLP, Layout]:
         """The NLP of a formulation at the case's soup; tangent coordinates are about the start."""

@@ -140,7 +140,7 @@ def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
         photo=photo,
         seed=problem.seed,
         min_facing=problem.formulation.min_facing,
-        depth_ratio=problem.formulation.depth_ratio,
+        depth_ratio=case.formulation().depth_ratio,
         watch=watch,
     )
 
@@ -158,7 +158,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     assert pair.flow is not None
     # one superpixel coupled to all of the scene would fill the factors of the information
     data = first_edges(case.data, len(case.segmentation.edges))
-    energy = data, case.weights, case.problem.formulation
+    energy = data, case.weights, case.formulation()
     sure = confidence(after, pair, case.start, *energy, case.given)
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.original is None else full_size(case.original, after)
@@ -185,7 +185,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
 
 def skipped(case: Case) -> Solution:
     """The start in place of the NLP's solution, its planes tilted until they face the camera."""
-    start, data, form = case.start.soup, case.data, case.problem.formulation
+    start, data, form = case.start.soup, case.data, case.formulation()
     rays = data.visibility_ray(form.depth_ratio)
     soup = tilt_to_camera(start, data.anchor_ray, rays, form.min_facing)
     soup = soup.normalised(data.share).retracted()

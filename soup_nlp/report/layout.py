@@ -167,7 +167,7 @@ def _listed(values: Mapping[str, Any], prefix: str = "") -> ReadTree:
 def result_tree(run: Run) -> ReadTree:
     """Every array of a run that `TABLE` names."""
     pair, rec, sure = run.pair, run.reconstruction, run.confidence
-    form, parts = run.problem.formulation, run.components
+    form, parts = run.formulation(), run.components
     assert pair.flow is not None
     arrays = {
         "input": {**vars(pair), "flow": pair.flow.uv, "confidence": pair.flow.confidence},

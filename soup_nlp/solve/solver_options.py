@@ -7,7 +7,10 @@ from pydantic import Field
 
 from soup_nlp.errors import ConfigError
 from soup_nlp.model.formulation import Coordinates
-from soup_nlp.schema.section import Count, NonNegative, Positive, Section, Tolerance, Whole
+from soup_nlp.schema.section import Count, NonNegative, Positive, Section, Tolerance
+
+ITERATIONS = 60
+"""Default iteration limit of the stages before the constrained NLP."""
 
 
 def refuse_libraries(section: object, where: str) -> None:
@@ -31,26 +34,20 @@ class SolverOptions(Section):
     coordinates: Coordinates = "tangent"
     """Variables of the presolve. matrix: those of the constrained NLP, on which Ipopt then iterates
     from the initialisation, at 5 to 30 times the cost (docs/solving.md)."""
-    presolve: bool = True
-    """If false, Ipopt solves the constrained NLP at the final smoothing at once."""
     presolve_eps: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)] = (
         0.3,
         0.03,
         0.01,
     )
     """Smoothing widths of the stages with the majorant Hessian, decreasing."""
-    presolve_iterations: Whole = 60
-    """Iteration limit of each of these stages and of the Gauss-Newton ones."""
-    exact_iterations: Count = 100
-    """Iteration limit of the stage with the exact Hessian, at `eps`; 0 omits it and those of
-    Gauss-Newton."""
+    presolve_iterations: Count = ITERATIONS
+    """Iteration limit of each of these stages and of the Gauss-Newton ones; with 0 Ipopt solves the
+    constrained NLP at the final smoothing at once."""
     eps: Tolerance = 0.01
     """Smoothing of the constrained NLP."""
     max_iter: Count = 10
     """Iteration limit of the constrained NLP. From a minimum of the presolve it takes next to none;
     from elsewhere it finds none, and each of them takes seconds."""
-    tol: Tolerance = 1e-6
-    """Tolerance of the constrained NLP."""
     max_seconds: Tolerance = 600.0
     """CPU time of this process that all stages together may take."""
     ipopt: dict[str, bool | int | float | str] = Field(default_factory=dict)
@@ -68,3 +65,8 @@ class Stages(SolverOptions):
     result with the lower energy is taken: where all surfaces bend."""
     presolve_tol: Tolerance = 1e-8
     """Dual infeasibility that ends the stages before the constrained NLP."""
+    exact_iterations: Count = 100
+    """Iteration limit of the stage with the exact Hessian, at `eps`; 0 omits it and those of
+    Gauss-Newton."""
+    tol: Tolerance = 1e-6
+    """Tolerance of the constrained NLP."""

@@ -153,7 +153,7 @@ class _Solve:
             first |= warm_start(nlp, self.data, soup, rim)
         stage = self.ipopt(nlp, first)
         candidates = {"start": self.start, "presolve": presolved}
-        if not self.o.presolve:
+        if not self.o.presolve_iterations:
             del candidates["presolve"]
         candidates["constrained NLP"] = layout.unpack(stage.x)
         ends = {k: s.normalised(self.data.share).retracted() for k, s in candidates.items()}
@@ -193,7 +193,7 @@ class _Solve:
     def presolve(self) -> tuple[Soup, Float | None]:
         """Soup and multipliers of rim visibility of the presolve; the start where it is off."""
         soup, rim = self.start, None
-        if self.o.presolve:
+        if self.o.presolve_iterations:
             # the last stage has the rest of the time
             end = self.laps.begin + 0.7 * self.o.max_seconds
             energy = self.data, self.weights, self.form

@@ -55,7 +55,7 @@ SMALL = (
     "segmentation.superpixels=40",
     "segmentation.neighbours=6",
     "refine.enabled=false",
-    "solver.presolve=false",
+    "solver.presolve_iterations=0",
     "solver.max_iter=1",
 )
 

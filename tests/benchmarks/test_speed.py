@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 def test_the_plan_has_every_run_once_small_ones_first():
     pairs = ["street", "motorcycle"], [3, 4], [512]
-    cells = speed_cells(*pairs, [500, 250], [20, 10], ["solver.tol=0.5"])
+    cells = speed_cells(*pairs, [500, 250], [20, 10], ["solver.eps=0.5"])
     assert len({c.identity()["key"] for c in cells}) == len(cells) == 2 * 2 * (2 + 1)
     problems = [c.item.problem(c.overrides) for c in cells]
     sizes = [p.segmentation.superpixels for p in problems]
@@ -21,7 +21,7 @@ def test_the_plan_has_every_run_once_small_ones_first():
     assert [(p.input.seed, p.seed, p.input.width) for p in problems[:2]] == [
         (3, 3, 512), (4, 4, 512),
     ]  # fmt: skip
-    assert (problems[0].segmentation.neighbours, problems[0].solver.tol) == (10, 0.5)
+    assert (problems[0].segmentation.neighbours, problems[0].solver.eps) == (10, 0.5)
     assert not problems[0].refine.enabled
 
 
@@ -34,10 +34,7 @@ def test_bad_input_ends_with_2(tmp_path, capsys):
 
 def test_a_real_run_and_its_table(tmp_path):
     size = ["--scenes", "street", "--superpixels", "12", "--neighbours", "4", "--widths", "64"]
-    small = sets(
-        "solver.presolve_eps=[0.3] solver.presolve_iterations=3"
-        " solver.exact_iterations=0 solver.max_iter=1"
-    )
+    small = sets("solver.presolve_eps=[0.3] solver.presolve_iterations=3 solver.max_iter=1")
     assert main(["speed", *size, *small, "--out", str(tmp_path)]) == 0
     (row,) = read_rows(tmp_path / "table.jsonl")
     assert row["energy"]["total"] < row["energy_start"]["total"]

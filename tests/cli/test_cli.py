@@ -95,7 +95,7 @@ def test_evaluate_scores_against_a_file(solved, tmp_path, capsys):
 
 
 def test_a_solve_that_stops_early_is_a_result(tmp_path):
-    limit = sets("solver.max_iter=0 solver.presolve=false refine.rounds=1")
+    limit = sets("solver.max_iter=0 solver.presolve_iterations=0 refine.rounds=1")
     assert main(["solve", "street", "--out", str(tmp_path), *SMALL, *limit, "-q"]) == 1
     for name in FILES:
         assert (tmp_path / name).exists(), name
@@ -199,7 +199,7 @@ def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch
         (tmp_path / clip).mkdir(parents=True)
         write_pair(tmp_path / clip, render_scene("orbit", seed, 64, 48), ("frame_0", "frame_1"))
     small = ["--superpixels=6", "--neighbours=3", "--no-refine", "-q", "--fov=50"]
-    small += sets("output.page=false solver.presolve=false solver.max_iter=1")
+    small += sets("output.page=false solver.presolve_iterations=0 solver.max_iter=1")
 
     def solve(clip: str, *arguments: str) -> int:
         return main(["solve", *(f"{clip}/frame_{k}.png" for k in (0, 1)), *small, *arguments])

@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("solves_once")]
 
 SMALL = sets(
     "input.width=112 input.height=84 refine.enabled=false segmentation.superpixels=16"
-    " segmentation.neighbours=5 solver.presolve=false solver.max_iter=0 output.page=false"
+    " segmentation.neighbours=5 solver.presolve_iterations=0 solver.max_iter=0 output.page=false"
 )
 
 

@@ -33,8 +33,6 @@ PAPER = {
     "energy.weights.prior": 0.0,
     "energy.weights.order": 0.0,
     "energy.weights.sigma_arap": np.inf,
-    "energy.weights.sigma_proj": np.inf,
-    "energy.weights.sigma_cont_ref": np.inf,
     # t-hat: translations of unit length
     "formulation.gauge": "unit-translation",
     "formulation.min_facing": 0.0,

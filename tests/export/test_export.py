@@ -102,6 +102,7 @@ def test_verified_means_optimal(exported, optimum, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:sigma. no uncertainty can be computed")
 @pytest.mark.parametrize("size", [1e20, 1e300])
 def test_a_huge_point_is_checked_and_makes_no_result(size, exported, tmp_path, capsys):
     _, nlp, _, (v, r), _ = problem_of(exported)

@@ -28,7 +28,7 @@ def numeric_fields(model: type[Section], prefix: str = "") -> Iterator[tuple[str
 
 
 WITH = {
-    "solver.pre": "--set solver.presolve=true",
+    "solver.pre": "--set solver.presolve_iterations=60",
     "refine": "--set refine.enabled=true --set refine.from_start=true --set refine.rounds=1"
     " --set refine.particles=4",
 }

@@ -22,7 +22,7 @@ TINY = {
     "segmentation.method": "grid",
     "segmentation.neighbours": 4,
     "refine.enabled": False,
-    "solver.presolve": False,
+    "solver.presolve_iterations": 0,
     "solver.max_iter": 2,
 }
 """Settings with which a solve ends in a fraction of a second, mostly not converged."""

@@ -140,7 +140,7 @@ def test_a_term_that_a_result_does_not_have_is_absent(folder):
 
 def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
     # without the presolve there is no other answer, whatever the rounding
-    run = solve_pair(pair, **SMALL, solver={"presolve": False}, refine={"enabled": False})
+    run = solve_pair(pair, **SMALL, solver={"presolve_iterations": 0}, refine={"enabled": False})
     folder = tmp_path / "out"
     write_folder(prepare_folder(folder), run, "a log\n")
     assert "nlp is Ipopt's answer" not in bad(check_folder(folder))

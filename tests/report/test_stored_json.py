@@ -69,7 +69,7 @@ def test_every_entry_of_a_chain(tmp_path):
 def solved(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("solved") / "out"
     small = {"segmentation": {"superpixels": 12, "neighbours": 4}, "flow": {"source": "truth"}}
-    options = {"solver": {"presolve": False, "max_iter": 1}, "refine": {"enabled": False}}
+    options = {"solver": {"presolve_iterations": 0, "max_iter": 1}, "refine": {"enabled": False}}
     run = solve_pair(render_scene("street", 0, 64, 48), **small, **options)
     write_folder(prepare_folder(out), run, "a log\n")
     return out

@@ -90,7 +90,7 @@ def test_a_chain_says_which_depth_is_drawn(tmp_path):
     assert fuse(none).size == 0
 
 
-START_ALONE = sets("refine.enabled=false solver.presolve=false solver.max_iter=1")
+START_ALONE = sets("refine.enabled=false solver.presolve_iterations=0 solver.max_iter=1")
 
 
 @pytest.mark.filterwarnings("default:.*the key white")
@@ -304,7 +304,7 @@ def test_a_chain_takes_the_keys_of_a_pair_and_files_of_every_pair(tmp_path):
     keys = {
         "segmentation": {"superpixels": 20, "neighbours": 5},
         "refine": {"enabled": False},
-        "solver": {"presolve": False, "max_iter": 1},
+        "solver": {"presolve_iterations": 0, "max_iter": 1},
         "flow": {"source": f"{tmp_path}/flow/*.npy"},
         "depth_prior": {"source": str(tmp_path / "depth"), "kind": "relative"},
     }

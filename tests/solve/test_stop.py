@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 
 SMALL = (
     "input.width=64 input.height=48 flow.source=truth segmentation.superpixels=10"
-    " segmentation.neighbours=3 solver.presolve_iterations=2 solver.exact_iterations=2"
+    " segmentation.neighbours=3 solver.presolve_iterations=2"
     " solver.presolve_eps=[0.3] refine.particles=4"
 )
 

@@ -72,7 +72,7 @@ def test_an_answer_that_violates_its_constraints_has_not_converged(monkeypatch):
         return replace(stage, x=x, status="Solve_Succeeded", converged=True)
 
     monkeypatch.setattr(Ipopt, "__call__", answered)
-    options = Stages(presolve=False, max_iter=1)
+    options = Stages(presolve_iterations=0, max_iter=1)
     for off, status in ((0.9e-6, "Solve_Succeeded"), (1.1e-6, "Constraints_Violated")):
         found = stages.solve_soup(tiny.soup, tiny.data, PAPER, FORM, options)
         assert found.status == status

@@ -209,7 +209,7 @@ def test_a_prior_that_cannot_be_one_is_refused(swing):
 def test_the_prior_is_in_the_energy_and_in_sigma(pan, swing):
     options = {"segmentation": {"superpixels": 60}, "refine": {"enabled": False}}
     # the start has it already
-    options["solver"] = {"presolve": False, "max_iter": 2}
+    options["solver"] = {"presolve_iterations": 0, "max_iter": 2}
     none = soup_nlp.solve_pair(swing.pair, **options)
     assert "depth" not in none.energy
     assert none.given is None
