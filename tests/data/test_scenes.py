@@ -169,23 +169,6 @@ def test_points_that_pass_the_camera_have_no_flow():
     assert np.isfinite(T.flow[T.components == 0]).all()
 
 
-def test_edge_pixels_mix_both_sides_by_their_share():
-    bright = Texture(((0.6,) * 3, (0.6,) * 3), cell=1.0, contrast=0.0)
-    dark = Texture(((0.1,) * 3, (0.1,) * 3), cell=1.0, contrast=0.0)
-    K = camera.intrinsics(64, 64, 31.5, 23.5)
-    # the right edge of the near box's front at depth 1 projects to u = 31.5 + 64 * half
-    for third in (0, 1, 2, 3):
-        half = (40 - 0.5 + third / 3 + 1e-6 - 31.5) / 64
-        near = Body((Part(Box((half, 9.0, 1e-6)), placed(0, 0, 1 + 1e-6), bright, glow=1.0),))
-        far = Body((Part(Plane(), placed(0, 0, 4), dark, glow=1.0),))
-        row = render(Scene((far, near), np.eye(4), np.eye(4)), K, 48, 64).image_ref[24, :, 0]
-        inner, outer = int(row[36]), int(row[44])
-        assert inner > 2 * outer
-        assert row[39] == inner
-        assert row[41] == outer
-        assert abs(row[40] - (outer + (inner - outer) * third / 3)) <= 1
-
-
 # --- textures ---------------------------------------------------------------------------------
 
 

@@ -8,7 +8,6 @@ import pytest
 from helpers_model import PAPER, Tiny
 from scipy import sparse
 
-from benchmarks.family.sol import write_sol
 from soup_nlp.errors import ExportError
 from soup_nlp.export import verify
 from soup_nlp.export.nl import write_nl
@@ -69,20 +68,6 @@ def test_a_file_is_read_into_the_order_of_the_problem(tmp_path):
     path.write_text(TEXT.partition("objno")[0])
     sol = read_sol(path, ORDER, ROWS)
     assert (sol.code, sol.status, sol.solved) == (-1, "unknown", False)
-
-
-@pytest.mark.parametrize(
-    ("message", "read"),
-    [("two\n\nlines", "two\nlines"), ("one\n Options\ntwo", 'one\n"Options"\ntwo')],
-)
-@pytest.mark.parametrize("lam", [None, np.array([0.1, -1 / 3])])
-def test_written_files_read_back(message, read, lam, tmp_path):
-    x = np.random.default_rng(0).normal(size=3)
-    write_sol(tmp_path / "a.sol", x, lam, ORDER, ROWS, message, 402)
-    sol = read_sol(tmp_path / "a.sol", ORDER, ROWS)
-    assert np.array_equal(sol.x, x)
-    assert np.array_equal(sol.lam_g, lam)
-    assert (sol.message, sol.code) == (read, 402)
 
 
 @pytest.mark.parametrize(
