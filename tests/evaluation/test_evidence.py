@@ -5,16 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from soup_nlp.config.problem import make_problem
-from soup_nlp.data.pair import Pair
 from soup_nlp.evaluation.evidence import Evidence, evidence
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.pipeline.case import prepare
-from soup_nlp.pipeline.run import make_run, skipped
-from soup_nlp.report.findings import hints
 from soup_nlp.start.bending import ANY_TURN, LEAST_GAP_PX, PLAIN_TURN, fit_robustly, turned
 from soup_nlp.start.camera_error import (
     KINDS,
@@ -110,7 +105,6 @@ def test_a_component_without_flow_is_a_guess(small_room):
 # --- errors of a given camera that the flow of a rigid scene shows --------------------------------
 
 FOCAL = 400.0
-ORBIT = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
 
 
 def matches(seed: int = 0) -> Matches:
@@ -185,24 +179,3 @@ def test_a_better_camera_has_square_pixels():
 
 def test_too_few_matches_show_no_error():
     assert likeliest(camera_errors(matches().at(slice(7)))) is None
-
-
-def started(pair: Pair):
-    """The start of a pair as a run, and what is said of it."""
-    raw = {"input": ORBIT, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
-    case = prepare(make_problem(raw), pair=pair)
-    done = make_run(case, skipped(case))
-    return done, "; ".join(hints(done))
-
-
-@pytest.fixture(scope="module")
-def orbit():
-    return make_problem({"input": ORBIT, "flow": {"source": "truth"}}).load_pair()
-
-
-@pytest.mark.slow
-def test_a_repeated_frame_is_drawn(orbit):
-    done, told = started(replace(orbit, flow=None, image_next=orbit.image_ref))
-    assert not done.good
-    assert done.confidence.share("drawn") == 1
-    assert "nearly the same" in told
