@@ -296,13 +296,13 @@ def check_fits(problem: Problem, pair: Pair) -> None:
             expected=f"1 to {height * width // 4} for {width}x{height}",
         )
     parts = solve_bytes(problem, pair)
-    total, (_, hint) = sum(size for size, _ in parts.values()), max(parts.values())
-    shares = ", ".join(f"{name} {size / 1e9:.3g} GB" for name, (size, _) in parts.items())
-    require_memory(total, "this problem", shares, hint)
+    shares = ", ".join(f"{name} {size / 1e9:.3g} GB" for name, size in parts.items())
+    hint = "smaller images with their intrinsics, or lower the option behind the largest part"
+    require_memory(sum(parts.values()), "this problem", shares, hint)
 
 
-def solve_bytes(problem: Problem, pair: Pair) -> dict[str, tuple[float, str]]:
-    """Bytes of a solve, right within a factor of two, and how to need fewer, by measured part."""
+def solve_bytes(problem: Problem, pair: Pair) -> dict[str, float]:
+    """Bytes of a solve, right within a factor of two, by measured part: option, or the images."""
     s, r = problem.segmentation, problem.refine
     pixels, n = pair.size[0] * pair.size[1], s.superpixels
     graph = n * (s.neighbours + NEIGHBOURS)
@@ -313,18 +313,9 @@ def solve_bytes(problem: Problem, pair: Pair) -> dict[str, tuple[float, str]]:
     points = around if s.boundary_samples == "all" else min(around, s.boundary_samples)
     tables = 2.0 * graph * r.particles**2 * 8 if r.enabled else 0.0
     return {
-        "images": (PIXEL * pixels, "smaller images, with their intrinsics"),
-        "sampled pixels": (ROW * inside, "a lower energy.pixel_samples"),
-        "boundary points": (
-            ROW * n * NEIGHBOURS * points,
-            "a lower segmentation.boundary_samples",
-        ),
-        "graph": (
-            EDGE * graph,
-            "a lower segmentation.superpixels or segmentation.neighbours",
-        ),
-        "particles": (
-            tables,
-            "a lower refine.particles, segmentation.superpixels or segmentation.neighbours",
-        ),
+        "images": PIXEL * pixels,
+        "energy.pixel_samples": ROW * inside,
+        "segmentation.boundary_samples": ROW * n * NEIGHBOURS * points,
+        "segmentation.superpixels and neighbours": EDGE * graph,
+        "refine.particles": tables,
     }

@@ -1,13 +1,11 @@
 """Files for other programs, by the name of their format; each is written from frames."""
 
-import io
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from soup_nlp.errors import ConfigError, optional, printable, repr_of
 from soup_nlp.report.chain import AXES, Chain, Frame
@@ -77,12 +75,6 @@ def check_formats(names: Sequence[str]) -> list[str]:
             expected=", ".join(FORMATS),
         )
     return list(dict.fromkeys(names))
-
-
-def _write_npy(path: Path, values: NDArray[np.floating]) -> None:
-    packed = io.BytesIO()
-    np.save(packed, values.astype(np.float32))
-    write_bytes(path, packed.getvalue())
 
 
 def _write_pfm(path: Path, frame: Frame) -> None:
@@ -201,8 +193,8 @@ FORMATS = {
     "npy": Format(
         "depth and sigma as float32 arrays, K.txt",
         frames={
-            "depth.npy": lambda path, frame: _write_npy(path, frame.depth),
-            "sigma.npy": lambda path, frame: _write_npy(path, frame.sigma),
+            "depth.npy": lambda path, frame: np.save(path, frame.depth.astype(np.float32)),
+            "sigma.npy": lambda path, frame: np.save(path, frame.sigma.astype(np.float32)),
         },
         whole={"K.txt": _write_cameras},
     ),

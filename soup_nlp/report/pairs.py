@@ -76,7 +76,7 @@ def places(names: Iterable[str]) -> list[str]:
 
 def needed_bytes(problem: Problem) -> float:
     """Estimate of the memory of a solve."""
-    return sum(size for size, _ in solve_bytes(problem, problem.load_pair()).values())
+    return sum(solve_bytes(problem, problem.load_pair()).values())
 
 
 def fitting(workers: int, needs: float) -> int:

@@ -67,7 +67,7 @@ def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
 
 
 def _components(chain: Chain, k: int) -> Picture:
-    """The image in the colours of the components; striped where most of the depth is drawn."""
+    """The image in the colours of the components."""
     result, track = chain.pairs[k], chain.tracks[k]
     part = result.components.of_pixel
     count = len(track)
@@ -78,12 +78,6 @@ def _components(chain: Chain, k: int) -> Picture:
     word = f"one {kind}" if count == 1 else f"{count} {kind}s, share of the image"
     grey = result.images[0].astype(float).mean(axis=2, keepdims=True)
     shaded = colours[part] * (0.6 + 0.4 * grey / 255)
-    drawn = np.bincount(part.ravel(), result.drawn.ravel(), minlength=count)
-    striped = drawn / part.size > 0.5 * pixels
-    stripe = np.add.outer(np.arange(part.shape[0]), np.arange(part.shape[1])) % 8 < 3
-    shaded[striped[part] & stripe] = 255
-    if striped.any():
-        word += "; striped: most of its depth is drawn"
     return Picture(
         "components", word, shaded.astype(np.uint8), Legend(colours[None, :6], tuple(texts))
     )
