@@ -240,6 +240,13 @@ def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
         ((80, 120, 47.5, 31.5), False, "a crop, or a wrong file", "80,80,47.5,31.5"),
         ((80, 80, -3, 31.5), True, "a crop, or a wrong file", "80,80,47.5,31.5"),
         ((80, 80, 47.5, 60), False, "a crop, or a wrong file", "80,80,47.5,31.5"),
+        # in millimetres
+        (
+            (5, 5, 47.5, 31.5),
+            False,
+            "a focal length that is not in pixels",
+            "115.2,115.2,47.5,31.5",
+        ),
     ],
 )
 def test_implausible_intrinsics_name_their_cause(

@@ -153,6 +153,8 @@ def _problems(K: Float, size: Sequence[int], cropped: bool) -> list[str]:
             out.append(f"principal point {cx:g}, {cy:g} is the middle of another size")
     if _ratio(fx, fy) > UNEVEN:
         out.append(f"fx {fx:g} and fy {fy:g} differ much")
+    if (degrees := _degrees(fx / max(size))) > WIDEST:
+        out.append(f"fx {fx:g} is a view of {degrees:.0f} degrees")
     return out
 
 
@@ -180,4 +182,7 @@ def _explanation(K: Float, size: Sequence[int]) -> tuple[str, Float]:
         near = _off_middle(fits[0, 2], fits[1, 2], size) < 2 * NEAR_MIDDLE
         if near and fits.diagonal().min() > 0 and not _problems(fits, size, False):
             return cause, fits
+    if _degrees(fx / max(size)) > WIDEST:
+        usual = GUESS * max(size)
+        return "a focal length that is not in pixels", intrinsics(usual, usual, *middle)
     return "a crop, or a wrong file", intrinsics(fx, fx if _ratio(fx, fy) > UNEVEN else fy, *middle)
