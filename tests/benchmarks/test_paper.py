@@ -54,7 +54,7 @@ def test_the_documented_departures_that_the_preset_keeps():
         "energy.pixel_samples",
         "segmentation.boundary_samples",
         "solver.eps",
-        "solver.presolve",
+        "solver.presolve_iterations",
     }
 
 
