@@ -272,7 +272,7 @@ def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
         key = np.log1p(-np.random.default_rng(seed).random(len(weight))) / weight
         pick = np.sort(np.argpartition(-key, SAMPLES)[:SAMPLES])
         weight = np.ones(len(weight))  # the draw has done the weighting
-    motion = _best_motion(epipolar.Matches(r[pick], q[pick], weight[pick], focal), seed)
+    motion = _best_motion(epipolar.Matches(r[pick], q[pick], weight[pick], focal))
     if motion is None:
         return None
     z, z_next = epipolar.triangulate(motion, r, q)
@@ -284,11 +284,11 @@ def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
     return depth
 
 
-def _best_motion(matches: epipolar.Matches, seed: int) -> epipolar.Motion | None:
+def _best_motion(matches: epipolar.Matches) -> epipolar.Motion | None:
     """The motion of correspondences with the smallest Cauchy cost, or None where there is none."""
     best, lowest = None, np.inf
     for distance in (INLIER, TIGHT * INLIER):
-        motion = epipolar.estimate(matches, distance, seed)
+        motion = epipolar.estimate(matches, distance)
         if motion is None or not (np.isfinite(motion.R).all() and np.isfinite(motion.t).all()):
             continue
         off = matches.distance(motion) / (TIGHT * INLIER)

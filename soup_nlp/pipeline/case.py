@@ -113,7 +113,7 @@ def _observed(
     done("segmentation", seg)
     if pair.focal_sigma >= GUESS_SIGMA:
         matches = _flow_fit(problem, pair, seg).views.matches()
-        error = camera_error(matches, "focal length", pair.focal_sigma, seed=problem.seed)
+        error = camera_error(matches, "focal length", pair.focal_sigma)
         better = float(np.exp(error.mean)), error.deviation
         full, pair = full.with_focal(*better), pair.with_focal(*better)
         if log:
@@ -266,7 +266,7 @@ def see_through(pair: Pair, seed: int = 0) -> Flow | None:
         flow.confidence[v, u][pick].astype(float),
         float(pair.K_next[0, 0]),
     )
-    motion = estimate(matches, seed=seed)
+    motion = estimate(matches)
     if motion is None:
         return None
     ref, nxt = without_still_layer(pair.image_ref, pair.image_next)

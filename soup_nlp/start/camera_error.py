@@ -82,9 +82,7 @@ def corrected(kind: str, x: float, ref: Float, following: Float) -> tuple[Float,
     return np.pad(a, pad, constant_values=1.0), np.pad(b, pad, constant_values=1.0)
 
 
-def camera_error(
-    matches: Matches, kind: str, deviation: float, wrong: float = 1.0, seed: int = 0
-) -> CameraError:
+def camera_error(matches: Matches, kind: str, deviation: float, wrong: float = 1.0) -> CameraError:
     """What correspondences say of an error of the camera.
 
     With s(x) the Sampson distances of the best motion if the error is x, and g the least of their
@@ -96,10 +94,9 @@ def camera_error(
         kind: One of `KINDS`.
         deviation: Standard deviation of the error.
         wrong: Probability of an error, without the flow; 1 for a guess.
-        seed: Of the robust fits.
     """
     matches = matches.confident(PIXELS)
-    distance = _distances(matches, kind, deviation, seed)
+    distance = _distances(matches, kind, deviation)
     prior = float(special.logit(wrong))
     if distance is None:
         return CameraError(0.0, deviation, deviation, prior)
@@ -117,7 +114,7 @@ def camera_error(
     return CameraError(mean, spread, float(np.sqrt(density @ acts**2)), prior + more)
 
 
-def _distances(matches: Matches, kind: str, deviation: float, seed: int) -> Float | None:
+def _distances(matches: Matches, kind: str, deviation: float) -> Float | None:
     """(len(STEPS), M) Sampson distances of the best motion with every error, pixels, or None.
 
     Motions change little from one error to the next. That of a focal length changes much from one
@@ -134,7 +131,7 @@ def _distances(matches: Matches, kind: str, deviation: float, seed: int) -> Floa
         ways += [range(count), range(count - 1, -1, -1)]
     best, least = np.zeros((count, len(matches.ray))), np.full(count, np.inf)
     for way in ways:
-        motion = essential_motion(tried[way[0]], None, seed)
+        motion = essential_motion(tried[way[0]], None)
         if motion is None:
             continue
         for k in way:

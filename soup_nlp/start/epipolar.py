@@ -97,27 +97,26 @@ def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
     return focal * np.sum(q.T * by_q, axis=0) / np.sqrt(np.maximum(squared, 1e-24))
 
 
-def estimate(matches: Matches, threshold: float = 1.0, seed: int = 0) -> Motion | None:
+def estimate(matches: Matches, threshold: float = 1.0) -> Motion | None:
     """Motion with the most inliers, or None if the correspondences do not determine one.
 
     Args:
         matches: Correspondences.
         threshold: Inlier distance, pixels.
-        seed: Seed of RANSAC.
     """
-    motion = essential_motion(matches, threshold, seed)
+    motion = essential_motion(matches, threshold)
     return None if motion is None else refine(motion, matches, threshold)
 
 
-def essential_motion(matches: Matches, threshold: float | None, seed: int = 0) -> Motion | None:
+def essential_motion(matches: Matches, threshold: float | None) -> Motion | None:
     """Motion by RANSAC on the essential matrix and cheirality, or None; see `estimate`.
 
-    Without a threshold it is the motion with the least median error.
+    Without a threshold it is the motion with the least median error. OpenCV draws the same samples
+    every time.
     """
     r, q, _, focal = matches
     if len(r) < 8:
         return None
-    cv2.setRNGSeed(seed)
     try:
         E, _ = cv2.findEssentialMat(
             *(np.ascontiguousarray(v[:, :2]) for v in (r, q)),

@@ -50,7 +50,7 @@ def _patch(flow: FlowFit, i: int) -> tuple[Motion, Float] | None:
     if len(inside.ray) < LEAST_PIXELS:
         return None
     around = views.subset(np.append(i, flow.seg.knn[i])).matches()
-    motion = essential_motion(around.confident(MOST_PIXELS), o.threshold_px, o.seed)
+    motion = essential_motion(around.confident(MOST_PIXELS), o.threshold_px)
     if motion is None:
         return None
     m, seen = plane_of(motion, inside), np.vstack([inside.ray, views.anchor[i]])

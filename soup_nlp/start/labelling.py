@@ -139,7 +139,7 @@ def _price(excess: Float, shared: float) -> Float:
 def dominant(flow: FlowFit) -> Motion:
     """The motion that most of the image shares."""
     matches = flow.views.matches().confident(MOST_PIXELS)
-    return estimate(matches, flow.options.threshold_px, flow.options.seed) or SIDEWAYS
+    return estimate(matches, flow.options.threshold_px) or SIDEWAYS
 
 
 def _of_surfaces(flow: FlowFit, seen: Mask, surface: Int, main: Motion) -> list[Motion]:
@@ -163,7 +163,7 @@ def candidates(
     matches = flow.views.subset(at).matches(PIXELS)
     shift = fit_translation(main.R, matches, max(noise, 0.1))
     refined = [refine_near(m, matches, scale) for m in (*present, shift)]
-    own = estimate(matches, max(3 * noise, 0.3), flow.options.seed)
+    own = estimate(matches, max(3 * noise, 0.3))
     return refined if own is None else [*refined, own]
 
 

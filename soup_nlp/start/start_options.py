@@ -29,7 +29,7 @@ class SeededStart(StartOptions):
     """StartOptions with the seed, which a problem has once, and what is no option of a problem."""
 
     seed: Seed = 0
-    """Seed of sampling and RANSAC."""
+    """Seed of sampling."""
     samples: Whole = 40
     """Sampled pixels per superpixel."""
     threshold_px: NonNegative = 1.0
