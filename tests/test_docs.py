@@ -78,6 +78,13 @@ def keys(model: type[BaseModel], prefix: str = "") -> set[str]:
     return out
 
 
+def test_the_keys_of_options_are_few():
+    names = keys(Problem)
+    ends = {name for name in names if not any(other.startswith(f"{name}.") for other in names)}
+    # the section input is of kinds with keys of their own
+    assert len(ends - {"input"}) <= 55
+
+
 @cache
 def commands() -> set[str]:
     """Every command of the command line."""
