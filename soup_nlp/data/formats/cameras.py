@@ -67,7 +67,7 @@ def estimated_cameras(
 
 def _degrees(focal: float) -> float:
     """Field of view of a side of length 1, degrees."""
-    return 2 * math.degrees(math.atan(0.5 / focal))
+    return 2 * math.degrees(math.atan2(0.5, focal))
 
 
 def exif_focal(path: PathLike | None) -> float | None:
