@@ -25,8 +25,10 @@ from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.start import camera_error
 
 # drawn cases are the same in every run, without a time limit on a busy machine
-settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=20)
+settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("fixed")
+
+SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 
 
 def once(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -89,3 +91,11 @@ def small_room() -> Case:
 def small_run(small_room: Case) -> Run:
     """The start of that room as a run: every record is there, nothing was solved."""
     return make_run(small_room, skipped(small_room))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the real pairs; tests that use it carry `pytest.mark.shared`."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(f"the real pairs are not here: no folder {SHARED_DATA.resolve()}")
+    return SHARED_DATA.resolve()

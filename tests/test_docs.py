@@ -205,3 +205,18 @@ def test_a_mutant_of_a_constraint_changes_one_place():
     for mutant, _ in MUTANTS:
         text = (ROOT / "soup_nlp" / mutant.module).read_text(encoding="utf-8")
         assert text.count(mutant.old) == 1, mutant.what
+
+
+def test_the_check_of_names_can_fail():
+    known = definitions(ROOT / "soup_nlp/geometry/soup.py")
+    assert {"Soup", "Soup.points", "Soup.lam", "reconstruct"} <= known
+    assert "Soup.nothing" not in known
+    assert "1-rays" in headings("# Title\n### 1. Rays\n```text\n# none\n```")
+
+
+def test_the_comparison_of_scores_can_fail():
+    assert fits("0.016", ["0.0160"])
+    assert not fits("0.016", ["0.0167"])
+    assert not fits("0.016, 0.02", ["0.0160"])
+    assert fits("0.10 to 0.25", ["0.2475", "0.0982", "0.1270"])
+    assert not fits("0.10 to 0.25", ["0.2575", "0.0982"])

@@ -22,6 +22,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.storage.each import each
 from soup_nlp.storage.rows import read_rows
 
 TINY = [
@@ -289,3 +290,30 @@ def test_a_cluster_survives_the_loss_of_a_worker(four, tmp_path, cluster):
     assert done.good
     assert len(killed) == 1
     assert len(rows_of(tmp_path / "out")) == 4
+
+
+@pytest.mark.slow
+def test_two_runs_in_one_folder_solve_no_pair_twice(four, tmp_path):
+    runs = [subprocess.Popen(command(four, tmp_path / "out")) for _ in range(2)]
+    assert [run.wait() for run in runs] == [0, 0]
+    rows = read_rows(tmp_path / "out" / "pairs.jsonl")
+    assert sorted(row["key"] for row in rows) == [f"orbit_{k}" for k in range(4)]
+    assert not list((tmp_path / "out" / "pairs").glob("*.claim"))
+    assert len(rows_of(tmp_path / "out")) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_the_loss_of_the_scheduler_ends_the_command(cluster):
+    address, started = cluster
+
+    # pickled by value: the workers do not know this module
+    def later() -> dict[str, int]:
+        time.sleep(0.5)
+        return {}
+
+    rows = each({str(k): later for k in range(8)}, cluster=address)
+    assert next(rows)[1]["ok"]
+    started[0].kill()
+    with pytest.raises(DataError, match="scheduler of the cluster is lost"):
+        list(rows)

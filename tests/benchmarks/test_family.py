@@ -1,15 +1,18 @@
 """The SOUP family: names, the same bytes on every processor, index, best points, answers."""
 
+import inspect
 import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from freeze_family import save_frozen
 
 from benchmarks.__main__ import main
-from benchmarks.family.frozen import load_frozen
+from benchmarks.family.frozen import load_frozen, read_frozen
 from benchmarks.family.instances import (
     BITS,
     FORMULATIONS,
@@ -26,6 +29,7 @@ from benchmarks.family.instances import (
 )
 from benchmarks.family.write import check_sol, published
 from soup_nlp.errors import ConfigError
+from soup_nlp.export.nl import write_nl
 from soup_nlp.model.symbolic import make_oracle
 
 pytestmark = pytest.mark.slow
@@ -165,3 +169,37 @@ def test_other_files_are_not_overwritten(name, tmp_path, capsys):
     assert main(["family", str(tmp_path), "--sizes", "100"]) == 2
     assert "holds other files" in capsys.readouterr().err
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
+def digests(path: Path) -> list[str]:
+    """SHA-256 of instances of a record."""
+    from benchmarks.family.instances import STARTS, build_instance, case_of
+
+    record = read_frozen(path)
+    case = case_of(record)
+    chosen = [("unit-offset/smooth", start) for start in (*STARTS, "best")]
+    nlps = (build_instance(case, record, *one)[0] for one in [*chosen, (OTHER, STARTS[0])])
+    return [write_nl(path.with_suffix(".nl"), nlp).sha256 for nlp in nlps]
+
+
+def test_two_processors_make_the_same_bytes(record, tmp_path):
+    save_frozen(tmp_path / "record.npz", record)
+    here = digests(tmp_path / "record.npz")
+    names = {"pathlib": "Path", "soup_nlp.export.nl": "write_nl"}
+    names["benchmarks.family.frozen"] = "read_frozen"
+    lines = [f"OTHER = {OTHER!r}", *(f"from {k} import {v}" for k, v in names.items())]
+    lines.append(inspect.getsource(digests))
+    program = "\n".join([*lines, f"print(*digests(Path({str(tmp_path / 'record.npz')!r})))"])
+    # numpy's own loops without vector instructions beyond the baseline as well
+    old = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4"}
+    ended = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program],
+        env={**os.environ, "OMP_NUM_THREADS": "1", **old},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    # the record's best point is its proposal, so that easy and hard are one here
+    assert len(here) == 5
+    assert len(set(here)) == 4
+    assert ended.stdout.split() == here

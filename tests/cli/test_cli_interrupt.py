@@ -11,9 +11,12 @@ from helpers_files import sets
 
 from soup_nlp.cli import main as cli
 from soup_nlp.cli import solve as solve_module
+from soup_nlp.config.problem import load_problem
 from soup_nlp.data.flow.sources import FlowOptions
 from soup_nlp.data.inputs import SceneInput
+from soup_nlp.errors import StoppedError
 from soup_nlp.pipeline import case as cases
+from soup_nlp.pipeline.run import run
 from soup_nlp.report import folder as folders
 from soup_nlp.storage.folders import SUMS
 from soup_nlp.storage.progress import interruptible
@@ -156,3 +159,28 @@ def test_a_second_signal_while_the_first_is_handled_ends_at_once(monkeypatch):
     monkeypatch.setattr(guard.event, "set", second)
     with pytest.raises(KeyboardInterrupt):
         guard.handle(signal.SIGINT, None)
+
+
+def test_an_interrupt_that_a_library_turns_into_another_error(tmp_path, monkeypatch, capfd):
+    def library(*_, **__):
+        try:
+            ctrl_c()
+        except KeyboardInterrupt:
+            raise SystemError("error return without exception set") from None
+
+    monkeypatch.setattr(cases, "build_segmentation", library)
+    assert solve(tmp_path / "out") == 130
+    assert "interrupted" in (tmp_path / "out" / folders.FAILED).read_text()
+    # also where a command has no answer to signals of its own
+    assert cli.main(["export", "orbit", "-o", str(tmp_path / "export"), *SMALL]) == 130
+    assert "bug" not in capfd.readouterr().err
+
+
+def test_a_run_of_python_says_it_too():
+    problem = load_problem("orbit", [word for word in SMALL if word != "--set"])
+    with interruptible() as stop:
+        ctrl_c()
+        with pytest.raises(StoppedError, match="load"):
+            run(problem, stop=stop)
+        with pytest.raises(KeyboardInterrupt):
+            ctrl_c()

@@ -1,5 +1,6 @@
 """Options of `solve` that can, or cannot, be combined with a problem file."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -9,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import sets, write_pair
+from helpers_files import sets, write_flo, write_pair
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
@@ -145,3 +146,34 @@ def test_a_working_folder_that_is_gone(tmp_path, monkeypatch, capsys):
     (tmp_path / "gone").rmdir()
     assert main(["solve", "orbit"]) == 2
     assert "the working folder does not exist any more" in capsys.readouterr().err
+
+
+def test_a_flow_goes_with_a_problem_file(tmp_path, monkeypatch, capsys):
+    flow = render_scene("orbit", 0, 112, 84).truth.flow.astype(np.float32)
+    write_flo(tmp_path / "own flow.flo", flow)
+    monkeypatch.chdir(tmp_path)
+    args = ["solve", "orbit", "--out", "my out", "-q", "--flow", "own flow.flo", *SMALL]
+    assert main(args) in (0, 1)
+    assert "own flow.flo" in json.loads((tmp_path / "my out/summary.json").read_text())["flow"]
+    # the command can be pasted into a shell
+    assert "soup-nlp check 'my out'" in capsys.readouterr().out
+
+
+def test_images_may_differ_in_size(tmp_path, capsys):
+    foreign(tmp_path / "pair")
+    pair = render_scene("orbit", 0, 112, 84)
+    cut = str(tmp_path / "pair" / "cut.png")
+    cv2.imwrite(cut, pair.image_next[:76, :104, ::-1])
+    np.save(tmp_path / "cut.npy", pair.truth.depth_next[:76, :104])
+    options = [str(tmp_path / "pair" / "frame_0.png"), cut]
+    # the camera is a file here, as it may be in a problem file
+    options += ["--intrinsics", str(tmp_path / "pair" / "K.txt")]
+    options += ["--set", f"input.depth_next={tmp_path / 'cut.npy'}"]
+    assert main(["solve", "--out", str(tmp_path / "out"), *options, *SMALL[4:]]) in (0, 1)
+    # only the next frame has a truth here
+    assert "next frame" in capsys.readouterr().out
+    assert main(["check", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["metrics"]["solution_next"]["coverage"] > 0.5
+    depth = cv2.imread(str(tmp_path / "out" / "depth_next.png"), cv2.IMREAD_UNCHANGED)
+    assert depth.shape == (76, 104)

@@ -1,19 +1,27 @@
 """The preset that is the method as printed: its options, its start, its unit, its proposals."""
 
+import re
 from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+from benchmarks.paper import printed
+from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
+from soup_nlp.config.trees import PRESETS
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.layout import TangentLayout
+from soup_nlp.model.programs import build_tangent_nlp
 from soup_nlp.model.reweighting import in_translations
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
+from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.epipolar import Matches, Motion
 from soup_nlp.start.homographies import plane_of
@@ -151,3 +159,60 @@ def test_the_papers_nlp_has_the_minimum_of_the_presolve(case):
     # one energy of one soup in two sets of variables
     assert last.history["obj"][0] == pytest.approx(exact.objective, rel=1e-7)
     assert done.energy["total"] < 0.5 * done.energy_start["total"]
+
+
+def test_every_option_of_the_preset_is_in_the_problem():
+    problem = {"input": STREET, "preset": "paper"}
+    overrides = [f"{key}={value}" for key, value in printed().items()]
+    assert make_problem(problem) == make_problem(problem, overrides)
+
+
+def test_the_documented_departures_that_the_preset_keeps():
+    """The table of departures names their keys: the preset sets all but the listed ones."""
+    text = (Path(__file__).parents[2] / "docs" / "formulation.md").read_text()
+    table = text.split("| in the paper |")[1].split("\n\n")[0]
+    keys = set(re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)", table.replace("../soup_nlp", "")))
+    assert keys - printed().keys() == {
+        "flow.source",
+        "energy.pixel_samples",
+        "segmentation.boundary_samples",
+        "solver.eps",
+        "solver.presolve_iterations",
+    }
+
+
+def test_the_command_line_puts_a_preset_below_overrides(capsys):
+    assert main(["show", "--preset", "paper"]) == 0
+    assert yaml.safe_load(capsys.readouterr().out) == PRESETS["paper"]
+    assert main(["show", "street", "--preset", "paper", "--set", "refine.rounds=9"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert (shown["refine"]["rounds"], shown["refine"]["particles"]) == (9, 50)
+    assert main(["show"]) == 2
+    for words in (["--preset", "papr"], ["street", "--preset", "papr"]):
+        assert main(["show", *words]) == 2
+        assert "paper" in capsys.readouterr().err
+
+
+def test_walks_are_the_only_proposals_of_the_paper(case):
+    options = case.problem.refine.replace(rounds=2, particles=8)
+    done = refine_soup(
+        case.start.soup, case.data, case.weights, options, min_facing=0.0, depth_ratio=1e6
+    )
+    for number in done.rounds:
+        kinds = {kind for kind, count in number.proposed.items() if count}
+        assert kinds <= {"current"} | {k for k in kinds if k.startswith("walk_")}
+    assert done.energy["total"] <= done.energy_begin["total"]
+
+
+def test_slanted_planes_do_not_lengthen_the_unit(case):
+    """The presolve's row of the length unit adds up the distances of the slanted planes."""
+    nlp, layout = build_tangent_nlp(case.soup, case.data, case.weights, case.formulation())
+    row = next(g for g in nlp.groups if g.kernel.name == "t_simplex").rows[0, 0]
+    x = nlp.x0 + 1e-2 * np.random.default_rng(0).normal(size=nlp.nx)
+    lam, slope = x[::9], x.reshape(-1, 9)[:, 1:3]
+    across = layout.radius - np.sum(slope * layout.anchor[:, :2], axis=1)
+    m = np.linalg.norm(np.column_stack([slope, across]), axis=1)
+    unit = layout.share @ (layout.depth * lam * layout.radius / m)
+    assert nlp.constraints(x)[row] == pytest.approx(unit, rel=1e-9)
+    assert nlp.constraints(nlp.x0)[row] == pytest.approx(1.0, rel=1e-9)
+    assert abs(unit - 1) > 1e-4

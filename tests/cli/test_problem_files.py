@@ -211,3 +211,31 @@ def test_problems_are_found_by_name_anywhere(tmp_path, monkeypatch, capsys):
     (tmp_path / "street").write_text("input: {kind: motorcycle}\n")
     # a file of that name is meant first
     assert load_problem("street").input.kind == "motorcycle"
+
+
+COMPLETED = {
+    "so": "solve",
+    "solve moto": "motorcycle",
+    "convert out --to ply,col": "ply,colmap",
+    "show street --preset pa": "paper",
+}
+
+
+COMPLETE = f"""import os, sys
+sys.argv = ["soup-nlp"]
+from soup_nlp.cli.main import main
+for line in {list(COMPLETED)}:
+    words = dict(COMP_WORDS="soup-nlp " + line, COMP_CWORD=str(len(line.split())))
+    os.environ.update(words, _SOUP_NLP_COMPLETE="complete_bash")
+    try:
+        main()
+    except SystemExit:
+        pass
+"""
+
+
+@pytest.mark.slow
+def test_completion_knows_commands_problems_and_formats():
+    run = [sys.executable, "-c", COMPLETE]
+    done = subprocess.run(run, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == list(COMPLETED.values())

@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from PIL.Image import open as open_image
 import soup_nlp
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem, SegmentationOptions, load_problem
+from soup_nlp.data.formats.cameras import GUESS_SIGMA
+from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.inputs import pair_hash
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
@@ -178,3 +181,20 @@ def test_what_cannot_be_converted_is_refused(saved, tmp_path, capsys):
         del file["input/image_ref"]
     assert main(["convert", str(out), "--to", "glb"]) == 2
     assert "input/image_ref" in capsys.readouterr().err
+
+
+def test_a_camera_is_a_field_of_view_or_guess():
+    image = render_scene("orbit", 0, 64, 48).image_ref
+    pair = soup_nlp.Pair(image, image, fov=90)
+    assert pair.K_ref[0, 0] == pytest.approx(32)
+    np.testing.assert_array_equal(pair.K_next, pair.K_ref)
+    with pytest.warns(DataWarning, match="no intrinsics; focal length 77 px"):
+        pair = soup_nlp.Pair(image, image)
+    assert pair.focal_sigma == GUESS_SIGMA
+    # a copy keeps it
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        other = pair.with_flow(soup_nlp.Flow(np.zeros((48, 64, 2), np.float32)))
+    assert other.K_ref[0, 0] == pytest.approx(1.2 * 64)
+    with pytest.raises(DataError, match="two cameras"):
+        soup_nlp.Pair(image, image, (70, 70, 31, 24), fov=90)

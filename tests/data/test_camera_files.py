@@ -29,18 +29,23 @@ def opencv(name: str, values: str, rows: int) -> str:
 READ: dict[str, tuple[str | bytes, list[float]]] = {
     "four numbers": ("256 257 159.5 119.5", []),
     "commas": ("256,257,159.5,119.5\n", []),
+    "commas and blanks": ("256, 257, 159.5, 119.5", []),
+    "lines": ("256\n257\n159.5\n119.5\n", []),
     "rows": ("# camera\n256 0 159.5\n0 257 119.5\n0 0 1\n", []),
     "columns": (COLUMNS, []),
+    "exponents": ("2.56e2 +257 1.595E+02 119.5", []),
     "4x4": ("256 0 159.5 0\n0 257 119.5 0\n0 0 1 0\n0 0 0 1", []),
     "3x4": ("256 0 159.5 0\n0 257 119.5 0\n0 0 1 0", []),
     "brackets": ("[[256, 0, 159.5], [0, 257, 119.5], [0, 0, 1]]", []),
     "MATLAB": ("K = [256 0 159.5; 0 257 119.5; 0 0 1];  % pixels", []),
     "with distortion": ("256 257 159.5 119.5 0.1 -0.2 0 0.001 0.3", [0.1, -0.2, 0, 0.001, 0.3]),
     "names": (FOUR, []),
+    "capitals": ("FX 256\nFY 257\nCX 159.5\nCY 119.5", []),
     "equal signs": ("fx=256, fy=257, cx=159.5, cy=119.5", []),
     "one row of names": ("fx 256 fy 257 cx 159.5 cy 119.5", []),
     "head row": ("fx,fy,cx,cy\n256,257,159.5,119.5\n", []),
     "INI": ("[camera]\nfx = 256\nfy = 257\ncx = 159.5\ncy = 119.5\nk1 = -0.3\n", [-0.3]),
+    "twice the same": (FOUR + "fx: 256.0", []),
     "holes": (FOUR + "p1: 0.01", [0, 0, 0.01]),
     "signs": (FOUR + "k1: +0.1\np1: -.5e-3\nk3: 0", [0.1, 0, -5e-4]),
     "not octal": ("fx: 0256\nfy: 0257\ncx: 159.5\ncy: 119.5", []),
@@ -91,6 +96,10 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
         [],
     ),
     "Kalibr": ("cam0:\n" + KALIBR.format("pinhole", "radtan", [0.1, 0, 0, 0], LIST), [0.1]),
+    "two alike": (
+        "".join(f"cam{k}:\n" + KALIBR.format("pinhole", "none", [], LIST) for k in (0, 1)),
+        [],
+    ),
     "basalt": (
         json.dumps({"value0": {"intrinsics": [{"camera_type": "pinhole", "intrinsics": GROUP}]}}),
         [],
@@ -130,18 +139,21 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
     ),
     "UTF-16": (FOUR.encode("utf-16"), []),
     "UTF-8 with a mark": (FOUR.encode("utf-8-sig"), []),
+    "Windows": (FOUR.replace("\n", "\r\n"), []),
     ".npy matrix": (npy(K), []),
+    ".npy numbers": (npy(RIGHT), []),
     ".npz": (npz(mtx=K, dist=np.array([[0.1, 0, 0, 0, 0]]), rvecs=np.ones((5, 3))), [0.1]),
 }  # fmt: skip
 
 
-def test_a_camera_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", READ)
+def test_a_camera_is_read(name: str, tmp_path: Path) -> None:
+    content, lens = READ[name]
     path = tmp_path / "camera"
-    for name, (content, lens) in READ.items():
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        matrix, distortion = read_camera(path)
-        np.testing.assert_array_equal(matrix, K, err_msg=name)
-        np.testing.assert_allclose(distortion, lens, err_msg=name)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    matrix, distortion = read_camera(path)
+    np.testing.assert_array_equal(matrix, K)
+    np.testing.assert_allclose(distortion, lens)
 
 
 TWO = {"left": GROUP, "right": {**GROUP, "fx": 300}}
@@ -177,7 +189,14 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
         json.dumps({"frames": [{"fl_x": f, "fl_y": f, "cx": 1, "cy": 2} for f in (256, 300)]}),
         "2 cameras",
     ),
+    "other distortion": (
+        "".join(
+            f"cam{k}:\n" + KALIBR.format("pinhole", "radtan", [k, 0, 0, 0], LIST) for k in (0, 1)
+        ),
+        r"distortion[\s\S]*0 and 1",
+    ),
     "twice": (FOUR + "fx: 300", r"fx is given twice[\s\S]*256 and 300"),
+    "twice in JSON": ('{"fx": 256, "fx": 300, "fy": 1, "cx": 1, "cy": 1}', "fx is given twice"),
     "Kalibr omni": ("cam0:\n" + KALIBR.format("omni", "radtan", [0], [1.2, *RIGHT]), "another mod"),
     "Kalibr equidistant": (
         "cam0:\n" + KALIBR.format("pinhole", "equidistant", [0] * 4, LIST),
@@ -200,20 +219,32 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "fisheye group": (json.dumps({**GROUP, "fisheye": {"k1": 0.1}}), "another model"),
     "Mei": ("model_type: MEI\nmirror_parameters:\n  xi: 0.9\n" + FOUR, "another model"),
     "other distortion model": (FOUR + "distortion_model: division\nk1: 0.1", "another model"),
+    "radial list": (json.dumps({**GROUP, "radial_distortion": [0.1, 0.2]}), "of another model"),
+    "k of two": (json.dumps({**GROUP, "k": [0.1, 0.2]}), "of another model"),
     "D1": ("M1: [256, 0, 1, 0, 256, 1, 0, 0, 1]\nD1: [.1, 0, 0, 0]\nD2: [.2, 0, 0, 0]", "unclear"),
+    "k0": (FOUR + "k0: 0.1", "of another model"),
+    "nested": (json.dumps({**GROUP, "lens": {"distortion": {"a": 0.1}}}), "of another model"),
     "inverse": (
         json.dumps({**GROUP, "model": "inverse_brown_conrady", "coeffs": [0.1, 0, 0, 0, 0]}),
         "of another model",
     ),
     "decimal commas": (FOUR.replace("256", "256,5"), r"'256,5'[\s\S]*decimal comma"),
     "decimal commas without names": ("256,5 256,5 59,5 19,5", r"'256,5'[\s\S]*decimal comma"),
+    "decimal commas in lines": ("fx = 256,5\nfy = 256,5\ncx=9\ncy=9", "decimal comma"),
+    "decimal commas in JSON": (json.dumps({**GROUP, "fx": "256,5"}), "decimal comma"),
     "no number": ("fx ...\nfy 1\ncx 1\ncy 1", r"not a number[\s\S]*'\.\.\.'"),
     "empty": ("fx:\nfy: 1\ncx: 1\ncy: 1", "fx is not one number"),
     "a word": (FOUR.replace("256", "wide"), "not a number"),
+    "two points": (FOUR.replace("256", "1.2.3"), r"'1\.2\.3'"),
     "a unit": (FOUR.replace("256", "4.2 mm"), "not one|not a number"),
+    "a unit in lines": ("fx = 4.2 mm\nfy = 4.2 mm\ncx = 1\ncy = 1", "not one|not a number"),
+    "underscores": (FOUR.replace("256", "25_6"), "'25_6'"),
     "two numbers": (FOUR.replace("256", "[256, 257]"), "fx is not one number"),
     "NaN distortion": (FOUR + "k1: .nan", "distortion k1 is unclear"),
+    "NaN distortion without names": ("256 257 159.5 119.5 0.1 nan", "wrong number of values"),
     "NaN": (FOUR.replace("256", ".nan"), "no camera matrix"),
+    "infinite": (json.dumps({**GROUP, "fx": float("inf")}), "no camera matrix"),
+    "negative": (json.dumps({**GROUP, "fx": -1}), "no camera matrix"),
     "half a camera": ("fx: 256\ncx: 1", "lacks fy and cy"),
     "a field of view": ('{"camera_angle_x": 0.6911112070083618, "frames": []}', "--fov 39.60"),
     "no camera": ("width: 320\nheight: 240", r"no camera[\s\S]*width, height"),
@@ -228,18 +259,20 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "binary": (b"\x80\x04\x95\x00\x00", "not text"),
     "odd UTF-16": (FOUR.encode("utf-16")[:-1], "not text"),
     "objects": (npy(np.array([None])), "no readable array"),
+    "other .npy": (npy(np.ones(3)), "wrong number of values"),
     "damaged .npy": (npy(K)[:-5], "no readable array"),
     "prose": ("the camera of my phone", "no camera"),
 }
 
 
-def test_what_is_no_camera_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_camera_is_refused(name: str, tmp_path: Path) -> None:
+    content, match = REFUSED[name]
     path = tmp_path / "camera"
-    for name, (content, match) in REFUSED.items():
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        with pytest.raises(DataError) as caught:
-            read_camera(path)
-        text = str(caught.value)
-        assert re.search(match, text), (name, text)
-        assert "\n  expected: " in text, name
-        assert "\n  try: " in text, name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(DataError) as caught:
+        read_camera(path)
+    text = str(caught.value)
+    assert re.search(match, text), text
+    assert "\n  expected: " in text
+    assert "\n  try: " in text

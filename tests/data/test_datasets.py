@@ -10,6 +10,7 @@ from helpers_files import put, raises, write_cam, write_dpt, write_flo, write_ki
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.datasets.benchmarks import CAMERAS
 from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.data.formats.map_files import KITTI_DISPARITY, read_depth_png16
 from soup_nlp.errors import ConfigError
 
 H, W = 6, 9
@@ -313,3 +314,29 @@ def test_motorcycle_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
     image_of = moved @ pair.K_next.T
     flow = image_of[..., :2] / image_of[..., 2:] - np.stack([u, v], -1)
     np.testing.assert_allclose(flow, truth.flow, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_real_pairs(shared_data: Path) -> None:
+    pair = load("kitti2012", shared_data / "kitti2012", index="27")
+    depth = pair.truth.depth_ref
+    disparity = read_depth_png16(
+        shared_data / "kitti2012" / "training" / "disp_occ" / "000027_10.png",
+        KITTI_DISPARITY,
+    )
+    finite = np.isfinite(disparity)
+    np.testing.assert_array_equal(np.isfinite(depth), finite)
+    np.testing.assert_allclose(depth[finite] * disparity[finite], 718.856 * 0.53717, rtol=1e-4)
+    with pytest.warns(DataWarning, match="688,688"):
+        sintel = load("sintel", shared_data / "sintel", scene="alley_1", frame=2)
+    with pytest.warns(DataWarning, match="688,688"):
+        far = load("sintel", shared_data / "sintel", scene="alley_1", frame=20, step=5)
+    assert str(sintel.truth) == "Truth(flow; m)"
+    assert "depth_ref" in str(far)
+    driving = load("folder", shared_data / "driving_synthetic")
+    assert "depth_ref, flow" in str(driving)
+    paper = load("folder", shared_data / "kinect_paper" / "pair_049")
+    assert 0.3 < np.median(paper.truth.points[:, 2]) < 1.0
+    desk = load("folder", shared_data / "tum_fr1", depth_scale=5000.0).truth
+    assert 0.5 < np.nanmedian(desk.depth_ref) < 3.0

@@ -1,5 +1,6 @@
 """Flow sources: DIS with its confidence, files, truth, plug-ins."""
 
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ from helpers_files import raises, write_flo, write_kitti_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from soup_nlp.data.datasets.benchmarks import KittiInput
 from soup_nlp.data.flow import dis
 from soup_nlp.data.flow.consistency import (
     confidence_of,
@@ -17,7 +19,7 @@ from soup_nlp.data.flow.consistency import (
     round_trip_error,
     standing_edges,
 )
-from soup_nlp.data.flow.dis import guided_flow
+from soup_nlp.data.flow.dis import dominant_homographies, guided_flow
 from soup_nlp.data.flow.sources import dis_flow, flow_sources, resolve_flow
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.report.findings import STANDING
@@ -285,3 +287,61 @@ def test_a_text_that_stands_still_over_a_moving_scene_is_seen() -> None:
 
     assert shares("") == 0
     assert shares("COPY") > 2 * STANDING
+
+
+def test_dis_images_of_different_size() -> None:
+    first, second = shifted(64, 90, 2, 0)
+    flow = dis_flow(first, second[:, :70])
+    assert flow.uv.shape == (64, 90, 2)
+    assert not flow.confidence[:, 72:].any()
+    assert (flow.confidence[10:-10, 10:60] > 0.5).mean() > 0.9
+
+
+def test_an_image_that_is_too_small_for_dis() -> None:
+    good = np.zeros((20, 20, 3), np.uint8)
+    with raises(r"too small[\s\S]*20x15"):
+        dis_flow(good[:15], good)
+
+
+@pytest.mark.slow
+@pytest.mark.shared
+def test_dis_on_kitti(shared_data: Path) -> None:
+    whole = KittiInput(kind="kitti2012", root=str(shared_data / "kitti2012"), index="27").load(Path)
+    middle = np.s_[:, 350:-350]
+    flow = dis_flow(whole.image_ref[middle], whole.image_next[middle])
+    error = np.linalg.norm(flow.uv - whole.truth.flow[middle], axis=2)
+    finite = np.isfinite(error)
+    assert np.median(error[finite]) < 0.4
+    assert (error[finite] > 3).mean() < 0.25
+    sure = finite & (flow.confidence > 0.5)
+    assert sure.sum() > 0.7 * finite.sum()
+    assert (error[sure] > 3).mean() < 0.05
+    edges = [-1.0, 0.0, 0.25, 0.5, 0.75, 0.9, 1.0]
+    bins = [
+        finite & (flow.confidence > low) & (flow.confidence <= high)
+        for low, high in pairwise(edges)
+    ]
+    medians = [np.median(error[bucket]) for bucket in bins]
+    assert medians == sorted(medians, reverse=True)
+
+
+def test_homographies_are_recovered_one_after_the_other():
+    left = np.arange(WIDTH) < WIDTH // 3
+    shift = np.array([[1.0, 0, 3], [0, 1, -2], [0, 0, 1]])
+    flow = np.where(left[None, :, None], truth(shift), truth(ROAD)).astype(np.float32)
+    homographies = dominant_homographies(flow, np.ones((HEIGHT, WIDTH), np.float32), 4)
+    assert len(homographies) == 2
+    for H, true in zip(homographies, (ROAD, shift)):
+        np.testing.assert_allclose(H / H[2, 2], true, atol=1e-3, rtol=1e-3)
+    assert dominant_homographies(flow, np.zeros((HEIGHT, WIDTH), np.float32), 4) == []
+    assert len(dominant_homographies(flow, np.ones((HEIGHT, WIDTH), np.float32), 1)) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("planes", "least", "most"), [(0, 0.0, 0.3), (4, 0.7, 1.0)])
+def test_only_homographies_find_large_displacements(planes, least, most, monkeypatch):
+    monkeypatch.setattr(dis, "PLANES", planes)
+    fast = 2 * ROAD - np.eye(3)
+    flow = dis.dis_flow(*images(fast))
+    right = np.linalg.norm(flow.uv - truth(fast), axis=-1) < 1
+    assert least <= (right & (flow.confidence > 0.5)).mean() <= most

@@ -2,11 +2,16 @@
 
 import numpy as np
 import pytest
-from helpers_truth import assert_partition
+from helpers_truth import assert_partition, majority
 
+from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.borders import fit_affine, follow_depth, follow_flow
+from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Flow
+from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.superpixels import segment
+from soup_nlp.pipeline.case import superpixels
 
 HEIGHT, WIDTH, EDGE = 48, 64, 26
 """EDGE is inside a column of cells of 8 pixels."""
@@ -98,3 +103,21 @@ def test_scattered_pixels_are_no_outliers():
     assert np.median(weight[labels == 0]) > 0.4
     assert weight[lone].max() < 0.1
     assert weight[(labels == 1) & ~lone].min() > 0.9
+
+
+MEMORY = {"input": {"kind": "memory", "hash": "0"}}
+
+
+@pytest.mark.slow
+def test_following_the_flow_leaves_fewer_mixed_superpixels():
+    """Superpixels of two components; the ratio is 0.35, as SLIC mixes few at the wanted number."""
+    pair = render_scene("orbit", 3, 384, 164)
+    pair = pair.with_flow(flow_from_truth(pair))
+    share = {}
+    for margin in (1.0, None):
+        cut = {"superpixels": 300, "follow_flow_px": margin}
+        labels = superpixels(make_problem({**MEMORY, "segmentation": cut}), pair)
+        purity = majority(pair.truth, build_segmentation(labels, pair.image_ref))[1]
+        share[margin] = float((purity < 0.95).mean())
+    np.testing.assert_array_equal(labels, segment(pair.image_ref, 300))
+    assert share[1.0] < 0.5 * share[None]

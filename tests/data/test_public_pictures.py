@@ -4,6 +4,7 @@ import re
 import struct
 import warnings
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.formats.images import DataWarning, read_image, read_images
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.data.working_size import scaled_camera
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.pipeline.run import solve_pair
 
 MIDDLE = (47.5, 31.5)
 
@@ -303,3 +306,66 @@ def test_an_assumed_scale_of_depth_gives_a_warning(kind: str, folder: Path) -> N
         assert truth.depth_ref[0, 0] == depth
         words = ["assumed: 1000 values per unit" in str(w.message) for w in caught]
         assert words == [True] * (scale is None)
+
+
+def test_a_photo_of_high_range_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.hdr"), texture().astype(np.float32))
+    with pytest.raises(DataError, match=r"HDR photo[\s\S]*expected: [\s\S]*try: develop it"):
+        read_image(tmp_path / "a.hdr")
+
+
+@pytest.mark.parametrize("factor", [257, 16])
+def test_8_bits_beside_16_are_stretched_alike(factor: int, tmp_path: Path) -> None:
+    image = np.clip(texture().astype(int), 40, 200)
+    cv2.imwrite(str(tmp_path / "a.png"), image.astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "b.png"), (image * factor).astype(np.uint16))
+    with pytest.warns(DataWarning, match="16 bit beside 8 bit"):
+        eight, sixteen = read_images([tmp_path / "a.png", tmp_path / "b.png"])
+    if factor == 257:
+        np.testing.assert_array_equal(eight, sixteen)
+    assert eight.max() == 255
+    with warnings.catch_warnings(action="error"):
+        eight, _ = read_images([tmp_path / "a.png", tmp_path / "b.png"], white=257 * 255)
+    np.testing.assert_array_equal(eight, image[:, :, ::-1])
+
+
+@pytest.mark.parametrize("brand", [b"heic", b"mif1", b"crx "])
+def test_heic_gives_an_error_with_a_hint(brand: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftyp" + brand + bytes(100))
+    with pytest.raises(DataError, match="convert it to PNG or JPEG first") as caught:
+        read_image(tmp_path / "a.heic")
+    assert "damaged" not in str(caught.value)
+
+
+def test_intrinsics_of_arrays_are_checked_too() -> None:
+    pair = render_scene("orbit", 0, 128, 54)
+    other = replace(pair, K_next=scaled_camera(pair.K_next, (54, 128), (135, 320)))
+    with pytest.raises(DataError, match=r"principal point is outside[\s\S]*K_next[\s\S]*320 x 135"):
+        solve_pair(other)
+    half = replace(pair, K_ref=scaled_camera(pair.K_ref, (54, 128), (32, 76)))
+    with (
+        pytest.warns(DataWarning, match="K_ref, 128 x 54.*an image of 76 x 32"),
+        pytest.raises(ConfigError),
+    ):
+        solve_pair(half, preset="none")
+    with pytest.raises(ConfigError):
+        solve_pair(other, preset="none", cropped=True)
+
+
+def test_plausible_intrinsics_give_no_warning(folder: Path) -> None:
+    for four in ((80, 80, 47.5, 31.5), (80, 90, 40, 38), (500, 500, 55, 31)):
+        assert said(folder, intrinsics=[*four])[1] == ""
+    # the principal point of the next frame is checked against its own middle
+    with pytest.warns(DataWarning, match=r"b\.png.*far from the middle"):
+        load(folder, intrinsics=[80, 80, 47.5, 31.5], intrinsics_next=[80, 80, 20, 31.5])
+
+
+def test_undistortion_needs_the_file_of_a_camera_and_no_truth(folder: Path) -> None:
+    (folder / "K.txt").write_text("80 80 47.5 31.5 0.1")
+    np.save(folder / "d.npy", np.ones((64, 96)))
+    for keys in (
+        {"intrinsics": [80.0, 80.0, 47.5, 31.5]},
+        {"intrinsics": "K.txt", "depth": "d.npy"},
+    ):
+        with pytest.raises(ConfigError, match="cannot be undistorted"):
+            load(folder, undistort=True, **keys)

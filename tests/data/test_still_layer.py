@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from test_flow import texture
 
+from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.layers import without_still_layer
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.pipeline.case import see_through
+from soup_nlp.pipeline.case import see_through, with_flow
 
 WIDTH, HEIGHT = 512, 218
 BEHIND = np.s_[130:205, 150:400]
@@ -69,3 +70,19 @@ def test_the_road_moves_behind_a_reflection(reflecting: Pair):
     # moving pixels outside the static layer keep their flow
     above = np.s_[20:90, 100:400]
     assert np.mean((seen.uv == reflected.flow.uv)[above]) > 0.95
+
+
+@pytest.mark.slow
+def test_images_without_a_layer_are_left_alone(street: Pair):
+    assert see_through(given(street, still=False)) is None
+
+
+@pytest.mark.slow
+def test_true_flow_is_believed(reflecting: Pair):
+    """The correction applies to computed flow only, and an option disables it."""
+    memory = {"input": {"kind": "memory", "hash": "0"}}
+    for source, options in (("truth", {}), ("dis", {"consistency": False})):
+        reflected = given(reflecting, still=True, source=source)
+        problem = make_problem({**memory, "flow": options})
+        believed = with_flow(problem, reflected, reflected, None)
+        assert (believed.flow.uv[BEHIND] == 0).all()

@@ -97,3 +97,23 @@ def test_without_flow_or_motion_there_is_no_baseline(orbit, monkeypatch):
     assert depth is None or depth.shape == orbit.size
     monkeypatch.setattr("soup_nlp.start.epipolar.estimate", lambda *_: None)
     assert rigid_depth(orbit) is None
+
+
+def test_confidence_weighs_the_motion(orbit):
+    """A moving half of low confidence does not determine the motion."""
+    uv, confidence = orbit.flow.uv.copy(), orbit.flow.confidence.copy()
+    uv[:, :150] += np.linspace(3, 9, 150)[None, :, None]
+    confidence[:, :150] = 0.02
+    depth = rigid_depth(orbit.with_flow(Flow(uv, confidence)))
+    right = depth_metrics(depth[:, 150:], orbit.truth.depth_ref[:, 150:])
+    assert right.mre < 0.01
+
+
+@pytest.mark.slow
+def test_dynamic_scene_is_not_rigid():
+    pair = render_scene("street", width=256, height=109)
+    depth = rigid_depth(pair.with_flow(flow_from_truth(pair)))
+    m = depth_metrics(depth, pair.truth.depth_ref)
+    at_rest = np.where(pair.truth.components == 0, pair.truth.depth_ref, np.nan)
+    static = depth_metrics(depth, at_rest)
+    assert static.mre < m.mre < 0.05

@@ -15,6 +15,7 @@ from soup_nlp.evaluation.confidence import (
     ADDED,
     FACTORS,
     MISFIT,
+    MOST_SIGMA,
     at_outlines,
     confidence,
     flow_misfit,
@@ -309,3 +310,37 @@ def test_where_surfaces_bend_nothing_is_surer_than_relief_without_parallax(small
     all_bend = np.ones(len(small_room.soup), bool)
     bends = replace(small_room, start=replace(small_room.start, bends=all_bend))
     assert sure_of(bends).sigma.min() >= with_prior(FACTORS["bends"]) * (1 - 1e-9)
+
+
+def test_all_depths_growing_alike_costs_nothing(info):
+    size = abs(info.matrix) @ abs(info.growth)
+    assert abs(info.matrix @ info.growth).max() < 1e-9 * size.max()
+
+
+def test_an_undetermined_superpixel_has_the_sigma_of_the_prior(small_room, sure):
+    blind = 25
+    weight = small_room.data.pixel_weight.copy()
+    weight[blind] = 0.0
+    data = replace(small_room.data, pixel_weight=weight)
+    loose = small_room.weights.replace(arap=1e-9, cont=1e-9, orient=1e-9)
+    sigma = sure_of(small_room, data, loose).sigma
+    inside = small_room.segmentation.labels == blind
+    np.testing.assert_allclose(sigma[inside], PRIOR, rtol=0.05)
+    assert sure.sigma[inside].mean() < 0.9 * PRIOR
+
+
+@pytest.mark.slow
+def test_the_background_of_a_camera_at_rest_is_unsure(small_room, sure):
+    scene = {"kind": "scene", "scene": "still", "width": 256, "height": 128}
+    still = prepare(make_problem({"input": scene, "segmentation": {"superpixels": 60}}))
+    moves = still.pair.truth.components > 0
+    at_rest = sure_of(still).sigma > MOST_SIGMA
+    assert at_rest[~moves].mean() > 0.8
+    assert np.mean(sure.sigma > MOST_SIGMA) < 0.2
+
+
+def test_an_energy_that_sees_no_plane_leaves_everything_to_the_prior(small_room):
+    alone = dict.fromkeys(("proj", "cont", "orient", "prior"), 0.0)
+    sigma = sure_of(small_room, weights=small_room.weights.replace(**alone)).sigma
+    assert np.isfinite(sigma).all()
+    assert np.median(sigma) == pytest.approx(PRIOR, rel=0.05)

@@ -5,11 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.pair import Pair
 from soup_nlp.evaluation.evidence import Evidence, evidence
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.run import make_run, skipped
+from soup_nlp.report.findings import hints
 from soup_nlp.start.bending import ANY_TURN, LEAST_GAP_PX, PLAIN_TURN, fit_robustly, turned
 from soup_nlp.start.camera_error import (
     KINDS,
@@ -179,3 +184,64 @@ def test_a_better_camera_has_square_pixels():
 
 def test_too_few_matches_show_no_error():
     assert likeliest(camera_errors(matches().at(slice(7)))) is None
+
+
+ORBIT = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
+
+
+@pytest.fixture(scope="module")
+def orbit():
+    return make_problem({"input": ORBIT, "flow": {"source": "truth"}}).load_pair()
+
+
+def started(pair: Pair):
+    """The start of a pair as a run, and what is said of it."""
+    raw = {"input": ORBIT, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
+    case = prepare(make_problem(raw), pair=pair)
+    done = make_run(case, skipped(case))
+    return done, "; ".join(hints(done))
+
+
+def test_a_turn_is_no_evidence_with_a_wrong_focal_length(small_room):
+    soup, data = scene(small_room, 0.4, (0.0, 0.0, 0.0), turn=0.05)
+    K = data.K_next.copy()
+    K[:2, :2] *= 1.3
+    ray = data.pixel_ray / np.array([1.3, 1.3, 1.0])
+    result = of_one(soup, replace(data, K_next=K, pixel_ray=ray))
+    assert result.turn[0] < 0.02
+    assert result.guess[0]
+
+
+@pytest.mark.slow
+def test_a_wrong_principal_point_makes_depth_unsure(orbit):
+    K = orbit.K_ref.copy()
+    K[0, 2] += 32
+    exact, told = started(replace(orbit, flow=None))
+    assert exact.good
+    assert exact.confidence.evidence.camera is None
+    assert "intrinsics" not in told
+    wrong, told = started(replace(orbit, flow=None, K_ref=K, K_next=K))
+    assert "intrinsics" in told
+    sigma = np.median(wrong.confidence.sigma), np.median(exact.confidence.sigma)
+    assert sigma[0] > 1.3 * sigma[1]
+    truth, depth = orbit.truth.depth_ref, wrong.reconstruction.depth_ref
+    error = np.abs(np.log(depth * np.median(truth / depth) / truth))
+    assert np.mean(error < 2 * wrong.confidence.sigma) > 0.88
+
+
+@pytest.mark.slow
+def test_two_scenes_are_drawn():
+    one, other = (
+        make_problem({"input": {**ORBIT, "scene": name}}).load_pair() for name in ("room", "street")
+    )
+    done, told = started(replace(one, flow=None, image_next=other.image_next))
+    assert not done.good
+    assert "same scene" in told
+
+
+@pytest.mark.slow
+def test_a_repeated_frame_is_drawn(orbit):
+    done, told = started(replace(orbit, flow=None, image_next=orbit.image_ref))
+    assert not done.good
+    assert done.confidence.share("drawn") == 1
+    assert "nearly the same" in told

@@ -4,12 +4,19 @@ import re
 
 import numpy as np
 import pytest
+from helpers_start import squares
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
+from soup_nlp.geometry import camera
+from soup_nlp.model import oracle
+from soup_nlp.model.energy_data import build_energy_data
+from soup_nlp.model.energy_options import Weights
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, run, skipped
 from soup_nlp.report.verdict import verdict
+from soup_nlp.start.propose import propose
+from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow
 
@@ -80,3 +87,30 @@ def test_a_masked_part_is_sane_and_the_rest_stays(problem, whole, kind):
     assert np.median(sigma[mask]) > 3 * np.median(sigma[~mask])
     wrong = mask & (error > 0.2)
     assert np.sum(sigma[wrong] < 0.1) <= 0.15 * wrong.sum()
+
+
+@pytest.fixture(scope="module")
+def tiles():
+    return squares(6, 8, side=20, neighbours=6)
+
+
+K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
+
+
+def turned(angle: float) -> np.ndarray:
+    """Flow of a camera that turns about its vertical axis, pixels."""
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    uv = camera.pixel_grid(120, 160)
+    return camera.project(K, camera.rays(K, uv) @ R.T) - uv
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.02])
+def test_a_start_without_parallax_borrows_depth_but_fits_flow(tiles, angle):
+    flow = Flow(turned(angle).astype(np.float32), np.ones((120, 160), np.float32), "turn")
+    start = propose(FlowFit.of(tiles, flow, K, K))
+    assert start.borrowed.all()
+    data = build_energy_data(tiles, flow, K, K)
+    error = oracle.values("proj", start.soup, data, Weights())
+    assert error.max() < 1e-3
+    np.testing.assert_allclose(error, start.error, atol=1e-3)

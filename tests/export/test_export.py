@@ -9,13 +9,17 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers_files import sets
+from helpers_nl import ReadBack, close
 
 from benchmarks.family.sol import write_sol
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
 from soup_nlp.errors import ExportError
-from soup_nlp.export.foreign import import_sol
+from soup_nlp.export.foreign import import_sol, sol_table
 from soup_nlp.export.program import file_orders
+from soup_nlp.export.verify import Limits, examine, violations
+from soup_nlp.geometry.constraints import kind, table
+from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.stages import solve_soup
 
@@ -163,3 +167,76 @@ def test_a_presolved_start_has_multipliers(tmp_path, capsys):
     line = next(s for s in capsys.readouterr().out.splitlines() if s.startswith("energy"))
     energy = f"{manifest['exact_energy_at_start']['total']:.6g}"
     assert line == f"energy      start {energy}  solution {energy}"
+
+
+@pytest.mark.slow
+def test_the_file_and_its_manifest_are_those_of_the_nlp(exported):
+    case, nlp, _, (v, r), manifest = problem_of(exported)
+    back = ReadBack(exported / "soup.nl")
+    assert manifest["sizes"]["variables"] == len(back.x0) == nlp.nx
+    assert manifest["sizes"]["jacobian_nonzeros"] == nlp.nnzj
+    close(back.x0, nlp.x0[v])
+    rng = np.random.default_rng(0)
+    x = np.clip(nlp.x0 + 0.05 * rng.normal(size=nlp.nx), nlp.lbx, nlp.ubx)
+    close(back.values(x[v])[0], nlp.value(x))
+    close(back.values(x[v])[1], nlp.constraints(x)[r])
+    close(back.values(x[v])[2], nlp.gradient(x)[v])
+    assert manifest["objective_at_start"] == nlp.value(nlp.x0)
+    exact = oracle.energy(case.soup, case.data, case.weights)["total"]
+    assert manifest["exact_energy_at_start"]["total"] == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.slow
+def test_a_point_with_nan_is_not_verified(exported, optimum):
+    _, nlp, _, _, _ = problem_of(exported)
+    x, lam = optimum
+    assert examine(nlp, x, lam).within(Limits())
+    # multipliers that are not numbers are not used
+    assert examine(nlp, x, np.nan * lam).multipliers == "least squares"
+    bad = x.copy()
+    bad[3] = np.nan
+    assert violations(nlp, bad)["bounds"].max() == np.inf
+    found = examine(nlp, bad, lam)
+    assert (found.primal, found.dual, found.multipliers) == (np.inf, np.inf, "none")
+    assert not found.within(Limits())
+
+
+@pytest.mark.slow
+def test_a_false_claim_of_success_is_not_verified(exported, tmp_path, capsys):
+    sol = answer(exported, "false.sol", move=1e-3)
+    run = import_sol(exported, sol).run
+    assert not run.solution.converged
+    assert run.solution.stages[-1].objective != 0
+    assert main(["check", str(sol)]) == 1
+    said = capsys.readouterr().out
+    assert "FAIL so3" in said
+    assert "not verified" in said
+    assert "a constraint does not hold" in said
+    assert main(["import", str(exported), str(sol), "--out", str(tmp_path / "r")]) == 1
+    limit = import_sol(exported, answer(exported, "limit.sol", code=400))
+    assert "no success claimed" in str(limit)
+
+
+@pytest.mark.slow
+def test_the_worst_superpixel_is_named(exported):
+    _, nlp, layout, (v, r), _ = problem_of(exported)
+    x = nlp.x0.copy()
+    x[layout.of(np.array([7]))[0, 5]] += 1e-2
+    write_sol(exported / "seven.sol", x, None, v, r)
+    imported = import_sol(exported, exported / "seven.sol")
+    rows = sol_table(imported)
+    so3 = next(row for row in rows if row.name == "so3")
+    assert so3.worst[0][0] == 7
+    assert so3.beyond == 1
+    assert not so3.ok
+    assert "7 (" in table(rows)
+    assert kind("normal", np.array([0.0, np.nan]), 1e-6).largest == np.inf
+
+
+@pytest.mark.slow
+def test_no_multipliers_where_the_start_is_not_stationary(exported):
+    manifest = json.loads((exported / "manifest.json").read_text())
+    assert manifest["start"] == "proposal"
+    assert not manifest["initial_duals"]
+    lines = (exported / "soup.nl").read_text().splitlines()
+    assert not any(line[0] in "dS" for line in lines)

@@ -1,5 +1,9 @@
 """The .nl file equals the NLP: read back by CasADi, ASL, POUNCE and SCIP."""
 
+import json
+import shutil
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,11 +11,17 @@ import pytest
 from helpers_model import GAUGES, PAPER, TRUNCATED, tiny, wiggle
 from helpers_nl import ReadBack, close, defined_variables
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ExportError
 from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.export.sol import read_sol
+from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.nlp import NLP
+from soup_nlp.model.programs import build_matrix_nlp
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
 
 FORMS = [Formulation(gauge=gauge) for gauge in GAUGES]
 
@@ -168,3 +178,113 @@ def test_lifted_expressions_are_variables_with_rows(tmp_path):
 
 
 # --- terms that only some pairs have -------------------------------------------------------------
+
+
+def _section(tree: dict, name: str) -> dict:
+    """First mapping of that name anywhere in a tree."""
+    todo = [tree]
+    while todo:
+        node = todo.pop()
+        for key, child in node.items():
+            if isinstance(child, dict):
+                if key == name:
+                    return child
+                todo.append(child)
+    raise KeyError(name)
+
+
+@pytest.fixture(scope="module")
+def swinging(tmp_path_factory) -> Case:
+    """A box that swings before a room: occlusion shows its order, and its true depth is given."""
+    folder = tmp_path_factory.mktemp("swing")
+    scene = {"kind": "scene", "scene": "swing", "width": 160, "height": 120}
+    np.save(folder / "depth.npy", render_scene("swing", 0, 160, 120).truth.depth_ref)
+    raw = {
+        "input": scene,
+        "flow": {"source": "truth"},
+        "segmentation": {"superpixels": 32, "neighbours": 2, "boundary_samples": 1},
+        "energy": {"pixel_samples": 1},
+        "depth_prior": {"source": str(folder / "depth.npy")},
+    }
+    return prepare(make_problem(raw))
+
+
+def test_ampls_own_library_agrees(written):
+    """ASL, the reader behind most solvers, through gjh_asl_json: derivatives at the start."""
+    tool = shutil.which("gjh_asl_json")
+    if tool is None:
+        pytest.skip("gjh_asl_json (Debian package gjh-asl-json) is not installed")
+    nlp, _, file = written
+    stub = file.path.with_suffix("")
+    args = ["rows=soup.row", "cols=soup.col", "json=soup.json"]
+    subprocess.run([tool, stub.name, *args], cwd=stub.parent, check=True, capture_output=True)
+    # ASL counts names from the files; the JSON is keyed by them
+    said = json.loads(stub.with_suffix(".json").read_text())
+    stats = said["problem statistics"]
+    assert stats["total no. of variables"] == nlp.nx
+    assert stats["total no. of constraints"] == nlp.ng
+    assert (
+        stats["no. of nonlinear variables in both constraints and objectives"]
+        == file.counts["nonlinear_variables"]["both"]
+    )
+    assert stats["no. of nonzeros in constraints' Jacobian"] == nlp.nnzj
+    cols = stub.with_suffix(".col").read_text().split()
+    rows = stub.with_suffix(".row").read_text().split()
+
+    def matrix(section: str, down: list[str]) -> np.ndarray:
+        """Entries whose names are those of a row and of a variable."""
+        place = {f"{r}_{c}": (i, j) for i, r in enumerate(down) for j, c in enumerate(cols)}
+        out = np.zeros((len(down), len(cols)))
+        for key, number in _section(said, section).items():
+            out[place[key]] = number
+        return out
+
+    v, r = file.variables, file.rows
+    J = nlp.jacobian(nlp.x0).toarray()[np.ix_(r, v)]
+    np.testing.assert_allclose(matrix("constraints' jacobian", rows[:-1]), J, 1e-10, 1e-10)
+    gradient = nlp.gradient(nlp.x0)[None, v]
+    np.testing.assert_allclose(matrix("gradient", ["E"]), gradient, 1e-10, 1e-10)
+    # the Hessian of f + y g at the duals of the file
+    assert said["supplied starting points"]["dual"] == dict.fromkeys(rows[:-1], 1)
+    H = matrix("lagrangian hessian", cols)
+    H = np.where(H, H, H.T)
+    expected = nlp.hessian(nlp.x0, np.ones(nlp.ng)).toarray()[np.ix_(v, v)]
+    np.testing.assert_allclose(H, expected, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_scip_reads_it(written):
+    scip = pytest.importorskip("pyscipopt", reason="PySCIPOpt is not installed")
+    nlp, _, file = written
+    model = scip.Model()
+    model.hideOutput()
+    model.readProblem(str(file.path))
+    named = {v.name: v for v in model.getVars()}
+    # SCIP turns a nonlinear objective into a variable and a row
+    assert model.getNVars() == nlp.nx + 1
+    assert model.getNConss() == nlp.ng + 1
+    at = file.variables.tolist().index(0)
+    name = file.path.with_suffix(".col").read_text().split()[at]
+    assert named[name].getLbOriginal() == pytest.approx(nlp.lbx[0])
+
+
+@pytest.mark.slow
+def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, tmp_path):
+    data, eps = swinging.data, 2e-5
+    form = swinging.formulation(hessian="exact", eps=eps, eps_pixel=eps)
+    nlp, _ = swinging.nlp(form)
+    file = write_nl(tmp_path / "soup.nl", nlp)
+    back = ReadBack(file.path)
+    x = wiggle(nlp, 0, 0.02)
+    agrees(nlp, file, back, x, 0)
+    pounce_agrees(nlp, file, x)
+    # at the start the file has both terms, up to their smoothing
+    exact = oracle.energy(swinging.soup, data, swinging.weights)
+    f = float(back.values(nlp.x0[file.variables])[0])
+    for term in ("depth", "order"):
+        weight = getattr(data, f"{term}_weight")
+        less = replace(data, **{f"{term}_weight": np.zeros_like(weight)})
+        other = build_matrix_nlp(swinging.soup, less, swinging.weights, form)[0]
+        within = eps * getattr(swinging.weights, term) * np.abs(weight).sum()
+        assert exact[term] - within <= f - other.value(other.x0) <= exact[term] + 1e-9
+        assert exact[term] > 2 * within

@@ -8,6 +8,7 @@ import pytest
 from helpers_model import PAPER, Tiny
 from scipy import sparse
 
+from benchmarks.family.sol import write_sol
 from soup_nlp.errors import ExportError
 from soup_nlp.export import verify
 from soup_nlp.export.nl import write_nl
@@ -175,3 +176,17 @@ def test_residuals_are_within_a_few_times_the_tolerance(place):
         found = np.zeros(3)
         found[place] = factor * verify.SLACK * bounds[place]
         assert verify.Residuals(*found.tolist(), "", found, found).within(limits) is good
+
+
+@pytest.mark.parametrize(
+    ("message", "read"),
+    [("two\n\nlines", "two\nlines"), ("one\n Options\ntwo", 'one\n"Options"\ntwo')],
+)
+@pytest.mark.parametrize("lam", [None, np.array([0.1, -1 / 3])])
+def test_written_files_read_back(message, read, lam, tmp_path):
+    x = np.random.default_rng(0).normal(size=3)
+    write_sol(tmp_path / "a.sol", x, lam, ORDER, ROWS, message, 402)
+    sol = read_sol(tmp_path / "a.sol", ORDER, ROWS)
+    assert np.array_equal(sol.x, x)
+    assert np.array_equal(sol.lam_g, lam)
+    assert (sol.message, sol.code) == (read, 402)

@@ -233,3 +233,27 @@ def test_both_sides_of_a_break_of_the_surface_are_at_a_jump():
     expected = np.zeros((3, 4), bool)
     expected[0, 1:3] = expected[1:, 3] = True
     np.testing.assert_array_equal(at_jumps(right, below), expected)
+
+
+def test_planes_are_tilted_hardly_more_than_necessary():
+    anchor = np.tile(camera.rays(K_REF, [20.0, 30.0]), (8, 1))
+    rays = anchor[:, None] + [[0.1, 0.1, 0], [-0.1, 0.1, 0], [0.1, -0.1, 0], [-0.1, -0.1, 0]]
+    steep = np.linspace(1.0, 3.0, 8)[:, None] * [15.0, 5.0]
+    n, D = normal_and_distance(about_anchor(np.full(8, 2.0), steep, anchor))
+    soup = Soup(np.ones(8), n, D, np.tile(np.eye(3), (8, 1, 1)), np.zeros((8, 3)))
+    done = tilt_to_camera(soup, anchor, rays, 1e-3)
+    Z, slope = at_anchor(inverse_depth(done.n, done.distance), anchor)
+    steeper, _ = normal_and_distance(about_anchor(Z, slope / 0.7, anchor))
+    assert (-np.einsum("nc,nvc->nv", steeper, rays).max(axis=1) < 1e-3).all()
+
+
+def test_points_lie_on_their_plane_and_on_their_ray():
+    soup = random_soup(0, 7)
+    ray = np.tile(GRID, (7, 1, 1))
+    X = soup.points(ray)
+    np.testing.assert_allclose(
+        np.einsum("nc,nmc->nm", soup.n, X) + soup.distance[:, None], 0.0, atol=1e-12
+    )
+    np.testing.assert_allclose(np.cross(X, ray), 0.0, atol=1e-12)
+    np.testing.assert_allclose(X[..., 2], soup.depth_at(ray))
+    assert (soup.depth_at(ray) > 0).all()

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers_model import (
+    GAUGES,
     K_NEXT,
     K_REF,
     PAPER,
@@ -35,7 +36,7 @@ from soup_nlp.model.energy_data import (
 )
 from soup_nlp.model.energy_options import BENDING, GAP, EnergyOptions, Weights
 from soup_nlp.model.programs import build_matrix_nlp
-from soup_nlp.model.reweighting import HELD, Known, weighted
+from soup_nlp.model.reweighting import HELD, Known, in_pixels, weighted
 from soup_nlp.pipeline.case import build_energy
 from soup_nlp.start.labelling import limited_noise
 
@@ -350,3 +351,83 @@ def test_the_scene_is_joined_through_its_superpixel_of_median_depth():
     assert after["arap"] - before["arap"] == pytest.approx(PAPER.arap * cost)
     others = before.keys() - {"arap", "total"}
     assert {k: after[k] for k in others} == pytest.approx({k: before[k] for k in others})
+
+
+@pytest.mark.parametrize("at_anchors", [True, False])
+@pytest.mark.parametrize("units", UNITS)
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000))
+def test_a_motion_of_the_next_camera_changes_only_projection(units, at_anchors, seed):
+    """X'' = Q X' + s: distances of all motions and points of the next frame stay."""
+    problem, weights = tiny(units, at_anchors), weights_for(units).replace(sigma_proj=np.inf)
+    soup = random_soup(seed, 12)
+    rng = np.random.default_rng(seed)
+    Q, s = rotation.exp(rng.normal(0, 0.3, 3)), rng.normal(0, 0.3, 3)
+    moved = replace(soup, R=Q @ soup.R, t=soup.t @ Q.T + s / soup.lam[:, None])
+    before, after = (energies(x, problem.data, weights) for x in (soup, moved))
+    np.testing.assert_allclose(after[[0, 2, 3]], before[[0, 2, 3]], rtol=1e-9)
+    assert after[1] != pytest.approx(before[1], rel=1e-3)
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000))
+def test_turning_the_reference_frame_with_all_its_rays_changes_nothing(seed):
+    """X -> Q X: rays, normals and rotations turn together. Depth along z alone would not stand it,
+    so lengths here are in the paper's unit."""
+    problem, weights = tiny("paper", True), weights_for("paper")
+    soup, data = random_soup(seed, 12), problem.data
+    Q = rotation.exp(np.random.default_rng(seed).normal(0, 0.5, 3))
+    turned = replace(soup, n=soup.n @ Q.T, R=soup.R @ Q.T)
+    names = ("anchor_ray", "pixel_ray", "boundary_ray", "orient_turn")
+    rays = {name: getattr(data, name) @ Q.T for name in names}
+    np.testing.assert_allclose(
+        energies(turned, replace(data, **rays), weights),
+        energies(soup, data, weights),
+        rtol=1e-9,
+    )
+
+
+def test_the_order_of_the_superpixels_does_not_matter():
+    # every anchor is a neighbour of every other: fewer would be chosen among equally near ones
+    problem, weights = Tiny(neighbours=11), weights_for("paper")
+    order = np.random.default_rng(0).permutation(12)
+    rank = np.argsort(order).astype(np.int32)
+    seg = build_segmentation(
+        rank[problem.seg.labels], problem.image, neighbours=11, boundary_samples=2
+    )
+    data = build_energy_data(seg, problem.flow, K_REF, K_NEXT, 3, 0)
+    none = 0 * problem.data.prior_relief
+    s, own = problem.soup, replace(problem.data, prior_relief=none, depth_weight=none)
+    own = replace(own, order_weight=0 * own.order_weight, orient_turn=0 * own.orient_turn)
+    soup = Soup(s.lam[order], s.n[order], s.d[order], s.R[order], s.t[order])
+    np.testing.assert_allclose(energies(soup, data, weights), energies(s, own, weights), rtol=1e-12)
+
+
+def test_local_units_make_every_edge_blind_to_its_own_scale():
+    """Both superpixels of an edge twice as far: its energy stays, while others' does not."""
+    problem, weights = tiny("pixels", True), weights_for("pixels", truncated=False)
+    i, k = problem.seg.edges[0]
+    lam = problem.soup.lam.copy()
+    lam[[i, k]] *= 2
+    twice = replace(problem.soup, lam=lam)
+    a = oracle.values("arap", problem.soup, problem.data, weights)
+    b = oracle.values("arap", twice, problem.data, weights)
+    assert b[0] == pytest.approx(a[0], rel=1e-12)
+    touched = np.isin(problem.seg.edges, [i, k]).any(axis=1)
+    np.testing.assert_allclose(b[~touched], a[~touched], rtol=1e-12)
+    assert (b[touched][1:] != a[touched][1:]).all()
+
+
+def test_one_superpixel_is_a_valid_problem():
+    image = np.zeros((16, 16, 3), np.uint8)
+    seg = build_segmentation(np.zeros((16, 16), np.int32), image)
+    K = camera.intrinsics(20.0, 20.0, 7.5, 7.5)
+    flow = Flow(np.ones((16, 16, 2), np.float32), np.ones((16, 16), np.float32), "ones")
+    soup = random_soup(0, 1)
+    data = in_pixels(build_energy_data(seg, flow, K, K, 6), soup, seg)
+    for gauge in GAUGES:
+        nlp, _ = build_matrix_nlp(soup, data, PAPER, form(gauge=gauge))
+        e = oracle.energy(soup, data, PAPER)
+        assert e["arap"] == e["cont"] == e["orient"] == 0
+        assert nlp.value(nlp.x0) == pytest.approx(e["total"], rel=0.1)
+        assert nlp.constraints(nlp.x0)[: 6 + 1] == pytest.approx(0, abs=1e-12)

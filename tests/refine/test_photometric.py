@@ -246,3 +246,21 @@ def test_one_round_is_enough_where_images_and_flow_agree(scene):
         scene.truth, data, w, o, photo=replace(photo, contradicted=np.ones(40, bool))
     )
     assert (done.status, len(done.rounds), done.contradicted) == ("rounds", 3, 40)
+
+
+def test_the_truth_agrees_and_unseen_points_have_a_fixed_cost(scene):
+    photo = scene.look(scene.truth, photo=1.0)
+    cost = photo.costs(Particles.of(scene.truth), 1.0)[:, 0]
+    u = scene.seg.anchors[:, 0]
+    assert cost[(u < 38) | ((u > 58) & (u < 76))].max() < 0.03
+    # eight columns leave the view
+    at_border = np.zeros((HEIGHT, WIDTH))
+    at_border[:, WIDTH - 8 :] = TAU
+    for i in np.unique(scene.labels[:, -1]):
+        assert cost[i] == pytest.approx(at_border[scene.labels == i].mean(), abs=0.06)
+    # on the far plane, superpixels on the right would be hidden by the near one
+    hidden = Particles.of(scene.soup(np.full(scene.count, FAR)))
+    np.testing.assert_allclose(photo.costs(hidden, 1.0)[(u > 62) & (u < 85), 0], TAU, atol=1e-6)
+    # no superpixel gains by hiding: no visible sample costs more
+    other = Particles.of(scene.soup(np.full(scene.count, 0.7 * FAR)))
+    assert 0.1 < photo.costs(other, 1.0).max() <= TAU + 1e-6

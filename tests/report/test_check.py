@@ -5,11 +5,15 @@ import re
 import shutil
 from pathlib import Path
 
+import cv2
 import h5py
+import numpy as np
 import pytest
 
-from soup_nlp.data.pair import Pair
+from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import pixel_grid, project, rays
 from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import WRITTEN, CheckReport, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
@@ -151,3 +155,48 @@ def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
 
 
 # --- rounding of an energy that should be zero ---
+
+
+def one_plane() -> Pair:
+    """A plane and a motion with an exact flow, so that E is zero up to rounding."""
+    shot = render_scene("orbit", 0, 320, 160)
+    uv = pixel_grid(*shot.size)
+    ray = rays(shot.K_ref, uv)
+    points = (2.0 / (ray @ [-0.1, -0.2, 0.97]))[..., None] * ray
+    turn = cv2.Rodrigues(np.array([0.01, 0.02, -0.005]))[0]
+    flow = project(shot.K_next, points @ turn.T + [0.2, 0.02, 0.1]) - uv
+    sure = np.ones(shot.size, np.float32)
+    grey = np.full_like(shot.image_ref, 128)
+    return Pair(grey, grey, shot.K_ref, shot.K_next, Flow(flow, sure, "exact"))
+
+
+EXACT = {"segmentation": {"superpixels": 50, "neighbours": 8}, "refine": {"photo": 0.0}}
+
+
+@pytest.mark.parametrize("place", ["metrics", "residuals", "energy nlp proj"])
+def test_claims_that_are_missing_are_named(place, folder):
+    *above, last = place.split()
+    claims = json.loads((folder / "summary.json").read_text())
+    here = claims
+    for key in above:
+        here = here[key]
+    del here[last]
+    (folder / "summary.json").write_text(json.dumps(claims))
+    with pytest.raises(DataError, match=f"(?s)lacks .*{last}"):
+        check_folder(folder)
+
+
+def test_an_energy_of_rounding_size_passes_the_check(tmp_path):
+    # a slanted plane has relief, which E_prior charges
+    run = solve_pair(one_plane(), energy={"weights": {"prior": 0.0}}, **EXACT)
+    write_folder(prepare_folder(tmp_path), run, "")
+    assert run.energy["total"] < 1e-9
+    assert bad(check_folder(tmp_path)) == []
+    path = tmp_path / "summary.json"
+    claims = json.loads(path.read_text())
+    # 1e-7 is far below a pixel, but no rounding of coordinates up to 320
+    for off, expected in ((3e-11, []), (1e-7, ["energy solution proj"])):
+        claims["energy"]["solution"]["proj"] += off
+        path.write_text(json.dumps(claims))
+        wrong = bad(check_folder(tmp_path))
+        assert [name for name in wrong if name != "summary.json as written"] == expected

@@ -169,3 +169,12 @@ def test_what_is_shown_is_saved_for_other_viewers(browser, small_run, tmp_path, 
     assert depth == pytest.approx(np.median(own[:, 2]), rel=0.05)
     colours = found.colors if points else found.visual.vertex_colors
     assert np.std(colours[:, :3]) > 10
+
+
+def test_a_console_error_would_be_seen(browser):
+    browser.value("console.error('planted')")
+    browser.value("setTimeout(() => { throw new Error('thrown'); })")
+    browser.value("new Promise(done => setTimeout(done, 20))")
+    assert "planted" in browser.log[0]
+    assert "thrown" in browser.log[1]
+    browser.log.clear()

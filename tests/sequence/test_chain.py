@@ -11,7 +11,7 @@ from soup_nlp.geometry.rotation import exp
 from soup_nlp.report.chain import Link
 from soup_nlp.report.formats import write_formats
 from soup_nlp.sequence.links import chained_scales, follow, link, make_chain, number
-from soup_nlp.sequence.score import path_errors, read_path
+from soup_nlp.sequence.score import path_errors, read_path, similarity
 
 pytestmark = pytest.mark.slow
 
@@ -141,3 +141,14 @@ def test_errors_of_a_path_are_those_of_evo(tmp_path):
     (tmp_path / "bad.txt").write_text("1 2 3")
     with pytest.raises(DataError, match="TUM"):
         read_path(tmp_path / "bad.txt")
+
+
+def test_similarities_are_found_exactly():
+    rng = np.random.default_rng(3)
+    points, R = rng.normal(size=(6, 3)), exp([0.3, -0.2, 0.5])
+    scale, turn, shift = similarity(points, 2.5 * points @ R.T + [1, 2, 3])
+    assert scale == pytest.approx(2.5)
+    np.testing.assert_allclose(turn, R, atol=1e-12)
+    np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-12)
+    # a mirror image is no rotation
+    assert np.linalg.det(similarity(points * [1, 1, -1], points)[1]) == pytest.approx(1)

@@ -186,3 +186,18 @@ def test_frames_of_another_sequence_are_left_alone(tmp_path, capsys):
 def test_strides_are_checked(stride, tmp_path, capsys):
     assert main(["chain", str(tmp_path), "--stride", stride]) == 2
     assert "--stride" in capsys.readouterr().err
+
+
+def test_a_pattern_may_match_folders(tmp_path):
+    for name in ("10", "9", ".hidden", "[9]"):
+        (tmp_path / name).mkdir()
+        write_png(tmp_path / name / "x.png", IMAGE)
+        write_png(tmp_path / name / "z.png", IMAGE)
+    found = find_images(tmp_path / "*" / "x.png")
+    assert [p.parent.name for p in found] == ["9", "10", "[9]"]
+    # brackets in the name of a folder that exists are no pattern
+    assert [p.name for p in find_images(tmp_path / "[9]" / "*.png")] == ["x.png", "z.png"]
+
+
+def test_frames_of_a_scene_follow_each_other():
+    assert Frames(("a",) * 4, scene="street").pair(2)["frame"] == 2

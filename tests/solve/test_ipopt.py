@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from functools import partial
 
 import casadi as ca
@@ -238,5 +239,39 @@ def test_control_c_ends_a_solve_at_the_next_iteration(number):
 
 def test_a_nan_in_the_objective_is_a_result_too():
     stage = solve(of_one_variable(lambda x: ca.sqrt(x - 2)))
+    assert not stage.converged
+    assert np.isfinite(stage.x).all()
+
+
+def test_a_bound_beyond_the_optimum_is_active():
+    nlp = rosenbrock(2, ubx=0.5)
+    stage = solve(nlp)
+    # on x1 = 0.5 the best x2 is 0.25
+    np.testing.assert_allclose(stage.x, [0.5, 0.25], atol=1e-4)
+    assert stage.lam_x[0] == pytest.approx(1.0, rel=1e-3)
+    assert (stage.x <= 0.5 + 1e-8).all()
+
+
+def test_an_event_stops_and_keeps_the_best_iterate():
+    nlp, stop, seen = rosenbrock(10), threading.Event(), []
+
+    def listen(p: Progress) -> None:
+        seen.append(p.objective)
+        if p.iteration == 3:
+            stop.set()
+
+    stage = solve(nlp, watch=Watch(listen, stop))
+    assert stage.status == "Interrupted"
+    assert len(seen) == 4
+    assert stage.objective == min(seen)
+    assert nlp.value(stage.x) == pytest.approx(stage.objective)
+
+
+def test_a_listener_that_fails_ends_the_solve_with_its_message():
+    def listen(p: Progress) -> None:
+        raise ValueError("no more paper")
+
+    stage = solve(rosenbrock(10), watch=Watch(listen))
+    assert "no more paper" in stage.status
     assert not stage.converged
     assert np.isfinite(stage.x).all()

@@ -1,5 +1,6 @@
 """Soups solved: constraints, gauges, limits, interruption, a world whose truth is the optimum."""
 
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -34,6 +35,7 @@ from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import Solution, _near, solve_soup
 from soup_nlp.start.propose import propose
 from soup_nlp.start.views import FlowFit
+from soup_nlp.storage.progress import Watch
 
 pytestmark = pytest.mark.slow
 
@@ -279,3 +281,37 @@ def test_the_constrained_nlp_is_solved_from_the_start_without_tangent_stages(roo
     assert_constraints(solution, room.data)
     tangent = solved["unit-offset"].energy["total"]
     assert solution.energy["total"] == pytest.approx(tangent, rel=5e-3)
+
+
+def test_a_stop_before_the_start_gives_the_start(room):
+    stop = threading.Event()
+    stop.set()
+    solution = room.solve(watch=Watch(stop=stop))
+    assert solution.status == "Interrupted"
+    assert not solution.converged
+    assert_whole(solution, room)
+    assert solution.energy["total"] == pytest.approx(solution.energy_start["total"], rel=1e-3)
+
+
+def test_one_superpixel_is_solved():
+    pose, move = plane_pose(2.0, yaw=20), motion((0, 1, 0), (0.2, 0, 0))
+    pair = plane_world(pose, move, 64, 48)
+    seg = build_segmentation(np.zeros((48, 64), np.int32), pair.image_ref)
+    truth = plane_soup(pose, move, 1)
+    data = in_pixels(build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 30, 0), truth, seg)
+    solution = solve_soup(disturbed(truth, 0.05), data, WEIGHTS, form(), OPTIONS)
+    assert_constraints(solution, data)
+    assert solution.energy["total"] < 0.05 * solution.energy_start["total"]
+
+
+def test_a_better_start_is_delivered_beside_the_presolves_kkt_point(room, solved):
+    # wide smoothing raises the exact energy above that of a start that was solved with less
+    first = solved["unit-offset"].soup
+    options = OPTIONS.replace(presolve_eps=(0.3,), eps=0.3)
+    again = solve_soup(first, room.data, WEIGHTS, form(), options)
+    assert again.converged, again.status
+    assert again.stages[-1].history["inf_du"][0] < 1e-2
+    assert again.stages[-1].iterations <= 5
+    assert again.delivered == "start"
+    assert again.energy["total"] == pytest.approx(again.energy_start["total"], rel=1e-9)
+    assert_constraints(again, room.data)

@@ -12,8 +12,13 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.inputs import PriorOptions, pair_with_prior
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.geometry.superpixels import Labels, segment
+from soup_nlp.model.energy_data import build_energy_data
+from soup_nlp.model.energy_options import BENDING, EnergyOptions
+from soup_nlp.model.reweighting import Known, weighted
+from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run
 from soup_nlp.report.summary import summary
@@ -234,3 +239,60 @@ def test_the_prior_is_in_the_energy_and_in_sigma(pan, swing):
     guess = soup_nlp.solve_pair(pan.pair, prior_ref=pan.depth, **options)
     assert guess.metrics["solution"].mre < 0.1
     assert guess.confidence.share("inferred") == 1.0
+
+
+def median_in(depth: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """(N,) log of the median of every superpixel."""
+    return np.array([np.log(np.median(depth[labels == i])) for i in range(labels.max() + 1)])
+
+
+def across_steps(seg: Segmentation, depth: np.ndarray) -> float:
+    """Share of pixels whose depth is off the median of their superpixel by more than 20 %."""
+    off = np.abs(np.log(depth) - median_in(depth, seg.labels)[seg.labels])
+    return float((off > 0.2).mean())
+
+
+@pytest.mark.slow
+def test_orientation_is_held_where_the_prior_decides(pan):
+    start, given = pan.by(pan.depth)
+    pair, seg = pan.pair, pan.seg
+    data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 4, 0, True)
+    none = np.zeros(len(seg), bool)
+
+    def gain(opened: np.ndarray) -> np.ndarray:
+        prior = given.log_depth, opened, given.error
+        known = Known(start.component, none, start.variance, 1.0, None, none, prior)
+        found = weighted(data, start.soup, known, EnergyOptions())
+        assert (found.depth_weight > 0).any() == opened.any()
+        return found.orient_weight / data.orient_weight
+
+    np.testing.assert_allclose(gain(given.opened), BENDING["orient"] * len(seg) / 1000)
+    # where the flow determines the slopes nothing changes
+    np.testing.assert_array_equal(gain(0 * given.opened), 1.0)
+
+
+@pytest.mark.slow
+def test_superpixels_end_at_steps_of_an_unconfirmed_prior(pan, swing):
+    def cut(seen: Seen, prior: np.ndarray | None) -> Segmentation:
+        raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": 80}}
+        return prepare(make_problem(raw), pair=replace(seen.pair, depth_prior=prior)).segmentation
+
+    before, after = cut(pan, None), cut(pan, pan.depth)
+    assert across_steps(after, pan.depth) < 0.5 * across_steps(before, pan.depth)
+    wrong = cut(pan, np.exp(WAVE))
+    np.testing.assert_array_equal(wrong.labels, before.labels)
+    # the flow has ended them where it confirms the prior
+    np.testing.assert_array_equal(cut(swing, swing.depth).labels, cut(swing, None).labels)
+
+
+@pytest.mark.slow
+def test_evidence_for_a_prior_is_independent_of_superpixel_count(swing, monkeypatch):
+    monkeypatch.setattr(pipeline_case, "PIECES", 80)
+    numbers = []
+    for count in (80, 120):
+        raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": count}}
+        pair = replace(swing.pair, depth_prior=swing.depth * np.exp(0.2 * WAVE))
+        given = prepare(make_problem(raw), pair=pair).given
+        numbers.append(given.as_dict() | {"held": None})
+        assert len(given.from_prior) > 0.9 * count
+    assert numbers[0] == numbers[1]

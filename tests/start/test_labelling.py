@@ -22,6 +22,7 @@ from soup_nlp.start.labelling import (
     price_of_motion,
     smooth,
 )
+from soup_nlp.start.propose import propose
 
 
 @pytest.fixture(scope="module")
@@ -144,3 +145,39 @@ def test_a_random_walk_finds_the_surface_along_edges_of_like_colour():
     share = harmonic(likeness(edge), edge, np.eye(8)[:, [0, 7]], seen)
     np.testing.assert_allclose(share.sum(axis=1), 1, atol=1e-9)
     assert (np.diff(share[:, 0]) < 0).all()
+
+
+@pytest.mark.slow
+def test_what_is_not_seen_has_no_motion_of_its_own(world):
+    """Superpixels of the wedge without flow have its motion, and continue its surface."""
+    pair, flow, component, (room, wedge) = world
+    seg = flow.seg
+    inner = component == 1
+    ends = seg.pairs[seg.across(component)]
+    inner[ends.ravel()] = False
+    hidden = np.flatnonzero(inner)[:3]
+    assert len(hidden) == 3
+    uv = pair.flow.uv + np.where(np.isin(seg.labels, hidden)[..., None], 7.0, 0.0)
+    confidence = np.where(np.isin(seg.labels, hidden), 0.0, 1.0)
+    blind = fitted(pair.with_flow(Flow(uv.astype(np.float32), confidence, "test")), seg)
+    found = labelled(blind, [room, wedge], connected_labels(blind.jump < 1, blind.seg))
+    assert len(found.motions) == 2
+    assert len(np.unique(found.label[inner])) == 1
+    start = propose(blind)
+    assert start.borrowed[hidden].all()
+    assert not start.wrong[hidden].any()
+    z, true = start.soup.depth_at(blind.views.anchor), propose(flow).soup
+    ratio = z[hidden] / true.depth_at(blind.views.anchor)[hidden]
+    assert np.abs(np.log(ratio)).max() < 0.1
+
+
+@pytest.mark.slow
+def test_a_camera_at_rest_starts_near_its_flow():
+    """The room has no parallax; the depths that it borrows must not throw it across the image."""
+    pair, seg, _ = corner(np.eye(4), WEDGE, count=100)
+    start = propose(fitted(pair, seg))
+    anchor = camera.rays(pair.K_ref, seg.anchors)
+    uv = camera.project(pair.K_next, start.soup.moved(start.soup.points(anchor)))
+    shift = np.linalg.norm(uv - seg.anchors, axis=1)[start.borrowed]
+    assert len(shift) > 20
+    assert np.median(shift) < 0.1

@@ -12,6 +12,8 @@ from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
+from soup_nlp.model import oracle
+from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.start.components import TIES
 from soup_nlp.start.occlusion import LEAST_ORDER, covering, vote
@@ -165,3 +167,39 @@ def test_the_nlp_keeps_the_order_and_is_unsure_of_it(covers):
     assert np.median(step) > 0.2
     assert done.energy["order"] >= 0
     assert (done.reconstruction.sigma_ref > MOST_SIGMA).all()
+
+
+@pytest.mark.slow
+def test_what_moves_before_a_resting_camera_is_a_part_without_an_order_too():
+    pair, seg = sliding(True)
+    moves = (pair.flow.uv[..., 0] != 0).ravel()[np.unique(seg.labels, return_index=True)[1]]
+    start = begun(True)
+    assert start.at_rest
+    assert not start.component.any()
+    np.testing.assert_array_equal(start.part > 0, moves)
+    assert len(np.unique(start.part)) == 3
+    # a piece of flow that is hardly usable need not move
+    left = np.arange(WIDTH) < WIDTH / 2
+    doubtful = np.where((pair.flow.uv[..., 0] != 0) & left, 0.3, 1.0)
+    pair = pair.with_flow(Flow(pair.flow.uv, doubtful))
+    start = propose(fitted(pair, seg))
+    assert start.at_rest
+    np.testing.assert_array_equal(start.part > 0, moves & (seg.anchors[:, 0] > WIDTH / 2))
+
+
+@pytest.mark.slow
+def test_an_image_without_discontinuities_keeps_its_start(swing):
+    pair, seg = swing
+    still = pair.with_flow(Flow(0 * pair.flow.uv, pair.flow.confidence, "zero"))
+    start, same = propose(fitted(still, seg)), ordered(seg, still)
+    np.testing.assert_array_equal(same.soup.distance, start.soup.distance)
+    assert same.order is None
+
+
+@pytest.mark.slow
+def test_without_its_weight_nothing_is_placed_in_order():
+    problem, pair = made(True, "energy.weights.order=0")
+    case = prepare(problem, pair=pair)
+    assert case.start.order is None
+    assert not case.data.order_weight.any()
+    assert "order" not in oracle.energy(case.soup, case.data, case.weights)

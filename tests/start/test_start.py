@@ -256,3 +256,55 @@ def test_too_few_usable_pixels_are_an_error(room, usable):
     assert str(usable) in str(caught.value)
     # what a user of two frames can do: with the default flow there is no file to look at
     assert "try: two frames of one scene" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_noise_makes_it_worse_but_not_wild(room):
+    """Half a pixel of noise raises the errors, but to a limit."""
+    pair, seg, pure = room
+    noise = np.random.default_rng(99).normal(0, 0.5, pair.flow.uv.shape)
+    start = propose(fitted(with_uv(pair, pair.flow.uv + noise), seg))
+    assert_usable(start, seg)
+    e = compare(start, pair, seg, pure)
+    assert 1e-3 < np.median(e.depth()) < 0.05
+    assert 0.01 < np.median(e.direction) < 5
+    assert 0.3 < np.median(start.error) < 1.0
+
+
+@pytest.mark.slow
+def test_outliers_of_full_confidence_are_outvoted(room):
+    pair, seg, pure = room
+    rng = np.random.default_rng(99)
+    bad = rng.random(pair.size) < 0.1
+    uv = np.where(
+        bad[..., None], pair.flow.uv + rng.normal(0, 20, pair.flow.uv.shape), pair.flow.uv
+    )
+    start = propose(fitted(with_uv(pair, uv), seg))
+    assert_usable(start, seg)
+    e = compare(start, pair, seg, pure)
+    assert np.median(e.rotation) < 0.1
+    assert np.median(e.depth()) < 0.02
+
+
+@pytest.mark.slow
+def test_two_cameras_with_different_intrinsics(room):
+    pair, seg, pure = room
+    K_next = camera.intrinsics(230.0, 210.0, 80.0, 60.0)
+    grid = camera.pixel_grid(*pair.size)
+    target = camera.project(K_next, camera.rays(CORNER_K, grid + pair.flow.uv))
+    start = propose(FlowFit.of(seg, Flow(target - grid), CORNER_K, K_next))
+    e = compare(start, pair, seg, pure)
+    assert e.rotation.max() < 1e-5
+    assert e.depth().max() < 2e-3
+
+
+@pytest.mark.slow
+def test_the_start_is_a_function_of_its_seed():
+    pair, seg, _ = corner(wedge=WEDGE)
+    noise = np.random.default_rng(99).normal(0, 0.3, pair.flow.uv.shape)
+    noisy = with_uv(pair, pair.flow.uv + noise)
+    one, two, other = (propose(fitted(noisy, seg, seed=seed)) for seed in (3, 3, 4))
+    for f in fields(one.soup):
+        np.testing.assert_array_equal(getattr(one.soup, f.name), getattr(two.soup, f.name))
+    np.testing.assert_array_equal(one.motion, two.motion)
+    assert (one.soup.lam != other.soup.lam).any()

@@ -135,3 +135,22 @@ def test_a_worker_whose_parent_was_killed_before_it_began_ends():
     # the pipe is open until both processes have ended
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr) == ("", "")
+
+
+SCRIPT = """
+from functools import partial
+from soup_nlp.storage.each import each
+
+def square(number):
+    return {"square": number * number}
+
+print(sorted(row["square"] for _, row in each({str(k): partial(square, k) for k in range(3)}, 2)))
+"""
+
+
+@pytest.mark.slow
+def test_a_script_needs_no_guard(tmp_path):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    words = [sys.executable, str(tmp_path / "script.py")]
+    ended = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert ended.stdout == "[0, 1, 4]\n"

@@ -17,6 +17,7 @@ from kill_table import full_disks, table
 
 from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
+from soup_nlp.report.folder import write_failure
 from soup_nlp.storage.folders import (
     SUMS,
     UNFINISHED,
@@ -402,3 +403,68 @@ def test_kills_and_full_disks_leave_whole_folders(rows_of):
         # SIGKILL leaves its temporary folder
         assert not row.get("left") or row.get("killed"), row
         assert row.get("earlier kept") or row.get("disk") != "taken", row
+
+
+LIMITED = """
+import resource, sys
+from soup_nlp.cli.main import main
+from soup_nlp.errors import DataError
+from soup_nlp.storage.folders import staged
+from soup_nlp.storage.files import write_json
+from soup_nlp.storage.store import write_h5
+import numpy as np
+resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
+try:
+    with staged(sys.argv[1], True) as new:
+        write_json(new / "small.json", {})
+        write_h5(new / "r.h5", {"x": np.random.default_rng(0).random(20_000)}, {})
+except DataError as error:
+    print(error)
+    sys.exit(2)
+"""
+
+
+def test_sha256sum_reads_the_list(tmp_path):
+    write(tmp_path / "out", a="1", **{"b/c": "2"})
+    check = partial(subprocess.run, ["sha256sum", "--strict", "-c", SUMS], cwd=tmp_path / "out")
+    assert check().returncode == 0
+    (tmp_path / "out" / "b" / "c").write_text("3")
+    assert check().returncode == 1
+
+
+@pytest.mark.parametrize("name", ["link", "real", "."])
+def test_a_folder_may_be_a_link_or_the_working_folder(name, tmp_path, monkeypatch):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    monkeypatch.chdir(tmp_path / "real" if name == "." else tmp_path)
+    for text in "12":
+        write(claim(name, ["a"]), a=text)
+    assert content(tmp_path / "real") == {"a": "2"}
+    if name == ".":
+        assert Path.cwd() == tmp_path / "real"
+        assert os.listdir() == sorted(["a", SUMS], key=os.listdir().index)
+    assert (tmp_path / "link").is_symlink()
+
+
+def test_a_failure_log_overwrites_only_where_allowed(tmp_path):
+    log, missing = tmp_path / "failed.log", tmp_path / "ipopt.log"
+    log.write_text("mine")
+    with pytest.raises(DataError, match="would be overwritten"):
+        write_failure(tmp_path, "failed\n", missing)
+    assert log.read_text() == "mine"
+    write_failure(tmp_path, "failed\n", missing, overwrite=True)
+    assert content(tmp_path) == {"failed.log": "failed\n"}
+
+
+@pytest.mark.slow
+def test_a_file_that_cannot_be_written_ends_in_an_error(tmp_path):
+    target = tmp_path / "out"
+    write(target, a="1")
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, str(target)], capture_output=True, text=True
+    )
+    assert done.returncode == 2, done.stderr
+    assert "cannot be written" in done.stdout
+    assert f"where: {target / 'r.h5'}\n" in done.stdout
+    assert content(target) == {"a": "1"}
+    assert os.listdir(tmp_path) == ["out"]
