@@ -48,10 +48,9 @@ TIES = (
 contact below: it stands on its lower neighbours. outline: it touches its neighbours. nothing: it
 has no neighbour with a scale. ground: it would lie below the ground. fixed in the image: it stands
 still there, though the camera moves, and is placed by its outline. given depth: a depth prior gives
-it. occlusion: it covers its background, and is placed in front of it by the least step that
-is usual. too
-fast: contact is probably wrong, because it would make the component move much farther than the
-scene."""
+it. occlusion: it covers its background, and is placed in front of it by the least step that is
+usual. too fast: contact is probably wrong, because it would make the component move much farther
+than the scene."""
 FIXED, TOO_FAST = TIES.index("fixed in the image"), TIES.index("too fast")
 
 

@@ -63,8 +63,8 @@ class Start:
             components that start at a constant depth, each superpixel with a motion of its own. If
             the rigid part is small or has no parallax, or the camera is at rest, the whole image is
             one such component.
-        unexplained: (N,) True where nothing tells the depth: the motion leaves a large error,
-            or because a region bends although its flow jumps, see `torn`.
+        unexplained: (N,) True where nothing tells the depth: the motion leaves a large error, or a
+            region bends although its flow jumps, see `torn`.
         wrong: (N,) True where the motion does not explain the flow, which then counts as
             wrong.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
