@@ -24,7 +24,7 @@ from typer.core import TyperGroup
 
 from soup_nlp.errors import ConfigError, SoupError, StoppedError, printable
 from soup_nlp.storage.progress import interruptible
-from soup_nlp.storage.system import SIGNALS, prepare_streams, refusal
+from soup_nlp.storage.system import SIGNALS, keep_memory, prepare_streams, refusal
 from soup_nlp.storage.versions import __version__, versions
 
 BUG = 70
@@ -95,6 +95,7 @@ COMMANDS: Mapping[str, str] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     prepare_streams()
+    keep_memory()
     if argv is None:
         # pictures go to files, so that the backend of the user does not matter
         os.environ["MPLBACKEND"] = "agg"

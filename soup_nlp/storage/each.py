@@ -1,6 +1,7 @@
 """Many jobs: here, in worker processes of this machine (loky), or on a cluster (Dask)."""
 
 import logging
+import multiprocessing
 import os
 import re
 import resource
@@ -19,7 +20,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 
 from soup_nlp.errors import DataError, optional
 from soup_nlp.storage.files import plain
-from soup_nlp.storage.system import deferred_signals, end_with_parent, handling
+from soup_nlp.storage.system import deferred_signals, end_with_parent, handling, keep_memory
 
 Row = dict[str, Any]
 Work = Callable[[], Row]
@@ -100,6 +101,7 @@ def peak_bytes() -> int:
 
 def _prepare_worker(parent: int) -> None:
     end_with_parent(parent)
+    keep_memory()
     # the parent handles Ctrl-C, and interrupts its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -179,6 +181,8 @@ def _in_processes(
 
 def _alone(work: Work) -> Row:
     """The row of a job in a process of its own, whose memory ends with it."""
+    # Dask's workers are daemons, which multiprocessing lets have no children; these end with them
+    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
     return next(_in_processes({"": work}, 1, True, None))[1]
 
 

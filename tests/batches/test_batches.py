@@ -265,8 +265,9 @@ def cluster(tmp_path):
         while not place.is_file() or not place.stat().st_size:
             time.sleep(0.1)
         address = json.loads(place.read_text())["address"]
-        for k in range(2):
-            words = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--no-nanny"]
+        # the second one as docs/cluster.md starts it: a nanny's worker is a daemon
+        for k, nanny in enumerate(("--no-nanny", "--nanny")):
+            words = [sys.executable, "-m", "distributed.cli.dask_worker", address, nanny]
             words += ["--nthreads", "1", "--no-dashboard", "--local-directory", f"{tmp_path}/{k}"]
             started.append(subprocess.Popen(words, cwd=tmp_path, **QUIET))
         yield address, started
