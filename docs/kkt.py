@@ -14,7 +14,7 @@ from scipy.sparse.linalg import LinearOperator, SuperLU, onenormest, splu
 import soup_nlp
 from soup_nlp.export.verify import active, least_squares_multipliers
 
-SIZES = 50, 100, 150
+SIZES = 100, 250, 500
 SHOWN = 100
 """Superpixels of the patterns."""
 

@@ -1,10 +1,10 @@
 """Ipopt's stages before the constrained NLP: less smoothing, then ever more exact Hessians.
 
 The program is the whole energy in nine coordinates per superpixel, with SO(3) and unit normals by
-construction. The first stages use the majorant Hessian (theta = 0), whose model lies above every
-norm: full steps descend, and no inertia has to be corrected. The next ones leave out a growing
-share theta of the curvature along each residual, which the exact Hessian does not have either. The
-exact Hessian ends the sequence, near enough to its minimum to converge fast.
+construction. The first stages use the majorant Hessian (theta = 0), a model above every norm of a
+linear residual, so that no inertia has to be corrected. The next ones leave out a growing share
+theta of the curvature along each residual, which the exact Hessian does not have either. The exact
+Hessian ends the sequence, near enough to its minimum to converge fast.
 """
 
 from __future__ import annotations

@@ -9,6 +9,8 @@ import pytest
 from helpers_model import PAPER, Tiny
 from scipy import sparse
 
+from soup_nlp.cli import results
+from soup_nlp.cli.main import main
 from soup_nlp.export.verify import Residuals
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.programs import build_matrix_nlp
@@ -125,3 +127,16 @@ def test_a_stored_result_is_held_to_the_limits_of_a_solve(kind, limit):
         row = rows[f"solution {kind}"]
         assert row.found == pytest.approx(factor * limit, rel=1e-3)
         assert (row.found <= row.most) == good
+
+
+def test_the_exit_code_of_check_is_the_verdict_on_a_sol(monkeypatch):
+    tiny = Tiny()
+    soup = tiny.soup.normalised(tiny.data.share).retracted()
+    problem = SimpleNamespace(formulation=SimpleNamespace(min_facing=-1.0))
+    run = SimpleNamespace(answer=soup, data=tiny.data, problem=problem, metrics={})
+    for off, dual, code in ((0.9e-6, 0.9e-3, 0), (0.9e-6, 1.1e-3, 3), (1.1e-6, 0.9e-3, 1)):
+        found = Residuals(off, dual, 0.0, "", lam_x=(), lam_g=())
+        rows = {"rows": np.array([0.0, off])}
+        imported = SimpleNamespace(run=run, violations=rows, residuals=found)
+        monkeypatch.setattr(results, "import_sol", lambda *_, answer=imported: answer)
+        assert main(["check", "soup.sol"]) == code

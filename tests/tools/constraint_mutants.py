@@ -97,6 +97,10 @@ WIDENED = [
     Mutant("sign of the rim's multipliers", KKT, "= -rim / facing", "= rim / facing"),
     Mutant("slack of verification", "export/verify.py", "SLACK = 10.0", "SLACK = 1000.0"),
     Mutant("feasible to 1e-3", "export/verify.py", "FEASIBLE = 1e-6", "FEASIBLE = 1e-3"),
+    Mutant("check of a .sol: to 1e-3", "export/foreign.py", "k, v, FEASIBLE, False",
+           "k, v, 1e-3, False"),
+    Mutant("check of a .sol: feasible is enough", "cli/results.py", "NOT_STATIONARY = 3",
+           "NOT_STATIONARY = 0"),
 ]  # fmt: skip
 MUTANTS = [
     *((mutant, ROWS_AND_BOUNDS) for mutant in DELETED),
