@@ -15,8 +15,8 @@ from soup_nlp.errors import ModelError
 from soup_nlp.model.kernel import Group, Hessian, Pattern, hessian_entries, jacobian_entries
 from soup_nlp.model.operations import Vectors
 
-Terms = tuple[int, list[Vectors]]
-"""Size of a vector, and functions of kernels over their tables, whose entries it is the sum of."""
+Terms = tuple[int, list[Vectors], NDArray[np.integer]]
+"""Size of a vector, functions of kernels over their tables, and where it adds up their entries."""
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,14 @@ class NLP:
         theta = self.thetas() if theta is None else theta
         given = _vector("x", x, self.nx), _vector("theta", theta, len(self.theta))
         lam_g = lam_g if lam_g is None else _vector("lam_g", lam_g, self.ng)
-        # one entry more, for what fills the last block
-        size, summands = terms
-        out = np.zeros(size + 1)
+        size, summands, target = terms
+        entries, at = np.empty(len(target)), 0
         for term in summands:
-            term.add(out, *given, lam_f, lam_g)
-        return out[:-1]
+            end = at + term.entries
+            term.evaluate(entries[at:end], *given, lam_f, lam_g)
+            at = end
+        # the last one is of what fills the last blocks
+        return np.asarray(np.bincount(target, entries, size + 1)[:size], float)
 
     @cached_property
     def _first(self) -> Mapping[str, Terms]:
@@ -129,11 +131,15 @@ class NLP:
     ) -> Mapping[str, Terms]:
         """Terms of sums, of functions of every group; `places` has the size of every sum, and where
         (E, k) the entries of every group are added."""
-        out: dict[str, Terms] = {key: (size, []) for key, (size, _) in places.items()}
-        for k, (group, own) in enumerate(zip(self.groups, functions)):
-            for key, f in own.items():
-                size, targets = places[key]
-                out[key][1].append(Vectors(f, group, targets[k], size))
+        out = dict[str, Terms]()
+        for key, (size, targets) in places.items():
+            target: list[NDArray[np.integer]] = [np.zeros(0, np.int64)]
+            summands = list[Vectors]()
+            for group, own, at in zip(self.groups, functions, targets):
+                if key in own:
+                    summands.append(Vectors(own[key], group))
+                    target.append(summands[-1].ordered(at, size))
+            out[key] = size, summands, np.concatenate(target)
         return out
 
     def evaluated(self) -> Self:

@@ -111,25 +111,21 @@ _of_large = lru_cache(maxsize=16)(_instructions)
 
 # --- kernels summed over their table --------------------------------------------------------------
 
-BLOCK = 2048
-"""Elements of a block: more cost fewer calls, fewer fit into the cache."""
+BLOCK = 4096
+"""Largest number of elements of a block: more cost fewer calls, fewer fit into the cache."""
 
 
 class Vectors:
-    """One function of a kernel, summed over the kernel's table."""
+    """One function of a kernel, for every element of the kernel's table.
 
-    def __init__(
-        self, function: ca.Function, group: Group, target: NDArray[np.integer], sums: int
-    ) -> None:
-        """Translate the function.
+    Attributes:
+        entries: Number of its results, those of elements that fill the last block included.
+    """
 
-        Args:
-            function: (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,).
-            group: Kernel and table of E elements.
-            target: (E, k) where each entry is added.
-            sums: Size of the vector; what pads the last block is added behind it.
-        """
-        size = max(1, min(BLOCK, len(group)))
+    def __init__(self, function: ca.Function, group: Group) -> None:
+        """Translate a function (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,)."""
+        # blocks of equal size
+        size = max(1, -(-len(group) // -(-len(group) // BLOCK)))
         # what a function does not take has no rows
         count = [function.nnz_in(i) if i < function.n_in() else 0 for i in range(5)]
         self._x, self._data = np.empty((count[0], size)), np.empty((count[1], size))
@@ -137,8 +133,14 @@ class Vectors:
         self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
         self._function = function
         tables = (_in_blocks(t, size, t[-1:]) for t in (group.index, group.data, group.rows))
-        behind = np.full((1, target.shape[1]), sums)
-        self._blocks = list(zip(*tables, _in_blocks(target, size, behind)))
+        self._blocks = list(zip(*tables))
+        self.entries = len(self._blocks) * self._out.size
+
+    def ordered(self, target: NDArray[np.integer], behind: int) -> NDArray[np.integer]:
+        """Numbers (E, k) of the elements' entries in the order of `evaluate`; `behind` for what
+        fills the last block."""
+        last = np.full((1, target.shape[1]), behind)
+        return _in_blocks(target, self._out.shape[1], last).ravel()
 
     @cached_property
     def _calls(self) -> list[tuple[Callable[..., Any], Any]]:
@@ -168,18 +170,20 @@ class Vectors:
                 calls.append((known.numpy, (*given, work[to[0]])))
         return calls
 
-    def add(self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None) -> None:
-        """Add the elements' entries at x (nx,) to `out`; multipliers are those of Hessians."""
+    def evaluate(
+        self, out: Float, x: Float, theta: Float, lam_f: float, lam_g: Float | None
+    ) -> None:
+        """Write the entries at x (nx,) into `out` (entries,); multipliers are those of Hessians."""
         self._theta[:], self._lam_f[0] = theta[: len(self._theta)], lam_f
         with np.errstate(all="ignore"):
-            for index, data, rows, target in self._blocks:
+            for part, (index, data, rows) in zip(out.reshape(-1, *self._out.shape), self._blocks):
                 np.take(x, index, out=self._x)
                 self._data[:] = data
                 if lam_g is not None:
                     np.take(lam_g, rows, out=self._lam_c)
                 for call, given in self._calls:
                     call(*given)
-                out += np.bincount(target.ravel(), self._out.ravel(), len(out))
+                part[:] = self._out
 
 
 def _in_blocks(table: NDArray[Any], width: int, last: NDArray[Any]) -> NDArray[Any]:
