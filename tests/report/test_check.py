@@ -115,6 +115,17 @@ def test_forged_arrays_are_recomputed(place, folder):
         assert re.match(r"25 of 25 beyond .*; worst superpixels \d+ \(2\.0e-02\)", so3.note)
 
 
+@pytest.mark.parametrize(("off", "good"), [(1e-10, True), (1e-7, False)])
+def test_numbers_agree_but_for_rounding(off, good, folder):
+    claims = json.loads((folder / "summary.json").read_text())
+    claims["energy"]["solution"]["total"] *= 1 + off
+    claims["metrics"]["solution"]["mre"] *= 1 + off
+    (folder / "summary.json").write_text(json.dumps(claims))
+    relist(folder)
+    found = {"energy solution total", "mre solution"} & set(bad(check_folder(folder)))
+    assert len(found) == (0 if good else 2)
+
+
 @pytest.mark.parametrize("kept", [[], ["depth_ref.png"]])
 def test_a_folder_without_a_valid_list_is_noticed(kept, folder):
     write_sums(folder, Sums({name: digest_of(folder / name) for name in kept}))

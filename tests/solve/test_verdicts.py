@@ -11,7 +11,9 @@ from scipy import sparse
 
 from soup_nlp.cli import results
 from soup_nlp.cli.main import main
+from soup_nlp.export.compare import problem_task
 from soup_nlp.export.verify import Residuals
+from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.report.check import Stored, _constraints
@@ -129,14 +131,35 @@ def test_a_stored_result_is_held_to_the_limits_of_a_solve(kind, limit):
         assert (row.found <= row.most) == good
 
 
-def test_the_exit_code_of_check_is_the_verdict_on_a_sol(monkeypatch):
+@pytest.mark.parametrize("place", ["rows", "det"])
+def test_the_exit_code_of_check_is_the_verdict_on_a_sol(place, monkeypatch):
     tiny = Tiny()
     soup = tiny.soup.normalised(tiny.data.share).retracted()
     problem = SimpleNamespace(formulation=SimpleNamespace(min_facing=-1.0))
-    run = SimpleNamespace(answer=soup, data=tiny.data, problem=problem, metrics={})
     for off, dual, code in ((0.9e-6, 0.9e-3, 0), (0.9e-6, 1.1e-3, 3), (1.1e-6, 0.9e-3, 1)):
-        found = Residuals(off, dual, 0.0, "", lam_x=(), lam_g=())
-        rows = {"rows": np.array([0.0, off])}
+        # det R is off by three times a relative change of R, R'R by twice
+        point = replace(soup, R=soup.R * (1 + off / 3)) if place == "det" else soup
+        run = SimpleNamespace(answer=point, data=tiny.data, problem=problem, metrics={})
+        found = Residuals(0.0, dual, 0.0, "", lam_x=(), lam_g=())
+        rows = {"rows": np.array([0.0, off if place == "rows" else 0.0])}
         imported = SimpleNamespace(run=run, violations=rows, residuals=found)
         monkeypatch.setattr(results, "import_sol", lambda *_, answer=imported: answer)
         assert main(["check", "soup.sol"]) == code
+
+
+def test_a_verified_energy_is_at_most_a_thousandth_above_the_start():
+    class Case(SimpleNamespace):
+        def __len__(self):
+            return 4
+
+    tiny = Tiny()
+    case = Case(
+        formulation=lambda **changes: FORM.replace(**changes),
+        start=SimpleNamespace(soup=tiny.soup),
+        data=tiny.data,
+        weights=PAPER,
+        problem=SimpleNamespace(name="tiny", identity=lambda: "0"),
+    )
+    label, _ = problem_task(case, "matrix")
+    start = oracle.energy(tiny.soup, tiny.data, PAPER)["total"]
+    assert label["energy_limit"] == pytest.approx(1.001 * start)

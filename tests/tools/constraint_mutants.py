@@ -99,6 +99,9 @@ WIDENED = [
     Mutant("feasible to 1e-3", "export/verify.py", "FEASIBLE = 1e-6", "FEASIBLE = 1e-3"),
     Mutant("check of a .sol: to 1e-3", "export/foreign.py", "k, v, FEASIBLE, False",
            "k, v, 1e-3, False"),
+    Mutant("check of a .sol: a soup to 1e-3", "export/foreign.py", "limit=FEASIBLE", "limit=1e-3"),
+    Mutant("energy above the start", "export/verify.py", "ENERGY_SLACK = 1e-3",
+           "ENERGY_SLACK = 1.0"),
     Mutant("check of a .sol: feasible is enough", "cli/results.py", "NOT_STATIONARY = 3",
            "NOT_STATIONARY = 0"),
 ]  # fmt: skip
