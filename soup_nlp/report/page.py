@@ -44,6 +44,8 @@ SHOWN = 3
 objects."""
 SIDE, MANY = 1600, 4
 """Larger side of a picture, pixels; number of pairs above which pictures are smaller."""
+MOST = 100
+"""Largest number of pairs on a page; of a longer chain so many across all of it."""
 PIXELS = 600_000, 4_000_000
 """Largest number of shown pixels of a pair, and of all pairs; larger images are subsampled."""
 
@@ -128,15 +130,16 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
     """What page.js reads, in the shown unit and the first camera's axes.
 
     Returns:
-        "pairs": see `make_pair`. "names": of the frames. "modes": names and words of the colours.
-        "cameras": (4, 4) world_from_camera of every frame; of a pair whose surfaces bend, the
+        "pairs": see `make_pair`. "names": of both frames of every pair. "modes": names and words of
+        the colours. "cameras": (4, 4) world_from_camera of both; of a pair whose surfaces bend, the
         identity. "paths": colour and points of what moves and of the camera. "middle", "far",
         "deepest": median depth, depth beyond which points are hidden at first, largest depth.
         "origins": words for what gives a component its scale. "kinds": words for kinds of depth.
     """
-    metre, count = chain.metre or 1.0, len(chain.pairs)
+    metre, count = chain.metre or 1.0, min(len(chain.pairs), MOST)
+    at = np.linspace(0, len(chain.pairs) - 1, count).astype(int).tolist()
     pairs = []
-    for k in range(count):
+    for k in at:
         shown = (drawn or pictures(chain, k)).items()
         packed = {
             name: _packed(value) if isinstance(value, np.ndarray) else value
@@ -148,12 +151,14 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
     far, deepest = _far(z)
     still = chain.single and chain.pairs[0].bending
     poses = [STILL] * len(chain) if still else chain.world_from_camera
+    cameras = [replace(pose, t=metre * pose.t).matrix for pose in poses]
     names = [str(x).rpartition("/")[2] for x in chain.summary.get("sources", ())]
+    names = names or ["reference frame", "next frame"]
     return {
         "pairs": pairs,
-        "names": names or ["reference frame", "next frame"],
+        "names": [names[k : k + 2] for k in at],
         "modes": [[n, word] for n, word in MODES.items() if n in pairs[0]["pictures"]],
-        "cameras": [replace(pose, t=metre * pose.t).matrix for pose in poses],
+        "cameras": [cameras[k : k + 2] for k in at],
         "paths": _paths(chain, metre),
         "middle": float(np.median(z)) if z.size else 1.0,
         "far": far,

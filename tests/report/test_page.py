@@ -81,7 +81,7 @@ def test_the_page_is_one_file_that_fetches_nothing(text):
 def test_planes_and_motions_rebuild_both_frames(text, small_run):
     """The data of the page reproduce the reconstruction."""
     data, run = data_of(text), small_run
-    s, pose_next = data["pairs"][0], np.array(data["cameras"][1])
+    s, pose_next = data["pairs"][0], np.array(data["cameras"][0][1])
     scale, n = run.metrics["solution"].scale, len(run.soup)
     labels = unpack(s["labels"], "<u2", run.segmentation.labels.shape)
     np.testing.assert_array_equal(labels, run.segmentation.labels)

@@ -7,6 +7,7 @@ import pytest
 from helpers_result import toy_pairs
 
 from soup_nlp.config.problem import make_problem
+from soup_nlp.report import page as report_page
 from soup_nlp.report import pairs as stored
 from soup_nlp.report.chain import NEAR, Lazy
 from soup_nlp.report.result import Result
@@ -33,7 +34,7 @@ def test_items_are_made_when_they_are_needed_and_few_stay():
 
 
 @pytest.mark.slow
-def test_a_long_chain_reads_few_pairs_at_once(tmp_path):
+def test_a_long_chain_reads_few_pairs_at_once(tmp_path, monkeypatch):
     first, count, alive, most = toy_pairs()[0], 8, 0, 0
 
     class Counted(Result):
@@ -52,7 +53,13 @@ def test_a_long_chain_reads_few_pairs_at_once(tmp_path):
     sources = [f"{k}.png" for k in range(count + 1)]
     many = write_chain(tmp_path, make_chain([first] * count), "toy", sources)
     np.testing.assert_allclose(lazy.scales, many.scales)
-    assert '"6.png", "7.png", "8.png"]' in (tmp_path / "report.html").read_text()
+    assert '["6.png", "7.png"], ["7.png", "8.png"]]' in (tmp_path / "report.html").read_text()
+    # a page does not grow with the number of pairs
+    monkeypatch.setattr(report_page, "MOST", 3)
+    scene = report_page.make_scene(many)
+    assert scene["names"] == [["0.png", "1.png"], ["3.png", "4.png"], ["7.png", "8.png"]]
+    ends = [many.world_from_camera[k].matrix for k in (3, 4)]
+    np.testing.assert_allclose(scene["cameras"][1], ends)
 
 
 def test_a_result_that_another_run_left_is_not_that_of_a_row(tmp_path: Path):

@@ -274,7 +274,7 @@ async function colour(part) {
 const waiting = [], parts = [];
 let now = null, mode = data.modes[0][0], held = false;
 const load = async (k) => { waiting[k] ??= makePart(k); parts[k] = await waiting[k]; await colour(parts[k]); return parts[k]; };
-const place = (k) => (held ? new THREE.Matrix4() : matrix(data.cameras[k]));
+const place = (k, frame = 0) => (held ? new THREE.Matrix4() : matrix(data.cameras[k][frame]));
 const cameras = new THREE.Group(), paths = new THREE.Group();
 const cameraRef = frustum(0x6fb7ff), cameraNext = frustum(0xffa94d);
 cameras.add(cameraRef, cameraNext);
@@ -298,7 +298,7 @@ function arrange() {
     part.uniforms.motion.value = held ? part.raw : part.home;
   }
   cameraRef.matrix.copy(place(now.k));
-  cameraNext.matrix.copy(place(now.k + 1));
+  cameraNext.matrix.copy(place(now.k, 1));
   paths.visible = $("paths").checked && !held;
   cameras.visible = $("cameras").checked;
   draw();
@@ -308,7 +308,7 @@ async function setTime(value) {
   const t = Math.min(Math.max(Number(value) || 0, 0), last), k = Math.min(Math.floor(t), last - 1);
   $("time").value = t;
   const share = Math.round(100 * pairs[k].drawn);
-  const names = data.names.slice(Math.floor(t), Math.ceil(t) + 1).join(" to ");
+  const names = data.names[k].slice(Math.floor(t - k), Math.ceil(t - k) + 1).join(" to ");
   $("now").textContent = `${names}, time ${Math.round(100 * t) / 100} of ${last}; ${share} % drawn`;
   if (now?.k !== k) {
     const part = await load(k);
@@ -462,7 +462,7 @@ function tell(p) {
   const i = now.labels[p], sigma = now.sigma[p], own = now.component[i];
   const spread = sigma < 255 ? `${(sigma / 5.1).toFixed(sigma < 26 ? 1 : 0)} %` : "50 % or unknown";
   const part = own ? `component ${own}, ${data.origins[now.tie[i]]}` : "the static scene";
-  $("picked").textContent = (last > 1 ? `${data.names[now.k]}, ` : "")
+  $("picked").textContent = (last > 1 ? `${data.names[now.k][0]}, ` : "")
     + `pixel (${(p % now.w) * now.step}, ${Math.floor(p / now.w) * now.step}): depth`
     + ` ${now.position.getZ(p).toPrecision(4)} ${data.unit}, sigma ${spread}; superpixel ${i}, ${part}; ${data.kinds[now.kind[p]]}`;
 }
