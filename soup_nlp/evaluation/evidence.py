@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import special
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
@@ -25,24 +25,19 @@ from soup_nlp.start.bending import (
     turned,
 )
 from soup_nlp.start.camera_error import (
-    KINDS,
+    STEPS,
     CameraError,
+    camera_error,
     camera_errors,
-    corrected,
     likeliest,
 )
 from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Matches
-from soup_nlp.start.settle import RELIEF
 
-OPEN = 0.5
-"""Systematic error of the flow that leaves motions undetermined, in units of its noise."""
 CLIP_PX = 3.0
 """Limit of a superpixel's error where explanations are compared, pixels."""
 LEAST_MEMBERS = 3
 """Least number of superpixels with flow of a component whose depth can be known."""
-SMALL = 1e-4
-"""Error of the camera by which derivatives are computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,22 +119,31 @@ def evidence(
     errors = np.full((3, count), np.nan)
     sigma = np.full(len(soup), np.inf)
     shown: dict[str, CameraError] = {}
-    scene = None if rigid is None else rigid & valid & (component == SCENE)
-    if scene is not None and scene.any():
-        # what moves by itself has another motion
-        shown = camera_errors(_matches(data, scene))
-    camera = np.array([shown[kind].size if shown else 0.0 for kind in KINDS])
-    # where the focal length is a guess its deviation is known
-    camera[0] = focal_sigma or camera[0]
+    # what moves by itself has another motion
+    scene = valid & (component == SCENE)
+    at = scene if rigid is None else scene & rigid
+    if rigid is not None and at.any():
+        shown = camera_errors(_matches(data, at))
+    acting = dict(shown)
+    if focal_sigma and scene.any():
+        # its deviation is known, by the flow where that tells it
+        guess = camera_error(_matches(data, scene), "focal length", focal_sigma)
+        acting[guess.kind] = guess._replace(density=tuple(special.softmax(-(STEPS**2) / 2)))
+    still = component == SCENE
+    point = soup.points(data.anchor_ray)
+    target = rays(data.K_next, project(data.K_next, soup.moved(point)))
+    seen = data.anchor_ray[still], target[still], point[still, 2]
+    squares = np.zeros(len(soup))
+    if acting:
+        squares[still] = sum(error.squares(*seen) for error in acting.values())
+        # other components stand in the scene
+        squares[~still] = np.median(squares[still])
     for c in range(count):
         at = np.flatnonzero((component == c) & valid)
         if len(at) < LEAST_MEMBERS:
             continue
         errors[:, c] = *_without_depth(data, at), trimmed_mean(misfit[at])
-        members = np.flatnonzero(component == c)
-        sigma[members] = 0.0
-        if camera.any():
-            sigma[members] = _by_camera(soup, data, members, valid[members], OPEN * noise, camera)
+        sigma[component == c] = np.sqrt(squares[component == c])
     return Evidence(errors[0], errors[1], errors[2], noise, sigma, shown)
 
 
@@ -173,56 +177,3 @@ def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float
     ray = data.pixel_ray[at]
     at_one = np.insert(ray, 3, 1.0, axis=-1)
     return error(turned, PLAIN_TURN, ray), error(displaced, 6, at_one)
-
-
-def _by_camera(
-    soup: Soup, data: EnergyData, at: Int, valid: Mask, error: float, camera: Float
-) -> Float:
-    """(K,) standard deviation of log depth by errors of the camera, which the motion follows.
-
-    A change of the component's motion moves a superpixel along its epipolar line, which its depth
-    follows, and across it, which the flow contradicts. The information on the motion is that of
-    one measurement with the error of the flow, and of relief with the deviation `RELIEF`.
-
-    Args:
-        soup: The answer.
-        data: Anchors.
-        at: (K,) superpixels of the component.
-        valid: (K,) True where the superpixel's flow is known.
-        error: Systematic error of the flow, pixels.
-        camera: (K,) errors of the camera, in the order of `KINDS`.
-    """
-    ray, focal = data.anchor_ray[at], np.diag(data.K_next)[:2]
-    z = soup.depth_at(data.anchor_ray)[at]
-    turned = np.einsum("nij,nj->ni", soup.R[at], z[:, None] * ray)
-    X = turned + soup.translation[at]
-    depth = np.maximum(X[:, 2], 1e-9)
-    slope = np.zeros((len(at), 2, 3))
-    slope[:, 0, 0], slope[:, 1, 1] = focal[0] / depth, focal[1] / depth
-    slope[:, :, 2] = -focal * X[:, :2] / depth[:, None] ** 2
-    length = max(float(np.median(np.linalg.norm(soup.translation[at], axis=1))), 1e-12)
-    # normalised coordinates of the answer's points, which a small error of the camera changes
-    normalised = X / depth[:, None]
-    columns = [-slope @ rotation.hat(X), slope * length]
-    for kind in KINDS:
-        first, second = corrected(kind, SMALL, ray, normalised)
-        shift = np.einsum("nij,njk,nk->ni", slope, soup.R[at], z[:, None] * (first - ray))
-        columns.append(((shift - focal * (second - normalised)[:, :2]) / SMALL)[..., None])
-    J = np.concatenate(columns, axis=2)
-    along = np.einsum("nij,nj->ni", slope, turned)
-    # squared image motion by log depth, at least that at which one deviation of relief is visible
-    squared = np.sum(along**2, axis=1) + (error / RELIEF) ** 2
-    follow = -np.einsum("ni,nij->nj", along, J) / squared[:, None]
-    across = J + along[:, :, None] * follow[:, None]
-    # less a common factor of all depths, which superpixels without parallax do not follow
-    grown = np.sum(along**2, axis=1) / squared
-    share = grown[valid] @ follow[valid] / max(float(grown[valid] @ grown[valid]), 1e-12)
-    follow = follow - np.outer(grown, share)
-    information = np.mean(across[valid].transpose(0, 2, 1) @ across[valid], axis=0) / error**2
-    information += np.mean(follow[valid][:, :, None] * follow[valid][:, None], axis=0) / RELIEF**2
-    if not np.isfinite(information).all():
-        # a foreign solver may return a soup without finite information
-        return np.full(len(at), np.inf)
-    covariance = np.linalg.pinv(information[:6, :6], rcond=1e-12, hermitian=True)
-    by_camera = camera * (follow[:, 6:] - follow[:, :6] @ (covariance @ information[:6, 6:]))
-    return np.sqrt(np.sum(by_camera**2, axis=1))

@@ -6,7 +6,7 @@ nearly any flow. A focal length that is a guess has an error for certain, which 
 distinguishes it from one that is given. See docs/confidence.md.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy import special
 
 from soup_nlp.arrays import Float
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.start.epipolar import Matches, Motion, essential_motion, refine_near
+from soup_nlp.start.epipolar import Matches, Motion, essential_motion, refine_near, triangulate
 
 KINDS = {
     "focal length": (0.8, 0.25),
@@ -38,32 +38,58 @@ PIXELS, NOISE_PX, ROUNDS = 2000, 0.05, 4
 fit that begins at that of the error before."""
 LEAST_MEDIAN_PX = 0.005
 """Least median error of a flow, pixels: that of a rendered flow is rounding."""
+MOST_CHANGE = 2.5
+"""Largest log ratio of a depth to the median: what is behind the camera is farther away."""
 
 
 class CameraError(NamedTuple):
     """What a flow says of one kind of error of the camera.
 
     Attributes:
+        kind: One of `KINDS`.
         mean: Its mean, if there is one.
         deviation: Its standard deviation, if there is one.
-        effect: Root of the mean of the square of what it does to depth, if there is one: its own
-            size, but a focal length f acts by 1 / f^2, which is how much an image is bent.
         log_odds: Logarithm of the probability that there is one, over that of none.
+        tried: The errors x that are tried, none where no motion explains the flow.
+        density: Probability of each of them, if there is an error.
+        motions: Best motion with each of them.
     """
 
+    kind: str
     mean: float
     deviation: float
-    effect: float
     log_odds: float
+    tried: Sequence[float] = ()
+    density: Sequence[float] = ()
+    motions: Sequence[Motion] = ()
 
-    @property
-    def size(self) -> float:
-        """Root of the mean square of its effect; 0 where the odds against it are `LEAST_ODDS`.
+    def squares(self, ray: Float, target: Float, depth: Float) -> Float:
+        """(N,) mean square of the log ratio of depth with the error to the depth of an answer.
 
-        What the flow leaves open, such as the focal length on a straight drive, counts.
+        Depth is triangulated with the best motion, a common factor left out. It is 0 where the odds
+        against an error are `LEAST_ODDS`; what the flow leaves open, such as the focal length on a
+        straight drive, counts.
+
+        Args:
+            ray: (N, 3) rays of the reference frame.
+            target: (N, 3) rays of the same points of the answer in the next frame.
+            depth: (N,) their depth.
         """
-        probability = float(special.expit(self.log_odds))
-        return self.effect * probability**0.5 * (self.log_odds > -LEAST_ODDS)
+        if not self.motions or self.log_odds <= -LEAST_ODDS:
+            return np.zeros(len(ray))
+        rows = []
+        for x, motion in zip(self.tried, self.motions, strict=True):
+            z, _ = triangulate(motion, *corrected(self.kind, x, ray, target))
+            rows.append(_relative(np.where(z > 0, z, np.inf)))
+        change = np.array(rows) - _relative(depth)
+        change -= np.mean(change, axis=1, keepdims=True)
+        return float(special.expit(self.log_odds)) * (np.array(self.density) @ change**2)
+
+
+def _relative(depth: Float) -> Float:
+    """Log of depths relative to their median, at most `MOST_CHANGE` from 0."""
+    log = np.log(np.maximum(depth, 1e-30) / np.clip(np.median(depth), 1e-30, 1e30))
+    return np.clip(log, -MOST_CHANGE, MOST_CHANGE)
 
 
 def corrected(kind: str, x: float, ref: Float, following: Float) -> tuple[Float, Float]:
@@ -96,10 +122,10 @@ def camera_error(matches: Matches, kind: str, deviation: float, wrong: float = 1
         wrong: Probability of an error, without the flow; 1 for a guess.
     """
     matches = matches.confident(PIXELS)
-    distance = _distances(matches, kind, deviation)
+    distance, motions = _explained(matches, kind, deviation)
     prior = float(special.logit(wrong))
-    if distance is None:
-        return CameraError(0.0, deviation, deviation, prior)
+    if not motions:
+        return CameraError(kind, 0.0, deviation, prior)
     noise = max(float(np.median(distance, axis=1).min()), LEAST_MEDIAN_PX)
     against = MEASUREMENTS * np.mean(np.log1p((distance / noise) ** 2), axis=1)
     gain = against[len(STEPS) // 2] - against - STEPS**2 / 2
@@ -110,12 +136,13 @@ def camera_error(matches: Matches, kind: str, deviation: float, wrong: float = 1
     spread = max(float(np.sqrt(density @ (x - mean) ** 2)), deviation * (STEPS[1] - STEPS[0]))
     # the flow is so much more probable with an error
     more = float(special.logsumexp(gain) - special.logsumexp(-(STEPS**2) / 2))
-    acts = (1 - np.exp(-2 * x)) / 2 if kind == "focal length" else x
-    return CameraError(mean, spread, float(np.sqrt(density @ acts**2)), prior + more)
+    return CameraError(kind, mean, spread, prior + more, tuple(x), tuple(density), motions)
 
 
-def _distances(matches: Matches, kind: str, deviation: float) -> Float | None:
-    """(len(STEPS), M) Sampson distances of the best motion with every error, pixels, or None.
+def _explained(matches: Matches, kind: str, deviation: float) -> tuple[Float, tuple[Motion, ...]]:
+    """The best motion with every error, and its Sampson distances (len(STEPS), M), pixels.
+
+    There are no motions where the flow determines none.
 
     Motions change little from one error to the next. That of a focal length changes much from one
     end to the other, and is sought from the ends as well.
@@ -130,6 +157,7 @@ def _distances(matches: Matches, kind: str, deviation: float) -> Float | None:
     if of_focal:
         ways += [range(count), range(count - 1, -1, -1)]
     best, least = np.zeros((count, len(matches.ray))), np.full(count, np.inf)
+    motions: dict[int, Motion] = {}
     for way in ways:
         motion = essential_motion(tried[way[0]], None)
         if motion is None:
@@ -139,8 +167,9 @@ def _distances(matches: Matches, kind: str, deviation: float) -> Float | None:
             distance = _distance(tried[k], motion, kind, errors[k], matches)
             error = float(np.mean(np.log1p((distance / NOISE_PX) ** 2)))
             if error < least[k]:
-                best[k], least[k] = distance, error
-    return best if np.isfinite(least).all() else None
+                best[k], least[k], motions[k] = distance, error, motion
+    complete = len(motions) == count
+    return best, tuple(motions[k] for k in range(count)) if complete else ()
 
 
 def _distance(tried: Matches, motion: Motion, kind: str, x: float, given: Matches) -> Float:

@@ -19,7 +19,7 @@ from soup_nlp.start.components import FIXED, SCENE
 
 def blamed(evidence, camera):
     """Evidence of a flow that shows an error of the camera, or of none."""
-    errors = {camera: CameraError(0.1, 0.01, 0.1, 9.0)} if camera else {}
+    errors = {camera: CameraError(camera, 0.1, 0.01, 9.0)} if camera else {}
     return replace(evidence, errors=errors)
 
 
