@@ -31,8 +31,9 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# a file of tests shares what it solves
 test: lint $(VENV)/.optional
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
 quick: $(VENV)/.installed
 	$(BIN)/python -m pytest -m 'not slow'
