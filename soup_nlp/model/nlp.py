@@ -133,13 +133,11 @@ class NLP:
         (E, k) the entries of every group are added."""
         out = dict[str, Terms]()
         for key, (size, targets) in places.items():
-            target: list[NDArray[np.integer]] = [np.zeros(0, np.int64)]
-            summands = list[Vectors]()
-            for group, own, at in zip(self.groups, functions, targets):
-                if key in own:
-                    summands.append(Vectors(own[key], group))
-                    target.append(summands[-1].ordered(at, size))
-            out[key] = size, summands, np.concatenate(target)
+            every = zip(self.groups, functions, targets)
+            own = [(Vectors(f[key], group), at) for group, f, at in every if key in f]
+            target = [term.ordered(at, size) for term, at in own]
+            none: NDArray[np.integer] = np.zeros(0, np.int64)
+            out[key] = size, [term for term, _ in own], np.concatenate([none, *target])
         return out
 
     def evaluated(self) -> Self:
