@@ -151,15 +151,20 @@ def resumable(kept: str, where: object) -> Iterator[None]:
 
 
 def row_progress(quiet: bool, result_of: Callable[[Row], str] = lambda row: "done") -> Say:
-    """A function that prints finished rows: one updated line on a terminal, else a line per row.
+    """A function that prints finished rows and the time left: one updated line on a terminal, else a
+    line per row.
 
     `result_of` makes a short text from a row that did not fail.
     """
-    live = sys.stderr.isatty()
+    live, begin, kept = sys.stderr.isatty(), time.monotonic(), list[int]()
 
     def say(done: int, total: int, row: Row) -> None:
         result = f"failed: {reason(row)}" if failed(row) else result_of(row)
         line = f"{done}/{total}  {row['key']}  {result}  {row.get('seconds') or 0:.0f} s"
+        # what was kept took no time
+        kept.append(done - 1)
+        left = (time.monotonic() - begin) / (done - kept[0]) * (total - done) / 60
+        line += f", {left:.0f} min left" * (done < total)
         start, end = ("\r\x1b[2K", "\n" if done == total else "") if live else ("", "\n")
         print(f"{start}{line}", end=end, file=sys.stderr, flush=True)
 

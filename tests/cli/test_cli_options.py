@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from helpers_files import sets, write_flo, write_pair
 
 from soup_nlp.cli.main import main
+from soup_nlp.cli.options import row_progress
 from soup_nlp.config.problem import load_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.storage.folders import SUMS, Sums, write_sums
@@ -177,3 +179,17 @@ def test_images_may_differ_in_size(tmp_path, capsys):
     assert summary["metrics"]["solution_next"]["coverage"] > 0.5
     depth = cv2.imread(str(tmp_path / "out" / "depth_next.png"), cv2.IMREAD_UNCHANGED)
     assert depth.shape == (76, 104)
+
+
+def test_rows_of_a_batch_say_how_much_time_is_left(monkeypatch, capsys):
+    clock = iter([100.0, 160.0, 220.0, 280.0])
+    monkeypatch.setattr("soup_nlp.cli.options.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    say = row_progress(quiet=False, result_of=lambda row: "fine")
+    # one of four was kept, each of the others takes a minute
+    for done in (2, 3, 4):
+        say(done, 4, {"key": f"pair_{done}", "seconds": 60.0})
+    assert capsys.readouterr().err.splitlines() == [
+        "2/4  pair_2  fine  60 s, 2 min left",
+        "3/4  pair_3  fine  60 s, 1 min left",
+        "4/4  pair_4  fine  60 s",
+    ]
