@@ -151,10 +151,10 @@ def resumable(kept: str, where: object) -> Iterator[None]:
 
 
 def row_progress(quiet: bool, result_of: Callable[[Row], str] = lambda row: "done") -> Say:
-    """A function that prints finished rows and the time left: one updated line on a terminal, else a
-    line per row.
+    """A function that prints finished rows and the time left.
 
-    `result_of` makes a short text from a row that did not fail.
+    On a terminal it is one updated line, else a line per row. `result_of` makes a short text from a
+    row that did not fail.
     """
     live, begin, kept = sys.stderr.isatty(), time.monotonic(), list[int]()
 
