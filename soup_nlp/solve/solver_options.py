@@ -33,7 +33,7 @@ class SolverOptions(Section):
 
     coordinates: Coordinates = "tangent"
     """Variables of the presolve. matrix: those of the constrained NLP, on which Ipopt then iterates
-    from the initialisation, at 2 to 25 times the cost (docs/solving.md)."""
+    from the initialisation, at 2 to 40 times the cost (docs/solving.md)."""
     presolve_eps: Annotated[tuple[Positive, ...], Field(strict=False, min_length=1)] = (
         0.3,
         0.03,
