@@ -156,14 +156,15 @@ def row_progress(quiet: bool, result_of: Callable[[Row], str] = lambda row: "don
     On a terminal it is one updated line, else a line per row. `result_of` makes a short text from a
     row that did not fail.
     """
-    live, begin, kept = sys.stderr.isatty(), time.monotonic(), list[int]()
+    live, begin, kept = sys.stderr.isatty(), time.monotonic(), -1
 
     def say(done: int, total: int, row: Row) -> None:
+        nonlocal kept
         result = f"failed: {reason(row)}" if failed(row) else result_of(row)
         line = f"{done}/{total}  {row['key']}  {result}  {row.get('seconds') or 0:.0f} s"
-        # what was kept took no time
-        kept.append(done - 1)
-        left = (time.monotonic() - begin) / (done - kept[0]) * (total - done) / 60
+        # pairs before the first row were kept and took no time
+        kept = done - 1 if kept < 0 else kept
+        left = (time.monotonic() - begin) / (done - kept) * (total - done) / 60
         line += f", {left:.0f} min left" * (done < total)
         start, end = ("\r\x1b[2K", "\n" if done == total else "") if live else ("", "\n")
         print(f"{start}{line}", end=end, file=sys.stderr, flush=True)

@@ -126,15 +126,14 @@ def evidence(
         shown = camera_errors(_matches(data, at))
     acting = dict(shown)
     if focal_sigma and scene.any():
-        # its deviation is known, by the flow where that tells it
+        # its deviation is known
         guess = camera_error(_matches(data, scene), "focal length", focal_sigma)
         acting[guess.kind] = guess._replace(density=tuple(special.softmax(-(STEPS**2) / 2)))
-    still = component == SCENE
-    point = soup.points(data.anchor_ray)
-    target = rays(data.K_next, project(data.K_next, soup.moved(point)))
-    seen = data.anchor_ray[still], target[still], point[still, 2]
     squares = np.zeros(len(soup))
     if acting:
+        still, point = component == SCENE, soup.points(data.anchor_ray)
+        target = rays(data.K_next, project(data.K_next, soup.moved(point)))
+        seen = data.anchor_ray[still], target[still], point[still, 2]
         squares[still] = sum(error.squares(*seen) for error in acting.values())
         # other components stand in the scene
         squares[~still] = np.median(squares[still])

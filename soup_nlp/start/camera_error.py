@@ -81,14 +81,15 @@ class CameraError(NamedTuple):
         for x, motion in zip(self.tried, self.motions, strict=True):
             z, _ = triangulate(motion, *corrected(self.kind, x, ray, target))
             rows.append(_relative(np.where(z > 0, z, np.inf)))
-        change = np.array(rows) - _relative(depth)
+        # a foreign solver may return a depth that is no number
+        change = np.nan_to_num(np.array(rows) - _relative(depth))
         change -= np.mean(change, axis=1, keepdims=True)
         return float(special.expit(self.log_odds)) * (np.array(self.density) @ change**2)
 
 
 def _relative(depth: Float) -> Float:
     """Log of depths relative to their median, at most `MOST_CHANGE` from 0."""
-    log = np.log(np.maximum(depth, 1e-30) / np.clip(np.median(depth), 1e-30, 1e30))
+    log = np.log(np.maximum(depth, 1e-30) / np.clip(np.nanmedian(depth), 1e-30, 1e30))
     return np.clip(log, -MOST_CHANGE, MOST_CHANGE)
 
 

@@ -96,6 +96,14 @@ def test_an_uncertain_focal_length_counts_by_its_size(small_room):
     assert 1.5 < np.median(doubled) / np.median(uncertain) < 4
 
 
+def test_a_depth_that_is_no_number_leaves_the_others_theirs(small_room):
+    soup, data = scene(small_room, 0.3, (0.3, 0.0, 0.1))
+    broken = replace(soup, d=np.where(np.arange(len(soup)) == 3, np.nan, soup.d))
+    found, whole = (of_one(s, data, 0.2).sigma for s in (broken, soup))
+    assert np.isfinite(found).all()
+    assert np.median(found) == pytest.approx(np.median(whole), rel=0.5)
+
+
 def test_a_component_without_flow_is_a_guess(small_room):
     soup, data = scene(small_room, 0.4, (0.3, 0.0, 0.1))
     component = (np.arange(len(soup)) >= len(soup) - 5).astype(np.int64)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -154,3 +155,22 @@ def test_a_script_needs_no_guard(tmp_path):
     words = [sys.executable, str(tmp_path / "script.py")]
     ended = subprocess.run(words, capture_output=True, text=True, check=True)
     assert ended.stdout == "[0, 1, 4]\n"
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another library than glibc")
+def test_memory_that_was_freed_is_used_again():
+    """The 20,000 pages of ten arrays that come and go are not made again each time."""
+    code = """
+import numpy, resource
+from soup_nlp.storage.system import keep_memory
+keep_memory()
+for k in range(20):
+    if k == 10:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    arrays = [numpy.ones(10**6) for _ in range(10)]
+    del arrays
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+    words = [sys.executable, "-c", code]
+    faults = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    assert int(faults) < 2000
