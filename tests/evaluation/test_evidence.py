@@ -165,7 +165,7 @@ def test_the_error_of_a_camera_is_found(kind, x):
     change = np.log(wrong / right)
     change = np.abs(change - np.median(change))
     said = np.sqrt(found[kind].squares(seen.ray, seen.target, wrong))
-    assert np.median(said) == pytest.approx(np.median(change), rel=0.5)
+    assert np.median(said) == pytest.approx(np.median(change), rel=0.25)
     assert np.mean(change < 2 * said + 0.02) > 0.9
 
 
