@@ -23,7 +23,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from soup_nlp.errors import DataError, printable
-from soup_nlp.storage.files import PathLike, as_path, read_text, write_text
+from soup_nlp.storage.files import PathLike, as_path, read_text, require_file, write_text
 from soup_nlp.storage.system import deferred_signals
 
 SUMS = "SHA256SUMS"
@@ -77,9 +77,9 @@ def files_in(folder: Path) -> list[str]:
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file."""
+    """SHA-256 of a regular file; pipes may never end."""
     try:
-        with path.open("rb") as file:
+        with require_file(path, "file").open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise DataError("file cannot be read", where=path, found=error.strerror) from error
