@@ -37,7 +37,7 @@ from soup_nlp.start.occlusion import vote
 from soup_nlp.start.overlay import fixed_to_camera
 from soup_nlp.start.scales import held, scaled
 from soup_nlp.start.settle import settle
-from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit, Views
+from soup_nlp.start.views import LEAST_PARALLAX_PX, LEAST_SEEN, FlowFit, Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,6 +244,7 @@ def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Ma
     fit, parallax, views = choice.fit, choice.parallax, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
     weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | flow.poor | wrong
+    weak |= flow.seen < LEAST_SEEN
     if weak.all():
         # no depth is known: all depths are one, with translations that move the image as before
         length = np.where(mu > 0, mu, 0.0)

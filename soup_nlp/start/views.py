@@ -22,6 +22,9 @@ USABLE = 0.5
 """Mean confidence above which the flow of a superpixel counts."""
 LEAST_PARALLAX_PX = 0.25
 """Parallax from which the flow of a superpixel determines its depth, pixels."""
+LEAST_SEEN = 0.1
+"""Mean confidence of all pixels of a superpixel from which its flow determines its depth: fewer
+pixels match by chance as well."""
 LEAST_PIXELS = 8
 """Least number of usable pixels of a superpixel that has views of its own, and of an image."""
 CACHED = 1 << 16
@@ -117,6 +120,7 @@ class FlowFit(NamedTuple):
         poor: (N,) True where the views are a neighbour's, or do not count.
         fit: (N, 3, 2) affine flow, see `affine_flow`.
         residual: (N,) its mean error, pixels.
+        seen: (N,) mean confidence of all pixels, not only of the sampled ones.
         jump: (P,) mean difference of the affine flows of two neighbours on their boundary, pixels.
     """
 
@@ -128,6 +132,7 @@ class FlowFit(NamedTuple):
     poor: Mask
     fit: Float
     residual: Float
+    seen: Float
     jump: Float
 
     @classmethod
@@ -167,7 +172,8 @@ class FlowFit(NamedTuple):
         radius = np.maximum(np.linalg.norm(reach, axis=-1).max(axis=1), 1.0 / K_ref[0, 0])
         targets, focal = rays(K_next, uv + shift), np.diag(K_next)[:2]
         views = Views(rays(K_ref, uv), targets, weight, anchor, radius, focal)
-        fitted = cls(seg, K_ref, K_next, o, views, poor, *affine_flow(views), np.zeros(0))
+        seen = np.bincount(seg.labels.ravel(), flow.confidence.ravel()) / seg.sizes
+        fitted = cls(seg, K_ref, K_next, o, views, poor, *affine_flow(views), seen, np.zeros(0))
         edge = rays(K_ref, seg.boundary)
         first, second = (fitted.followed(which, edge) for which in seg.pairs.T)
         return fitted._replace(jump=np.linalg.norm(first - second, axis=-1).mean(axis=1))

@@ -82,5 +82,5 @@ def flow_of(
     anchor, none = camera.rays(K, seg.anchors), np.zeros(n)
     views = Views(anchor[:, None], anchor[:, None], weight, anchor, np.ones(n), np.ones(2))
     jump = np.broadcast_to(jump, len(seg.pairs))
-    affine = np.zeros((n, 3, 2))
-    return FlowFit(seg, K, K, SeededStart(**options), views, none > 0, affine, none, jump)
+    affine, own = np.zeros((n, 3, 2)), SeededStart(**options)
+    return FlowFit(seg, K, K, own, views, none > 0, affine, none, weight[:, 0], jump)

@@ -157,11 +157,20 @@ def test_confident_pixels_decide(room):
 
 
 @pytest.mark.slow
-def test_superpixels_without_confidence_borrow(room):
+@pytest.mark.parametrize("matched", [0.0, 0.05])
+def test_superpixels_without_confidence_borrow(room, matched):
+    """Also where a few pixels match by chance, here as if they were three times as far away."""
     pair, seg, pure = room
     blind = np.zeros(len(seg), bool)
     blind[[0, 7, 20, 21, 22, 40]] = True
-    start = propose(fitted(with_uv(pair, pair.flow.uv, ~blind[seg.labels]), seg))
+    usable = ~blind[seg.labels] | (np.random.default_rng(3).random(pair.size) < matched)
+    pixel, move = camera.pixel_grid(*pair.size), pair.truth.motions[0]
+    far = 3 * pair.truth.depth_ref[..., None] * camera.rays(pair.K_ref, pixel)
+    wrong = camera.project(pair.K_next, far @ move[:3, :3].T + move[:3, 3]) - pixel
+    uv = np.where(blind[seg.labels][..., None], wrong, pair.flow.uv)
+    flow = fitted(with_uv(pair, uv, usable), seg)
+    assert flow.poor[blind].all() == (matched == 0.0)
+    start = propose(flow)
     assert_usable(start, seg)
     assert start.borrowed[blind].all()
     assert not start.borrowed[~blind & pure].any()
