@@ -1,5 +1,6 @@
 """Frames of a sequence: files, videos and scenes; which of them are refused or left out."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -167,6 +168,16 @@ def test_an_unreadable_frame_is_found_before_the_first_solve(kind, tmp_path, cap
     error = capsys.readouterr().err
     assert last.name in error
     assert {"damaged": "truncated", "heic": "convert it", "turned": "turned"}[kind] in error
+
+
+def test_a_camera_that_is_a_pipe_is_refused(tmp_path, capsys):
+    """Its hash would wait for a writer for ever."""
+    for k in range(2):
+        write_png(tmp_path / f"{k}.png", IMAGE)
+    os.mkfifo(tmp_path / "K.txt")
+    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
+    assert "a pipe, socket or device" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_frames_of_another_sequence_are_left_alone(tmp_path, capsys):
