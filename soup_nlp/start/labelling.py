@@ -24,8 +24,7 @@ import numpy as np
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
-from soup_nlp.start.components import connected_labels, connected_pieces
-from soup_nlp.start.continuation import belonging
+from soup_nlp.start.components import belonging, connected_labels, connected_pieces
 from soup_nlp.start.epipolar import (
     SIDEWAYS,
     Motion,

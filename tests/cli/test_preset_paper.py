@@ -24,7 +24,7 @@ from soup_nlp.pipeline.record import Case
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.epipolar import Matches, Motion
-from soup_nlp.start.homographies import plane_of
+from soup_nlp.start.propose import plane_of
 
 PAPER = {
     # Sec. 4.4.1: "1,000-2,000 superpixels" by SLIC

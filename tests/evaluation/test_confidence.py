@@ -22,8 +22,13 @@ from soup_nlp.evaluation.confidence import (
     sigma_of,
     with_prior,
 )
-from soup_nlp.evaluation.information import information, marginals, spread_in_image
-from soup_nlp.evaluation.selected_inverse import BlockCholesky, layers
+from soup_nlp.evaluation.information import (
+    BlockCholesky,
+    information,
+    layers,
+    marginals,
+    spread_in_image,
+)
 from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation

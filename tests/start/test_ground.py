@@ -6,7 +6,7 @@ from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.ground import ground, on_ground
+from soup_nlp.start.scales import ground, on_ground
 from soup_nlp.start.views import FlowFit
 
 HIGH, FAR = 1.5, 30.0

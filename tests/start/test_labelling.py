@@ -11,8 +11,7 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start import labelling
-from soup_nlp.start.components import connected_labels
-from soup_nlp.start.continuation import belonging, continued, harmonic, likeness
+from soup_nlp.start.components import belonging, connected_labels, continued, harmonic, likeness
 from soup_nlp.start.epipolar import SIDEWAYS, Motion
 from soup_nlp.start.labelling import (
     CHANGE,
