@@ -23,15 +23,16 @@ from benchmarks.family.instances import (
 )
 from benchmarks.family.write import check_sol, family_tasks, write_family
 from benchmarks.scores import measure_pair
-from benchmarks.sigma import measure_terms, write_sigma
+from benchmarks.sigma import write_sigma
 from benchmarks.solvers import write_results
 from benchmarks.suites import SUITES, Options, list_suite
-from benchmarks.table import Cell, measure
+from benchmarks.table import Cell, frame_of, measure
 from soup_nlp import SoupError
 from soup_nlp.export.compare import compare as run_solvers
 from soup_nlp.export.compare import page as solver_page
 from soup_nlp.export.verify import Limits
 from soup_nlp.storage.files import write_text
+from soup_nlp.storage.rows import read_rows
 
 app = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, help="Accuracy and speed, measured."
@@ -104,20 +105,10 @@ def accuracy(
 
 
 @app.command()
-def sigma(
-    suite: Suites,
-    overrides: Set = None,
-    only: Only = None,
-    data: Data = None,
-    out: Out = Path("out/bench/sigma"),
-    width: Width = 1024,
-    workers: Workers = 1,
-) -> int:
-    """The factors of sigma, fitted with families left out in turn; a stopped run goes on."""
-    wanted = Options(("dis",), width, (0,), tuple(only or ()))
-    cells = [c for own in cells_of(suite, data, wanted, overrides).values() for c in own]
-    frame = measure(cells, measure_terms, out / "sigma.jsonl", workers)
-    return finish(out / "sigma.md", frame, write_sigma(out / "sigma.md", frame))
+def sigma(folder: Path) -> int:
+    """The factors of sigma, fitted to the rows of `accuracy`, families left out in turn."""
+    frame = frame_of([row for file in sorted(folder.glob("*.jsonl")) for row in read_rows(file)])
+    return finish(folder / "sigma.md", frame, write_sigma(folder / "sigma.md", frame))
 
 
 @app.command()

@@ -9,7 +9,7 @@ from benchmarks.table import Cell
 from soup_nlp import Pair, Run, Soup, Truth, run
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
-from soup_nlp.evaluation.confidence import MOST_SIGMA
+from soup_nlp.evaluation.confidence import LARGEST, MOST_SIGMA
 from soup_nlp.evaluation.metrics import MEDIAN, UNSCALED, depth_metrics, skill
 from soup_nlp.evaluation.scoring import (
     at_truth,
@@ -36,9 +36,29 @@ RIGHT, WRONG = 0.10, 0.20
 """Relative errors up to which a depth is right, and above which it is wrong."""
 
 
+PIXELS = 500
+"""Pixels with truth of a pair, drawn at random, to which sigma is fitted."""
+
+
 def measure_pair(cell: Cell) -> Row:
     """Solve and score one pair, see `solved`."""
-    return scores(solved(cell))
+    result = solved(cell)
+    return {**scores(result), "pixels": pixels(result)}
+
+
+def pixels(result: Run) -> Row:
+    """Errors of log depth after the median scale, and terms of sigma, at pixels of one pair."""
+    truth = result.pair.truth
+    assert truth is not None
+    z, gt = (v.ravel() for v in at_truth(truth, result.reconstruction.depth_ref))
+    at = np.flatnonzero(np.isfinite(gt) & np.isfinite(z) & (gt > 0) & (z > 0))
+    at = np.random.default_rng(0).permutation(at)[:PIXELS]
+    error = np.log(z[at] * np.median(gt[at] / z[at]) / gt[at])
+    terms = {k: at_truth(truth, v)[0].ravel()[at] for k, v in result.confidence.terms.items()}
+    return {
+        "error": np.round(error, 5).tolist(),
+        "terms": {k: np.round(np.minimum(v, LARGEST), 5).tolist() for k, v in terms.items()},
+    }
 
 
 def solved(cell: Cell) -> Run:

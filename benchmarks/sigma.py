@@ -7,15 +7,12 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import minimize
 
-from benchmarks.scores import sigma_scores, solved
-from benchmarks.table import Cell, markdown, panels, provenance, save
+from benchmarks.scores import sigma_scores
+from benchmarks.table import markdown, panels, provenance, save
 from soup_nlp.arrays import Float
-from soup_nlp.evaluation.confidence import FACTORS, LARGEST, sigma_of
-from soup_nlp.evaluation.scoring import at_truth
+from soup_nlp.evaluation.confidence import FACTORS, sigma_of
 from soup_nlp.storage.each import Row
 
-PIXELS = 500
-"""Pixels with truth of a pair that count, drawn at random."""
 HEAVY = 4.0
 """Error, in sigma, from which it counts linearly: a few pixels that a wrong motion misses by far
 would widen all of sigma."""
@@ -23,23 +20,6 @@ PULL = 1e-3
 """Loss by the squared change of the logarithm of a factor."""
 SCORES = ("nll", "flat", "within1", "within2", "sure_wrong", "right_unsure", "ause")
 """Scores of sigma in the table of families, see `benchmarks.scores.sigma_scores`."""
-
-
-def measure_terms(cell: Cell) -> Row:
-    """Errors of log depth after the median scale, and terms of sigma, at pixels of one pair."""
-    run = solved(cell)
-    truth = run.pair.truth
-    assert truth is not None
-    z, gt = at_truth(truth, run.reconstruction.depth_ref)
-    at = np.flatnonzero((np.isfinite(gt) & np.isfinite(z) & (gt > 0) & (z > 0)).ravel())
-    at = np.random.default_rng(0).permutation(at)[:PIXELS]
-    z, gt = z.ravel()[at], gt.ravel()[at]
-    terms = {name: at_truth(truth, v)[0].ravel()[at] for name, v in run.confidence.terms.items()}
-    error = np.log(z * np.median(gt / z) / gt)
-    return {
-        "error": np.round(error, 5).tolist(),
-        "terms": {name: np.round(np.minimum(v, LARGEST), 5).tolist() for name, v in terms.items()},
-    }
 
 
 def loss(error: Float, sigma: Float) -> float:
@@ -53,12 +33,12 @@ Pairs = dict[str, list[tuple[Float, dict[str, Float]]]]
 
 
 def pairs_of(frame: pd.DataFrame) -> Pairs:
-    """Errors and terms of the rows that were measured, by family."""
+    """Errors and terms of the rows that were measured with a computed flow, by family."""
     out: Pairs = {}
-    columns = [column for column in frame if column.startswith("terms.")]
-    for _, row in frame[frame["ok"].eq(True)].iterrows():
-        terms = {name.removeprefix("terms."): np.array(row[name]) for name in columns}
-        out.setdefault(row["family"], []).append((np.array(row["error"]), terms))
+    columns = [column for column in frame if column.startswith("pixels.terms.")]
+    for _, row in frame[frame["ok"].eq(True) & frame["flow"].eq("dis")].iterrows():
+        terms = {name.removeprefix("pixels.terms."): np.array(row[name]) for name in columns}
+        out.setdefault(row["family"], []).append((np.array(row["pixels.error"]), terms))
     return out
 
 
