@@ -60,7 +60,7 @@ KEEP_IN_MATRICES: Mapping[str, Any] = {
 LAST: Mapping[str, Any] = {"mu_init": 1e-10}
 """Options of the last stage. A larger barrier would push at constraints that the constrained NLP
 does not have in the same variables, and that would then have to iterate."""
-THETAS: Mapping[float, float] = {0.5: 0.1, 0.9: 0.1, 0.98: 1e-4}
+THETAS: Mapping[float, float] = {0.5: 0.1, 0.9: 0.1, 0.98: 1e-3}
 """Gauss-Newton stages: theta, and the share of `stagnation` that ends each."""
 RIDGE = 1e-2
 """Added to their diagonal: theta leaves some directions without curvature."""
