@@ -28,7 +28,7 @@ from soup_nlp.start.epipolar import Matches, estimate
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import covering
 from soup_nlp.start.prior_evidence import LEAST_SIGMA, PIECES, PriorEvidence, judged
-from soup_nlp.start.propose import Start, propose
+from soup_nlp.start.propose import Start, most_usual, propose
 from soup_nlp.start.start_options import HOMOGRAPHY, SeededStart
 from soup_nlp.start.views import FlowFit
 from soup_nlp.storage.progress import Watch
@@ -132,19 +132,30 @@ def _segmented(problem: Problem, pair: Pair, labels: Labels) -> Segmentation:
     return build_segmentation(labels, pair.image_ref, s.neighbours, boundary_samples=samples)
 
 
-def _flow_fit(problem: Problem, pair: Pair, seg: Segmentation) -> FlowFit:
-    """The flow of a pair as affine maps."""
+STARTS = 3
+"""Number of starts, each from other samples of the flow, of which the most usual is taken."""
+
+
+def _flow_fit(problem: Problem, pair: Pair, seg: Segmentation, sample: int = 0) -> FlowFit:
+    """The flow of a pair as affine maps, fitted to one of its samples."""
     assert pair.flow is not None
     own = HOMOGRAPHY if problem.start.method == "homography" else {}
-    options = SeededStart(**dict(problem.start), **own, seed=problem.seed)
+    options = SeededStart(**dict(problem.start), **own, seed=problem.seed ^ sample)
     return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, options)
 
 
 def _begun(problem: Problem, pair: Pair, seg: Segmentation) -> Begun:
-    """The start on given superpixels, without a depth prior."""
-    fitted = _flow_fit(problem, pair, seg)
-    contrast = covering(pair, fitted) if problem.energy.weights.order > 0 else None
-    return propose(fitted, contrast), pair, fitted
+    """The most usual of several starts on given superpixels, without a depth prior."""
+
+    def started(sample: int) -> tuple[Start, FlowFit]:
+        fitted = _flow_fit(problem, pair, seg, sample)
+        contrast = covering(pair, fitted) if problem.energy.weights.order > 0 else None
+        return propose(fitted, contrast), fitted
+
+    count = 1 if problem.start.method == "homography" else STARTS
+    starts, flows = zip(*map(started, range(count)), strict=True)
+    best, start = most_usual(starts, seg, flows[0].views.anchor)
+    return start, pair, flows[best]
 
 
 def _judged(problem: Problem, labels: Labels, begun: Begun) -> tuple[Begun, PriorEvidence]:

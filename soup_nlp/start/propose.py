@@ -1,5 +1,6 @@
 """Initial proposal of every superpixel: candidates, choice, planes, scales (paper, Sec. 4.4.1)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -71,6 +72,8 @@ class Start:
         order: (P,) probability that the second superpixel of a neighbour pair covers the first one,
             negative if the first covers the second, 0 where neither is known (`start.occlusion`,
             `order_in_front`); None where nothing is known.
+        scatter: (N,) root mean square difference of log depth from the starts that were not taken
+            (`most_usual`); 0 where there is one.
     """
 
     soup: Soup
@@ -89,6 +92,7 @@ class Start:
     at_rest: bool = False
     noise: float = LEAST_NOISE
     order: Float | None = None
+    scatter: Float | float = 0.0
 
     def __str__(self) -> str:
         count = len(self.motions)
@@ -134,6 +138,30 @@ class Start:
     def bending(self) -> bool:
         """Whether a region bends."""
         return bool(self.bends.any())
+
+
+MOST_APART = 1.0
+"""Difference of log depths from which two starts disagree entirely about a superpixel."""
+
+
+def most_usual(starts: Sequence[Start], seg: Segmentation, ray: Float) -> tuple[int, Start]:
+    """The index of the start that is nearest to the others, and that start with their `scatter`.
+
+    Starts from other samples of one flow label and scale components differently where it hardly
+    tells them; most agree where one goes astray. Of S starts, the one with the least mean
+    difference of log depth over pixels and other starts is taken, up to a common scale.
+
+    Args:
+        starts: S starts on the same superpixels.
+        seg: Superpixels.
+        ray: (N, 3) rays of the anchors.
+    """
+    depth = np.stack([np.log(start.soup.depth_at(ray)) for start in starts])
+    depth -= np.median(depth, axis=1, keepdims=True)
+    apart = np.minimum(np.abs(depth[:, None] - depth), MOST_APART)
+    best = int(np.argmin(apart.sum(axis=1) @ seg.sizes))
+    scatter = np.sqrt(np.sum(apart[best] ** 2, axis=0) / max(len(starts) - 1, 1))
+    return best, replace(starts[best], scatter=scatter)
 
 
 def propose(flow: FlowFit, contrast: Float | None = None) -> Start:

@@ -1,6 +1,6 @@
 """The start: exact on noise-free planes, finite and flagged on everything degenerate."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.start.propose import Start, propose
+from soup_nlp.start.propose import Start, most_usual, propose
 from soup_nlp.start.views import FlowFit
 
 
@@ -114,6 +114,24 @@ def test_one_motion_is_recovered_exactly(shift):
     assert start.error[pure].max() < 0.05
     assert not start.borrowed[pure].any()
     assert (start.motion == 0).mean() > 0.9
+
+
+def test_the_most_usual_start_is_taken():
+    pair, seg, _ = corner()
+    start = propose(fitted(pair, seg))
+    anchor = camera.rays(pair.K_ref, seg.anchors)
+    # a common scale is no difference; the farthest superpixels at twice their depth are one
+    scaled = replace(start, soup=replace(start.soup, lam=3 * start.soup.lam))
+    depth = start.soup.depth_at(anchor)
+    far = depth > np.quantile(depth, 0.9)
+    astray = replace(start, soup=replace(start.soup, lam=start.soup.lam * np.where(far, 2, 1)))
+    best, taken = most_usual([scaled, astray, start], seg, anchor)
+    assert best != 1
+    assert taken.soup is (scaled, astray, start)[best].soup
+    assert taken.scatter == pytest.approx(np.where(far, np.log(2) / np.sqrt(2), 0), abs=1e-12)
+    best, taken = most_usual([start], seg, anchor)
+    assert best == 0
+    assert not taken.scatter.any()
 
 
 @pytest.mark.slow
