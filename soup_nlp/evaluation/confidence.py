@@ -24,16 +24,13 @@ from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.components import FIXED, SCENE
 from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
-from soup_nlp.start.scales import displacement, log_pace
 
 FACTORS = {
     "flow": 2.5,
     "scale": 1.5,
-    "pace": 0.8,
     "relief": 0.5,
     "outline": 0.45,
     "mixed": 0.1,
-    "starts": 1.0,
     "bends": 0.22,
     "drawn": 0.55,
     "prior": 1.2,
@@ -132,9 +129,10 @@ def sigma_of(terms: Mapping[str, Float], factor: Mapping[str, float] = FACTORS) 
     """Standard deviation of log depth by its terms, see `terms`, and `FACTORS`.
 
     What is drawn has one number. Elsewhere it is the root of the sum of the squares of the terms
-    times their factors, to which the information of a prior is added.
+    times their factors (starts and camera have none), to which the information of a prior is added.
     """
-    squares = sum((factor[name] * terms[name]) ** 2 for name in ADDED) + terms["camera"] ** 2
+    squares = sum((factor[name] * terms[name]) ** 2 for name in ADDED)
+    squares = squares + terms["starts"] ** 2 + terms["camera"] ** 2
     known = with_prior(np.sqrt(squares), factor["prior"])
     return np.where(terms["drawn"] > 0, factor["drawn"], known)
 
@@ -153,7 +151,6 @@ def terms(
     * flow: `sqrt(noise max(noise, MISFIT misfit)) spread`. The random error of the flow, pixels,
       times the standard deviation by the marginals. The misfit is that of the answer.
     * scale: standard deviation of the log scale of a component beside the scene, by the marginals.
-    * pace: log ratio by which a component moves farther than the scene: it may be nearer.
     * relief: `noise / gap` times the log ratio of the depth to the median of the component. A small
       turn and a small translation move an image almost alike, so that an error that a flow shares
       stretches or flattens relief (bas-relief), the more the fewer pixels depth explains (`gap`).
@@ -181,14 +178,12 @@ def terms(
     depth = _log(rec.soup.depth_at(anchor_ray))
     middle = np.asarray(ndimage.median(depth, part, np.arange(int(part.max()) + 1)))
     gap = np.maximum(np.nan_to_num(sure.gap), noise * FACTORS["relief"])
-    pace = np.maximum(log_pace(displacement(rec.soup, anchor_ray, part), part), 0.0)
     other = part != SCENE
     drawn = start.at_rest | (start.tie == FIXED) | (start.bends & start.unexplained)
     local = np.sqrt(noise * np.maximum(noise, MISFIT * flow_misfit(rec, flow)))
     return {
         "flow": local[labels] * np.minimum(spread, LARGEST),
         "scale": (other * np.minimum(component, LARGEST)[part])[labels],
-        "pace": (other * pace[part])[labels],
         "relief": (noise / gap[part] * np.abs(depth - middle[part]))[labels],
         "outline": at_outlines(rec.depth_ref),
         "mixed": (4 * usable * (1 - usable))[labels],

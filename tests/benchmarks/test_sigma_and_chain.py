@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 
 def no_terms(count):
-    return dict.fromkeys((*ADDED, "camera", "drawn"), np.zeros(count))
+    return dict.fromkeys((*ADDED, "starts", "camera", "drawn"), np.zeros(count))
 
 
 def test_the_fit_finds_the_factor_of_normal_errors():
@@ -21,7 +21,7 @@ def test_the_fit_finds_the_factor_of_normal_errors():
     terms["flow"] = np.exp(rng.normal(-4, 0.5, 4000))
     factor = fitted({"family": [(rng.normal(0, 1.0 * terms["flow"]), terms)]})
     assert factor["flow"] == pytest.approx(1.0, rel=0.05)
-    assert factor["pace"] == pytest.approx(FACTORS["pace"], rel=0.05)
+    assert factor["scale"] == pytest.approx(FACTORS["scale"], rel=0.05)
 
 
 SMALL = (
