@@ -61,6 +61,7 @@ results: $(VENV)/.optional
 	-$(BIN)/soup-nlp solve problems/motorcycle.yaml -o out/motorcycle --overwrite
 	-cp out/motorcycle/overview.png results/motorcycle.png
 	$(BENCH) accuracy -o results/accuracy $(PAIRS)
+	$(BENCH) sigma results/accuracy
 	$(BENCH) chain -o results/accuracy $(if $(DATA),--data $(DATA))
 	$(BENCH) paper -o results/paper $(if $(DATA),--data $(DATA)) --limit 1 --superpixels 1000 \
 		--analysis 100

@@ -28,6 +28,7 @@ from benchmarks.solvers import write_results
 from benchmarks.suites import SUITES, Options, list_suite
 from benchmarks.table import Cell, frame_of, measure
 from soup_nlp import SoupError
+from soup_nlp.errors import DataError
 from soup_nlp.export.compare import compare as run_solvers
 from soup_nlp.export.compare import page as solver_page
 from soup_nlp.export.verify import Limits
@@ -107,7 +108,12 @@ def accuracy(
 @app.command()
 def sigma(folder: Path) -> int:
     """The factors of sigma, fitted to the rows of `accuracy`, families left out in turn."""
-    frame = frame_of([row for file in sorted(folder.glob("*.jsonl")) for row in read_rows(file)])
+    rows = [row for file in sorted(folder.glob("*.jsonl")) for row in read_rows(file)]
+    rows = [row for row in rows if "pixels" in row]
+    if not rows:
+        hint = "python -m benchmarks accuracy -o FOLDER"
+        raise DataError("no rows with pixels", where=folder, found="no such .jsonl", hint=hint)
+    frame = frame_of(rows).drop_duplicates("key", keep="last")
     return finish(folder / "sigma.md", frame, write_sigma(folder / "sigma.md", frame))
 
 

@@ -156,11 +156,13 @@ def most_usual(starts: Sequence[Start], seg: Segmentation, ray: Float) -> tuple[
         seg: Superpixels.
         ray: (N, 3) rays of the anchors.
     """
+    if len(starts) == 1:
+        return 0, starts[0]
     depth = np.stack([np.log(start.soup.depth_at(ray)) for start in starts])
     depth -= np.median(depth, axis=1, keepdims=True)
     apart = np.minimum(np.abs(depth[:, None] - depth), MOST_APART)
     best = int(np.argmin(apart.sum(axis=1) @ seg.sizes))
-    scatter = np.sqrt(np.sum(apart[best] ** 2, axis=0) / max(len(starts) - 1, 1))
+    scatter = np.sqrt(np.sum(apart[best] ** 2, axis=0) / (len(starts) - 1))
     return best, replace(starts[best], scatter=scatter)
 
 
