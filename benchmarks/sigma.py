@@ -97,8 +97,11 @@ def write_sigma(page: Path, frame: pd.DataFrame) -> str:
         f" {mean_loss(pairs, every):.4f}. Least and most: with one family left out.",
         markdown(fits.rename_axis("factor"), ".3f"),
     ]
-    for title, rows in (("today's factors", before), ("factors of the other families", after)):
-        table = pd.DataFrame(rows).set_index("family")[list(SCORES)]
+    for title, rows, hidden in (
+        ("today's factors", before, []),
+        ("factors of the other families", after, ["flat", "right_unsure", "ause"]),
+    ):
+        table = pd.DataFrame(rows).set_index("family")[list(SCORES)].drop(columns=hidden)
         table.loc["mean"] = table.mean()
         blocks += [f"## By {title}", markdown(table, ".3f")]
     blocks.append(f"![Reliability of sigma by family]({page.stem}.png)")
