@@ -62,6 +62,9 @@ LAST: Mapping[str, Any] = {"mu_init": 1e-10}
 does not have in the same variables, and that would then have to iterate."""
 THETAS: Mapping[float, float] = {0.5: 0.1, 0.9: 0.1, 0.98: 1e-3}
 """Gauss-Newton stages: theta, and the share of `stagnation` that ends each."""
+PATIENT: Mapping[float, float] = {0.98: 1e-4}
+"""The same of the last one where all surfaces bend: the exact Hessian has many negative directions
+there, and would begin too far from the minimum."""
 RIDGE = 1e-2
 """Added to their diagonal: theta leaves some directions without curvature."""
 UNTRUNCATED: Mapping[float, float] = {1.0: 0.3, 0.3: 1.0, 0.1: 1.0}
@@ -168,9 +171,10 @@ class Presolve:
             program.lam_g = before.lam_g
             if not self.data.local_units:
                 program.lam_x = before.lam_x
+        thetas = {**THETAS, **(PATIENT if o.untruncated else {})}
         growing = [
             _Planned(f"Gauss-Newton {theta:g}", o.eps, share, {"theta": theta, "ridge": RIDGE})
-            for theta, share in THETAS.items()
+            for theta, share in thetas.items()
         ]
         self._run(program, growing, options={"mu_init": 1e-6})
         if not self._stopped():
