@@ -34,8 +34,6 @@ SURE = 0.10
 """Sigma below which a depth claims to be sure."""
 RIGHT, WRONG = 0.10, 0.20
 """Relative errors up to which a depth is right, and above which it is wrong."""
-
-
 PIXELS = 500
 """Pixels with truth of a pair, drawn at random, to which sigma is fitted."""
 

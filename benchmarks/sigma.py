@@ -33,7 +33,7 @@ Pairs = dict[str, list[tuple[Float, dict[str, Float]]]]
 
 
 def pairs_of(frame: pd.DataFrame) -> Pairs:
-    """Errors and terms of the rows that were measured with a computed flow, by family."""
+    """Errors and terms of the rows that were measured with DIS flow, by family."""
     out: Pairs = {}
     columns = [column for column in frame if column.startswith("pixels.terms.")]
     for _, row in frame[frame["ok"].eq(True) & frame["flow"].eq("dis")].iterrows():

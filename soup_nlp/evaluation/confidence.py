@@ -157,7 +157,8 @@ def terms(
     * outline: step of log depth nearby.
     * mixed: `4 p (1 - p)`, p the share of usable flow of the superpixel, at least a half: two
       surfaces may share it.
-    * starts: difference of log depth between the starts from several samples of the flow.
+    * starts: root mean square difference of log depth between the starts from several samples of
+      the flow, see `Start.scatter`.
     * camera: standard deviation by errors of the camera.
     * bends: 1 where surfaces bend: relief follows from their own stretching, not from parallax.
     * drawn: 1 where nothing tells the depth: the camera rests or only turns, something stands still
@@ -187,7 +188,7 @@ def terms(
         "relief": (noise / gap[part] * np.abs(depth - middle[part]))[labels],
         "outline": at_outlines(rec.depth_ref),
         "mixed": (4 * usable * (1 - usable))[labels],
-        "starts": (start.scatter + np.zeros(len(depth)))[labels],
+        "starts": np.broadcast_to(start.scatter, len(depth))[labels],
         "camera": np.minimum(sure.sigma, LARGEST)[labels],
         "bends": start.bends[labels].astype(float),
         "drawn": drawn[labels].astype(float),

@@ -140,10 +140,6 @@ class Start:
         return bool(self.bends.any())
 
 
-MOST_APART = 1.0
-"""Difference of log depths from which two starts disagree entirely about a superpixel."""
-
-
 def most_usual(starts: Sequence[Start], seg: Segmentation, ray: Float) -> tuple[int, Start]:
     """The index of the start that is nearest to the others, and that start with their `scatter`.
 
@@ -160,7 +156,7 @@ def most_usual(starts: Sequence[Start], seg: Segmentation, ray: Float) -> tuple[
         return 0, starts[0]
     depth = np.stack([np.log(start.soup.depth_at(ray)) for start in starts])
     depth -= np.median(depth, axis=1, keepdims=True)
-    apart = np.minimum(np.abs(depth[:, None] - depth), MOST_APART)
+    apart = np.abs(depth[:, None] - depth)
     best = int(np.argmin(apart.sum(axis=1) @ seg.sizes))
     scatter = np.sqrt(np.sum(apart[best] ** 2, axis=0) / (len(starts) - 1))
     return best, replace(starts[best], scatter=scatter)
