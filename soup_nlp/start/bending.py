@@ -243,10 +243,6 @@ TELLS = 7.0
 NOISES, SYSTEMATIC, LEAST_PX, MOST_PX = 2.5, 4.0, 0.01, 0.08
 """Median excess of the error, in units of the noise, from which a surface may bend; below
 `SYSTEMATIC` noises, within these limits in pixels, it never does."""
-LEAST_LEFT, SURELY = 15, 0.5
-"""Least number of superpixels of a piece split from a rigid surface (large ones mix flows), and
-share of the limit of a bending surface's excess up to which a motion surely explains a surface, so
-that pieces it does not explain are no errors of the flow."""
 
 
 def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
@@ -255,39 +251,26 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     A surface bends if the best rigid motion leaves a median excess over the residual of affine
     flows that noise does not explain, or from which depth, which explains what a turn alone does
     not, stands out less than `TELLS` times: an error shared along the epipolar lines would then
-    cause much of the relief. Large pieces that the best motion does not explain are surfaces of
-    their own: where the flow jumps little, a bending surface is joined to its surroundings.
+    cause much of the relief.
 
     Returns:
         The motion that most of the image shares and those of the surfaces, and (N,) True where the
         surface bends.
     """
-    seg, views, usable = flow.seg, flow.views, flow.views.usable
+    views, usable = flow.views, flow.views.usable
     noise = reference_noise(flow.residual)
+    least = float(np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX))
     motions = [dominant(flow)]
-    whole = ~seg.across(surface)
     surface = joined(flow, surface)
-    bends = np.zeros(len(seg), bool)
-    left = [surface == c for c in np.unique(surface[usable])]
-    while left:
-        members = left.pop()
-        at = np.flatnonzero(members & usable)
+    bends = np.zeros(len(surface), bool)
+    for c in np.unique(surface[usable]):
+        at = np.flatnonzero((surface == c) & usable)
         tried = candidates(flow, at, motions[0], motions[:1], max(noise, LEAST_SCALE))
-        excess = views.subset(at).fit(tried).cost - flow.residual[at, None]
-        middle = np.median(excess, axis=0)
+        excess = np.median(views.subset(at).fit(tried).cost - flow.residual[at, None], axis=0)
         gain = np.median(fit_turn(views.subset(at), ANY_TURN)[1] - flow.residual[at])
-        least = np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX)
-        most = max(float(least), min(gain / TELLS, NOISES * noise))
-        best = int(np.argmin(middle))
-        if middle[best] > most:
-            bends |= members
-            continue
-        motions.append(tried[best])
-        if middle[best] <= SURELY * most:
-            unexplained = np.zeros(len(seg), bool)
-            unexplained[at[excess[:, best] > most]] = True
-            piece = connected_pieces(unexplained, seg, whole)
-            size = np.bincount(piece[unexplained], minlength=1)
-            large = np.flatnonzero(size >= max(LEAST_SURFACE * len(seg), LEAST_LEFT))
-            left += [piece == c for c in large]
+        best = int(np.argmin(excess))
+        if excess[best] > max(least, min(gain / TELLS, NOISES * noise)):
+            bends |= surface == c
+        else:
+            motions.append(tried[best])
     return motions, bends
