@@ -3,9 +3,8 @@
 Each rigid component has a scale that its flow does not tell. With z the depths of both sides of a
 pair of neighbours and x the log scales, the program adds up
 
-* contact: the pinball loss of `x_a - x_b - log(z_b / z_a)` over the outline of a component, with
-  the quantile `STANDS` below it, where it stands, and `HIDES` elsewhere, where it hides what is
-  behind it;
+* contact: the pinball loss with the quantile `HIDES` of `x_a - x_b - log(z_b / z_a)` over the
+  outline of a component, which hides what is behind it; below it, where it stands, it counts more;
 * pace: what a component moves farther than the scene, and a little of what it moves less;
 * ground: how far a component reaches below the ground of the scene;
 * order: by how much a component that covers another one is less than `IN_FRONT` before it.
@@ -39,8 +38,8 @@ from soup_nlp.start.components import (
 from soup_nlp.start.occlusion import CLOSING_PX, CONTRAST
 from soup_nlp.start.views import FlowFit
 
-STANDS, HIDES = 0.4, 0.2
-"""Quantiles of the depth ratios along the outline of a component, below it and elsewhere."""
+HIDES = 0.3
+"""Quantile of the depth ratios along the outline of a component, which hides what is behind it."""
 STRONG = 3.0
 """Weight of the contact below a component and of the order along an outline, relative to the
 contact of a whole outline."""
@@ -104,24 +103,20 @@ def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
     return x, tie
 
 
-def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> list[Rows]:
+def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> Rows:
     """Rows of contact between components (N,); none stands on one that is fixed (N,)."""
     seg = flow.seg
     across = seg.across(label)
     zi, zk = soup.depth_across(seg.pairs[across], flow.middle[across])
     ratio = np.log(np.concatenate([zk / zi, zi / zk]))
     around = outlines(label, seg)
-    count = int(label.max()) + 1
-    out = []
-    for below in (True, False):
-        mine = (around.below & flow.options.upright) == below
-        mine &= (around.component != SCENE) & ~fixed[around.neighbour]
-        a, b, length = around.component[mine], around.other[mine], around.contact[mine]
-        weight = length / np.bincount(a, length, count)[a]
-        weight = weight * (STRONG if below else 1.0)
-        share, tie = (STANDS, "contact below") if below else (HIDES, "outline")
-        out.append(rows(a, b, ratio[mine], weight * (1 - share), weight * share, tie))
-    return out
+    mine = (around.component != SCENE) & ~fixed[around.neighbour]
+    a, b, length = around.component[mine], around.other[mine], around.contact[mine]
+    below = around.below[mine] & flow.options.upright
+    part = 2 * a + below
+    weight = length / np.bincount(part, length)[part] * np.where(below, STRONG, 1.0)
+    tie = np.where(below, TIES.index("contact below"), TIES.index("outline"))
+    return Rows(a, b, ratio[mine], weight * (1 - HIDES), weight * HIDES, tie)
 
 
 def pace(flow: FlowFit, soup: Soup, label: Int) -> Rows:
@@ -182,7 +177,7 @@ def scaled(
     if count == 1 or not len(flow.seg.pairs):
         return np.ones(len(soup)), np.full(len(soup), TIES.index("reference"))
     fixed = np.zeros(len(soup), bool) if fixed is None else fixed
-    parts = [*contact(flow, soup, label, fixed), before(flow, soup, label, order)]
+    parts = [contact(flow, soup, label, fixed), before(flow, soup, label, order)]
     if floor is not None:
         parts += [pace(flow, soup, label), above(flow, soup, label, floor)]
     x, tie = minimum(count, parts, np.array([SCENE]))
