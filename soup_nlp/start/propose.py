@@ -30,11 +30,11 @@ from soup_nlp.start.labelling import (
     LEAST_NOISE,
     PIECE_SIZE,
     Labelling,
+    fixed_to_camera,
     labelled,
     limited_noise,
 )
 from soup_nlp.start.occlusion import vote
-from soup_nlp.start.overlay import fixed_to_camera
 from soup_nlp.start.scales import ground, held, on_ground, scaled
 from soup_nlp.start.settle import settle
 from soup_nlp.start.views import LEAST_PARALLAX_PX, LEAST_PIXELS, LEAST_SEEN, FlowFit, Views

@@ -5,7 +5,7 @@ pair of neighbours and x the log scales, the program adds up
 
 * contact: the pinball loss with the quantile `HIDES` of `x_a - x_b - log(z_b / z_a)` over the
   outline of a component, which hides what is behind it; below it, where it stands, it counts more;
-* pace: what a component moves farther than the scene, and a little of what it moves less;
+* pace: what a component moves farther than the scene;
 * ground: how far a component reaches below the ground of the scene;
 * order: by how much a component that covers another one is less than `IN_FRONT` before it.
 
@@ -43,8 +43,8 @@ HIDES = 0.3
 STRONG = 3.0
 """Weight of the contact below a component and of the order along an outline, relative to the
 contact of a whole outline."""
-FASTER, SLOWER = 1.5, 0.05
-"""Price of a log unit by which a component moves farther or less far than the scene."""
+FASTER = 1.5
+"""Price of a log unit by which a component moves farther than the scene."""
 FREE = 1.0
 """Log units by which a component that stands on something may move farther than the scene."""
 UNDER = 2.0
@@ -123,7 +123,7 @@ def pace(flow: FlowFit, soup: Soup, label: Int) -> Rows:
     """Rows of the displacement of components (N,)."""
     far = log_pace(displacement(soup, flow.views.anchor, label), label)
     c = np.flatnonzero((np.abs(far) < UNKNOWN) & (np.arange(len(far)) != SCENE))
-    return rows(c, np.array(SCENE), FREE - far[c], FASTER, SLOWER, "too fast")
+    return rows(c, np.array(SCENE), FREE - far[c], FASTER, 0.0, "too fast")
 
 
 def above(flow: FlowFit, soup: Soup, label: Int, floor: Float) -> Rows:
