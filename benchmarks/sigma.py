@@ -97,13 +97,11 @@ def write_sigma(page: Path, frame: pd.DataFrame) -> str:
         f" {mean_loss(pairs, every):.4f}. Least and most: with one family left out.",
         markdown(fits.rename_axis("factor"), ".3f"),
     ]
-    for title, rows, hidden in (
-        ("today's factors", before, []),
-        ("factors of the other families", after, ["flat", "right_unsure", "ause"]),
-    ):
-        table = pd.DataFrame(rows).set_index("family")[list(SCORES)].drop(columns=hidden)
-        table.loc["mean"] = table.mean()
-        blocks += [f"## By {title}", markdown(table, ".3f")]
+    table = pd.DataFrame(before).set_index("family")[list(SCORES)]
+    table["nll, left out"] = pd.DataFrame(after).set_index("family")["nll"]
+    table.loc["mean"] = table.mean()
+    about = "By today's factors; nll, left out: by those fitted to the other families."
+    blocks += ["## By family", about, markdown(table, ".3f")]
     blocks.append(f"![Reliability of sigma by family]({page.stem}.png)")
     return "\n\n".join(blocks) + "\n"
 
