@@ -21,9 +21,9 @@ from soup_nlp.geometry.surface import hidden
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
-from soup_nlp.start.components import FIXED, SCENE
 from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
+from soup_nlp.start.regions import FIXED, SCENE
 
 FACTORS = {
     "flow": 2.5,

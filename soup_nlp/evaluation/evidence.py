@@ -25,14 +25,14 @@ from soup_nlp.start.bending import (
     turned,
 )
 from soup_nlp.start.camera_error import (
-    STEPS,
+    TRIED_ERRORS,
     CameraError,
     camera_error,
     camera_errors,
     likeliest,
 )
-from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Matches
+from soup_nlp.start.regions import SCENE
 
 CLIP_PX = 3.0
 """Limit of a superpixel's error where explanations are compared, pixels."""
@@ -62,7 +62,7 @@ class Evidence:
 
     @property
     def camera(self) -> str | None:
-        """Error of the given camera that the flow shows, one of `KINDS`, or None."""
+        """Error of the given camera that the flow shows, one of `ERROR_KINDS`, or None."""
         return likeliest(self.errors)
 
     @property
@@ -128,7 +128,7 @@ def evidence(
     if focal_sigma and scene.any():
         # its deviation is known
         guess = camera_error(_matches(data, scene), "focal length", focal_sigma)
-        acting[guess.kind] = guess._replace(density=tuple(special.softmax(-(STEPS**2) / 2)))
+        acting[guess.kind] = guess._replace(density=tuple(special.softmax(-(TRIED_ERRORS**2) / 2)))
     squares = np.zeros(len(soup))
     if acting:
         still, point = component == SCENE, soup.points(data.anchor_ray)

@@ -23,12 +23,12 @@ from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import ITERATIONS, Stages
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.camera_error import camera_error
-from soup_nlp.start.components import TIES, TOO_FAST
 from soup_nlp.start.epipolar import Matches, estimate
 from soup_nlp.start.given_depth import Given, by_prior
 from soup_nlp.start.occlusion import covering
-from soup_nlp.start.prior_evidence import LEAST_SIGMA, PIECES, PriorEvidence, judged
+from soup_nlp.start.prior_evidence import JUDGED_PIECES, LEAST_SIGMA, PriorEvidence, judged
 from soup_nlp.start.propose import Start, most_usual, propose
+from soup_nlp.start.regions import TIES, TOO_FAST
 from soup_nlp.start.start_options import HOMOGRAPHY, SeededStart
 from soup_nlp.start.views import FlowFit
 from soup_nlp.storage.progress import Watch
@@ -164,8 +164,8 @@ def _judged(problem: Problem, labels: Labels, begun: Begun) -> tuple[Begun, Prio
     Superpixels follow a prior that is used although the flow does not confirm it.
     """
     s, pair, few = problem.segmentation, begun[1], begun
-    if s.superpixels > PIECES:
-        pieces = superpixels(problem, pair, PIECES)
+    if s.superpixels > JUDGED_PIECES:
+        pieces = superpixels(problem, pair, JUDGED_PIECES)
         few = _begun(problem, pair, _segmented(problem, pair, pieces))
     evidence = judged(*few, problem.depth_prior.kind)
     if evidence.used and not evidence.confirmed and s.follow_flow_px is not None:

@@ -12,7 +12,7 @@ from soup_nlp.data.working_size import scaled_camera
 from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
 from soup_nlp.start.camera_error import better_camera
-from soup_nlp.start.components import FIXED, SCENE
+from soup_nlp.start.regions import FIXED, SCENE
 
 SAID = {
     "measured": "measured by parallax",

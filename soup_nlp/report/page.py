@@ -24,7 +24,7 @@ from soup_nlp.report.figures import Legend, Picture, component_colours
 from soup_nlp.report.findings import ORIGINS, SAID, drawn_line
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import Result
-from soup_nlp.start.components import TIES
+from soup_nlp.start.regions import TIES
 from soup_nlp.storage.files import plain
 
 MODES = {

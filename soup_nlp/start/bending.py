@@ -17,9 +17,9 @@ from scipy.optimize import least_squares
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import connected_labels, connected_pieces, numbered
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.labelling import PIECE_SIZE, Labelling, candidates, dominant
+from soup_nlp.start.regions import connected_labels, connected_pieces, numbered
 from soup_nlp.start.views import FlowFit, Views
 
 REFERENCE = 1000
@@ -37,7 +37,7 @@ LEAST_GAP_PX = 0.5
 """Pixels by which depths must explain the flow of a component better than one depth or a turn, at
 least `LEAST_GAP` noises of the flow, so that it determines them; from a third on it may confirm a
 prior."""
-STEP, NEAREST = 1e-5, 1e-3
+MATRIX_STEP, LEAST_MOVED_DEPTH = 1e-5, 1e-3
 """Step by which matrices of motions are differentiated, and least depth of a moved point."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
 """Pixels of the fit of a turn, and the least scale of the refinement of a motion, pixels."""
@@ -119,15 +119,15 @@ def fit_robustly(
 
     def moved(x: Float) -> tuple[Float, Float]:
         out = matrix(x @ free) @ point
-        depth = np.maximum(out[2], NEAREST)
+        depth = np.maximum(out[2], LEAST_MOVED_DEPTH)
         return out[:2] / depth, depth
 
     def miss(x: Float) -> Float:
         return (scale * (moved(x)[0] - target)).ravel()
 
     def slope(x: Float) -> Float:
-        (at, depth), step = moved(x), STEP * free
-        change = (matrix(x @ free + step) - matrix(x @ free - step)) @ point / (2 * STEP)
+        (at, depth), step = moved(x), MATRIX_STEP * free
+        change = (matrix(x @ free + step) - matrix(x @ free - step)) @ point / (2 * MATRIX_STEP)
         return (scale / depth * (change[:, :2] - at * change[:, 2:])).reshape(size, -1).T
 
     x = np.zeros(size)
@@ -240,9 +240,9 @@ def torn(flow: FlowFit, surface: Int, bends: Mask) -> Mask:
 TELLS = 7.0
 """Ratio of what depth explains to what it leaves from which the flow tells of depth. Of rigid pairs
 `sun3d_lounge` and `s7_kitchen_150` have the least, 7.8; `rgbd/opening_door`, which bends, 6.5."""
-NOISES, SYSTEMATIC, LEAST_PX, MOST_PX = 2.5, 4.0, 0.01, 0.08
+MOST_NOISES, LEAST_NOISES, LEAST_EXCESS_PX, MOST_EXCESS_PX = 2.5, 4.0, 0.01, 0.08
 """Median excess of the error, in units of the noise, from which a surface may bend; below
-`SYSTEMATIC` noises, within these limits in pixels, it never does."""
+`LEAST_NOISES` noises, within these limits in pixels, it never does."""
 
 
 def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
@@ -259,7 +259,7 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
     """
     views, usable = flow.views, flow.views.usable
     noise = reference_noise(flow.residual)
-    least = float(np.clip(SYSTEMATIC * noise, LEAST_PX, MOST_PX))
+    least = float(np.clip(LEAST_NOISES * noise, LEAST_EXCESS_PX, MOST_EXCESS_PX))
     motions = [dominant(flow)]
     surface = joined(flow, surface)
     bends = np.zeros(len(surface), bool)
@@ -269,7 +269,7 @@ def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
         excess = np.median(views.subset(at).fit(tried).cost - flow.residual[at, None], axis=0)
         gain = np.median(fit_turn(views.subset(at), ANY_TURN)[1] - flow.residual[at])
         best = int(np.argmin(excess))
-        if excess[best] > max(least, min(gain / TELLS, NOISES * noise)):
+        if excess[best] > max(least, min(gain / TELLS, MOST_NOISES * noise)):
             bends |= surface == c
         else:
             motions.append(tried[best])

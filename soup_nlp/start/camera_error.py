@@ -16,7 +16,7 @@ from soup_nlp.arrays import Float
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.start.epipolar import Matches, Motion, essential_motion, refine_near, triangulate
 
-KINDS = {
+ERROR_KINDS = {
     "focal length": (0.8, 0.25),
     "principal point in x": (0.1, 0.02),
     "principal point in y": (0.1, 0.02),
@@ -26,14 +26,14 @@ KINDS = {
 """Standard deviation of every error of a given camera, and the probability of one without the flow:
 of a log focal length, which is mistaken more often than all else, of the principal point relative
 to the focal length, of k1, and of the log ratio of the focal lengths of the frames."""
-STEPS = np.linspace(-2.0, 2.0, 33)
+TRIED_ERRORS = np.linspace(-2.0, 2.0, 33)
 """Errors that are tried, in standard deviations."""
 MEASUREMENTS = 80
 """The flow counts as this many independent measurements: its errors are alike over parts of the
 image, so that its pixels are no independent ones."""
 LEAST_ODDS = 3.0
 """Log odds at which there is an error, and, against it, none that counts: twenty to one."""
-PIXELS, NOISE_PX, ROUNDS = 2000, 0.05, 4
+ERROR_PIXELS, ERROR_NOISE_PX, ERROR_FITS = 2000, 0.05, 4
 """Largest number of correspondences, the scale of their robust loss in pixels, and the rounds of a
 fit that begins at that of the error before."""
 LEAST_MEDIAN_PX = 0.005
@@ -46,7 +46,7 @@ class CameraError(NamedTuple):
     """What a flow says of one kind of error of the camera.
 
     Attributes:
-        kind: One of `KINDS`.
+        kind: One of `ERROR_KINDS`.
         mean: Its mean, if there is one.
         deviation: Its standard deviation, if there is one.
         log_odds: Logarithm of the probability that there is one, over that of none.
@@ -118,30 +118,32 @@ def camera_error(matches: Matches, kind: str, deviation: float, wrong: float = 1
 
     Args:
         matches: Correspondences with the camera as it is.
-        kind: One of `KINDS`.
+        kind: One of `ERROR_KINDS`.
         deviation: Standard deviation of the error.
         wrong: Probability of an error, without the flow; 1 for a guess.
     """
-    matches = matches.confident(PIXELS)
+    matches = matches.confident(ERROR_PIXELS)
     distance, motions = _explained(matches, kind, deviation)
     prior = float(special.logit(wrong))
     if not motions:
         return CameraError(kind, 0.0, deviation, prior)
     noise = max(float(np.median(distance, axis=1).min()), LEAST_MEDIAN_PX)
     against = MEASUREMENTS * np.mean(np.log1p((distance / noise) ** 2), axis=1)
-    gain = against[len(STEPS) // 2] - against - STEPS**2 / 2
+    gain = against[len(TRIED_ERRORS) // 2] - against - TRIED_ERRORS**2 / 2
     density = special.softmax(gain)
-    x = deviation * STEPS
+    x = deviation * TRIED_ERRORS
     mean = float(density @ x)
     # no finer than the errors that are tried
-    spread = max(float(np.sqrt(density @ (x - mean) ** 2)), deviation * (STEPS[1] - STEPS[0]))
+    spread = max(
+        float(np.sqrt(density @ (x - mean) ** 2)), deviation * (TRIED_ERRORS[1] - TRIED_ERRORS[0])
+    )
     # the flow is so much more probable with an error
-    more = float(special.logsumexp(gain) - special.logsumexp(-(STEPS**2) / 2))
+    more = float(special.logsumexp(gain) - special.logsumexp(-(TRIED_ERRORS**2) / 2))
     return CameraError(kind, mean, spread, prior + more, tuple(x), tuple(density), motions)
 
 
 def _explained(matches: Matches, kind: str, deviation: float) -> tuple[Float, tuple[Motion, ...]]:
-    """The best motion with every error, and its Sampson distances (len(STEPS), M), pixels.
+    """The best motion with every error, and its Sampson distances (len(TRIED_ERRORS), M), pixels.
 
     There are no motions where the flow determines none.
 
@@ -149,11 +151,11 @@ def _explained(matches: Matches, kind: str, deviation: float) -> tuple[Float, tu
     end to the other, and is sought from the ends as well.
     """
     of_focal = kind == "focal length"
-    errors, tried = deviation * STEPS, []
+    errors, tried = deviation * TRIED_ERRORS, []
     for x in errors:
         rays = corrected(kind, x, matches.ray, matches.target)
         tried.append(Matches(*rays, matches.weight, matches.focal * np.exp(x * of_focal)))
-    count, middle = len(STEPS), len(STEPS) // 2
+    count, middle = len(TRIED_ERRORS), len(TRIED_ERRORS) // 2
     ways = [range(middle, count), range(middle, -1, -1)]
     if of_focal:
         ways += [range(count), range(count - 1, -1, -1)]
@@ -164,9 +166,9 @@ def _explained(matches: Matches, kind: str, deviation: float) -> tuple[Float, tu
         if motion is None:
             continue
         for k in way:
-            motion = refine_near(motion, tried[k], NOISE_PX, rounds=ROUNDS)
+            motion = refine_near(motion, tried[k], ERROR_NOISE_PX, rounds=ERROR_FITS)
             distance = _distance(tried[k], motion, kind, errors[k], matches)
-            error = float(np.mean(np.log1p((distance / NOISE_PX) ** 2)))
+            error = float(np.mean(np.log1p((distance / ERROR_NOISE_PX) ** 2)))
             if error < least[k]:
                 best[k], least[k], motions[k] = distance, error, motion
     complete = len(motions) == count
@@ -195,7 +197,7 @@ def _distance(tried: Matches, motion: Motion, kind: str, x: float, given: Matche
 
 def camera_errors(matches: Matches) -> dict[str, CameraError]:
     """What correspondences say of every kind of error of a given camera, see `camera_error`."""
-    return {kind: camera_error(matches, kind, *prior) for kind, prior in KINDS.items()}
+    return {kind: camera_error(matches, kind, *prior) for kind, prior in ERROR_KINDS.items()}
 
 
 def likeliest(errors: Mapping[str, CameraError]) -> str | None:

@@ -13,12 +13,12 @@ from scipy.optimize import least_squares
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 
-REFINEMENTS, STEPS = 5, 30
+REFINEMENTS, EVALUATIONS = 5, 30
 """Largest number of robust fits of a motion, each with the noise estimated by the last, and of
 evaluations of a fit."""
 LEAST_WIDTH = 0.01
 """Smallest scale of the robust loss, pixels."""
-NEAR = np.array([0.02] * 3 + [0.3] * 2)
+MOTION_SIGMA = np.array([0.02] * 3 + [0.3] * 2)
 """Standard deviations of the change of a motion by `refine_near`: rotation in radians, direction of
 the translation."""
 
@@ -172,7 +172,9 @@ def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
         return (root * (essential_slope(motion, x) @ matches.slope(moved(x)))).T
 
     for _ in range(REFINEMENTS):
-        fit = least_squares(residual, x, jacobian, loss="cauchy", f_scale=scale, max_nfev=STEPS)
+        fit = least_squares(
+            residual, x, jacobian, loss="cauchy", f_scale=scale, max_nfev=EVALUATIONS
+        )
         x = fit.x
         error = np.abs(residual(x))
         near = error[error < max(3 * scale, LEAST_WIDTH)]
@@ -184,7 +186,7 @@ def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
 
 
 def refine_near(
-    motion: Motion, matches: Matches, noise: float, prior: Float = NEAR, rounds: int = 8
+    motion: Motion, matches: Matches, noise: float, prior: Float = MOTION_SIGMA, rounds: int = 8
 ) -> Motion:
     """Motion near a given one that lowers the robust Sampson distance.
 
@@ -195,7 +197,7 @@ def refine_near(
         motion: Where to begin.
         matches: Correspondences.
         noise: Flow noise, pixels.
-        prior: (5,) standard deviations of the change, see `NEAR`.
+        prior: (5,) standard deviations of the change, see `MOTION_SIGMA`.
         rounds: Gauss-Newton steps.
     """
     # one row per coordinate, the pixels contiguous
@@ -251,7 +253,7 @@ def essential_slope(motion: Motion, x: Float) -> Float:
     return np.concatenate([by_turn, by_shift]).reshape(5, 9)
 
 
-ROUNDS = 6
+TRANSLATION_FITS = 6
 """Re-weighted fits of a translation."""
 
 
@@ -268,7 +270,7 @@ def fit_translation(R: Float, matches: Matches, noise: float) -> Motion:
     """
     r, q, weight, focal = matches
     normal, w, t = np.cross(r @ R.T, q), weight, np.zeros(3)
-    for _ in range(ROUNDS):
+    for _ in range(TRANSLATION_FITS):
         t = np.linalg.eigh((normal * w[:, None]).T @ normal)[1][:, 0]
         spread = np.maximum(np.linalg.norm(np.cross(t, q)[:, :2], axis=1), 1e-6)
         # Sampson's weight: error in pixels, not the algebraic one

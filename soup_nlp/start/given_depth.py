@@ -15,7 +15,6 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import least_gap
-from soup_nlp.start.components import FIXED, SCENE, TIES
 from soup_nlp.start.prior_evidence import (
     COMPARED,
     LEAST_SIGMA,
@@ -24,12 +23,13 @@ from soup_nlp.start.prior_evidence import (
     without_gaps,
 )
 from soup_nlp.start.propose import Start
+from soup_nlp.start.regions import FIXED, SCENE, TIES
 from soup_nlp.start.views import FlowFit
 
-HELD, NEAR = 4 / 300, 0.1
+HELD_SHARE, NEAR_SHARE = 4 / 300, 0.1
 """Weight of the whole image's error beside residuals, as a share of its area; standard deviation of
 the distance up to which a residual counts, relative to the square root of that area."""
-REACH = 4
+SLOPE_REACH = 4
 """Pixels to either side between which a prior's slope is a difference."""
 
 
@@ -148,8 +148,12 @@ def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:
     """
 
     def along_rows(values: Float, focal: float) -> Float:
-        wide = np.pad(values, ((0, 0), (REACH, REACH)), mode="reflect", reflect_type="odd")
-        return focal * (wide[:, 2 * REACH :] - wide[:, : -2 * REACH]) / (2 * REACH)
+        wide = np.pad(
+            values, ((0, 0), (SLOPE_REACH, SLOPE_REACH)), mode="reflect", reflect_type="odd"
+        )
+        return (
+            focal * (wide[:, 2 * SLOPE_REACH :] - wide[:, : -2 * SLOPE_REACH]) / (2 * SLOPE_REACH)
+        )
 
     K, index = pair.K_ref, np.arange(len(seg))
     change = along_rows(inverse, K[0, 0]), along_rows(inverse.T, K[1, 1]).T
@@ -161,12 +165,12 @@ def _local(seg: Segmentation, known: Mask, residual: Float, sigma: float) -> tup
     """(N,) correction of a prior's log depth by known depths near it, and its standard deviation.
 
     A Gaussian window averages the residuals (N,), log ratios of depths that are known (N,) to the
-    prior's, and their squares, beside `HELD` of none and sigma^2, that of the whole image.
+    prior's, and their squares, beside `HELD_SHARE` of none and sigma^2, that of the whole image.
     """
     area = seg.labels.size
     squared = cdist(seg.anchors, seg.anchors[known], "sqeuclidean")
-    weight = np.exp(-0.5 * squared / (NEAR**2 * area)) * seg.sizes[known] / area
-    total = HELD + weight.sum(axis=1)
+    weight = np.exp(-0.5 * squared / (NEAR_SHARE**2 * area)) * seg.sizes[known] / area
+    total = HELD_SHARE + weight.sum(axis=1)
     mean = weight @ residual[known] / total
-    variance = (HELD * sigma**2 + weight @ residual[known] ** 2) / total - mean**2
+    variance = (HELD_SHARE * sigma**2 + weight @ residual[known] ** 2) / total - mean**2
     return mean, np.sqrt(np.maximum(variance, LEAST_SIGMA**2))

@@ -3,7 +3,7 @@
 The labels l minimise, with TRW-S, the energy
 
     sum_i c_i rho(e_i(l_i)) + sum_ij w_ij [l_i != l_j] + price * (number of motions that are used)
-    rho(e) = min(max(e / s - 1, 0), MOST)
+    rho(e) = min(max(e / s - 1, 0), MOST_COST)
 
 where e is the error that a motion leaves beyond that of an affine flow, c the confidence of the
 flow, and w the price of a change of motion where the flow is continuous. Large parts of a dense
@@ -24,7 +24,6 @@ import numpy as np
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
-from soup_nlp.start.components import belonging, connected_labels, connected_pieces
 from soup_nlp.start.epipolar import (
     SIDEWAYS,
     Motion,
@@ -32,27 +31,28 @@ from soup_nlp.start.epipolar import (
     fit_translation,
     refine_near,
 )
+from soup_nlp.start.regions import belonging, connected_labels, connected_pieces
 from soup_nlp.start.views import FlowFit
 
 CLIP = 3.0
 """Errors are clipped at this many pixels where motions are compared."""
 LEAST_NOISE, MOST_NOISE = 0.05, 0.6
 """Limits of the flow's noise, pixels."""
-SHARED, LEAST_SHARED = 3.0, 0.03
+SHARED_SCALE, LEAST_SHARED = 3.0, 0.03
 """Error that the flow shares, in units of the median error under the best motions, and its least,
 pixels."""
-MOST, CHANGE, PRICE = 8.0, 6.0, 0.04
+MOST_COST, CHANGE_COST, PRICE = 8.0, 6.0, 0.04
 """Largest cost of a superpixel, half the cost of one that differs from all its neighbours, and
 price of a motion by the number of superpixels: half a percent of them, if no other motion explains
 them, and at least one, pay for it."""
-SURFACES, PIECES, ROUNDS = 12, 6, 3
+PROPOSAL_SURFACES, PROPOSAL_PIECES, PROPOSAL_ROUNDS = 12, 6, 3
 """Largest numbers of surfaces and of pieces that no motion explains for which motions are proposed,
 and of rounds of proposals."""
 PIECE_SIZE = 4
 """Least number of superpixels that determine a motion."""
 UNEXPLAINED = 0.25
-"""Share of `MOST` from which on a motion does not explain a superpixel."""
-PIXELS, MOST_PIXELS = 1500, 6000
+"""Share of `MOST_COST` from which on a motion does not explain a superpixel."""
+MOTION_PIXELS, SCENE_PIXELS = 1500, 6000
 """Largest number of pixels to which a motion is fitted, and that of the whole image."""
 
 
@@ -97,7 +97,7 @@ class Labelling:
     @property
     def unexplained(self) -> Mask:
         """(N,) True where the motion does not explain the flow."""
-        return _price(self.excess, self.shared) > UNEXPLAINED * MOST
+        return _price(self.excess, self.shared) > UNEXPLAINED * MOST_COST
 
 
 def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
@@ -111,16 +111,18 @@ def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
     if not seen.any():
         return Labelling.of(flow, motions[:1], np.zeros(len(flow.seg), np.int64), LEAST_SHARED)
     motions = motions + _of_surfaces(flow, seen, surface, motions[0])
-    for left in reversed(range(ROUNDS + 1)):
+    for left in reversed(range(PROPOSAL_ROUNDS + 1)):
         error = views.fit(motions).penalised() - flow.residual[:, None]
         excess = np.maximum(error, 0.0)
-        shared = max(LEAST_SHARED, SHARED * float(np.median(excess.min(axis=1)[seen])))
+        shared = max(LEAST_SHARED, SHARED_SCALE * float(np.median(excess.min(axis=1)[seen])))
         cost = views.weight.mean(axis=1)[:, None] * _price(excess, shared)
         used, label = _paying(flow, cost)
         if left:
-            bad = seen & (cost[np.arange(len(cost)), np.array(used)[label]] > UNEXPLAINED * MOST)
+            bad = seen & (
+                cost[np.arange(len(cost)), np.array(used)[label]] > UNEXPLAINED * MOST_COST
+            )
             kept = [motions[c] for c in used]
-            motions = _refitted(flow, kept, label, seen, bad, shared / SHARED)
+            motions = _refitted(flow, kept, label, seen, bad, shared / SHARED_SCALE)
     label = belonging(flow.seg, label, seen)
     label = _earned(flow, np.where(seen[:, None], cost[:, used], 0.0), label)
     return Labelling.of(flow, [motions[c] for c in used], label, shared)
@@ -128,22 +130,22 @@ def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
 
 def price_of_motion(count: int) -> float:
     """Price of a motion in an image of `count` superpixels."""
-    return max(MOST, PRICE * count)
+    return max(MOST_COST, PRICE * count)
 
 
 def _price(excess: Float, shared: float) -> Float:
-    return np.clip(excess / shared - 1.0, 0.0, MOST)
+    return np.clip(excess / shared - 1.0, 0.0, MOST_COST)
 
 
 def dominant(flow: FlowFit) -> Motion:
     """The motion that most of the image shares."""
-    matches = flow.views.matches().confident(MOST_PIXELS)
+    matches = flow.views.matches().confident(SCENE_PIXELS)
     return estimate(matches, flow.options.threshold_px) or SIDEWAYS
 
 
 def _of_surfaces(flow: FlowFit, seen: Mask, surface: Int, main: Motion) -> list[Motion]:
     """Motions of the surfaces (N,) with the most superpixels that are seen."""
-    largest = np.argsort(-np.bincount(surface[seen]))[:SURFACES]
+    largest = np.argsort(-np.bincount(surface[seen]))[:PROPOSAL_SURFACES]
     groups = [np.flatnonzero((surface == c) & seen) for c in largest]
     scale = limited_noise(flow.residual[seen])
     large = [at for at in groups if len(at) >= PIECE_SIZE]
@@ -159,7 +161,7 @@ def candidates(
     `scale` is the error of the flow across epipolar lines, pixels.
     """
     noise = limited_noise(flow.residual[at])
-    matches = flow.views.subset(at).matches(PIXELS)
+    matches = flow.views.subset(at).matches(MOTION_PIXELS)
     shift = fit_translation(main.R, matches, max(noise, 0.1))
     refined = [refine_near(m, matches, scale) for m in (*present, shift)]
     own = estimate(matches, max(3 * noise, 0.3))
@@ -172,7 +174,7 @@ def _refitted(
     """Motions with candidates for the superpixels of each and for pieces that none explains."""
     main = motions[int(np.argmax(np.bincount(label[seen], minlength=len(motions))))]
     piece = connected_pieces(bad, flow.seg)
-    large = np.argsort(-np.bincount(piece[bad], minlength=1))[:PIECES]
+    large = np.argsort(-np.bincount(piece[bad], minlength=1))[:PROPOSAL_PIECES]
     groups = [((label == c) & seen, [m]) for c, m in enumerate(motions)]
     out = list(motions)
     for mask, own in groups + [(piece == c, []) for c in large]:
@@ -218,7 +220,7 @@ def _earned(flow: FlowFit, cost: Float, label: Int) -> Int:
 
 
 def smooth(flow: FlowFit, cost: Float) -> Int:
-    """(N,) labels that minimise costs (N, M) plus `CHANGE` where neighbours differ, by TRW-S.
+    """(N,) labels that minimise costs (N, M) plus `CHANGE_COST` where neighbours differ, by TRW-S.
 
     The weight of a neighbour is its share of the outlines times its affinity.
     """
@@ -228,7 +230,7 @@ def smooth(flow: FlowFit, cost: Float) -> Int:
     i, k = seg.pairs.T
     length = seg.boundary_length.astype(float)
     outline = np.bincount(i, length, n) + np.bincount(k, length, n)
-    weight = CHANGE * flow_affinity(flow) * length * (1 / outline[i] + 1 / outline[k])
+    weight = CHANGE_COST * flow_affinity(flow) * length * (1 / outline[i] + 1 / outline[k])
     return solve_trws(cost, seg.pairs, weight[:, None, None] * (1 - np.eye(m)), max_iter=30).labels
 
 
@@ -239,7 +241,7 @@ def flow_affinity(flow: FlowFit) -> Float:
 
 # --- regions that stand still in the image of a moving camera -------------------------------------
 
-STILL_PX = 1.0
+FIXED_PX = 1.0
 """Mean displacement up to which a superpixel may stand still, pixels: it may reflect movers."""
 CONTRADICTED_PX = 0.5
 """Least error of the best depth, pixels, beside the displacement."""
@@ -263,7 +265,7 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     """
     seg, views, usable = flow.seg, flow.views, flow.views.usable
     none, shift = np.zeros(len(seg), bool), views.distance(views.ray)
-    may = usable & (shift < STILL_PX)
+    may = usable & (shift < FIXED_PX)
     if may.sum() < PIECE_SIZE or not np.array_equal(flow.K_ref, flow.K_next):
         return none, shift
     camera = dominant(flow.without(may | ~usable))

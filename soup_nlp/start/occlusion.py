@@ -13,10 +13,10 @@ from soup_nlp.arrays import Float, Image, Int
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.start.components import numbered
+from soup_nlp.start.regions import numbered
 from soup_nlp.start.views import FlowFit
 
-WIDEST = 8
+WIDEST_STRIP = 8
 """Largest width of a strip beside an outline, pixels."""
 LEAST_STRIP = 3
 """Least number of pixels of a strip."""
@@ -60,9 +60,9 @@ def covering(pair: Pair, flow: FlowFit) -> Float:
 
     landed = [target(ends[:, e], edge) for e in (0, 1)]
     closing = np.einsum("mbc,mc->mb", landed[0] - landed[1], normal).mean(axis=1)
-    step = np.arange(1.0, WIDEST + 1)
-    inside = step <= np.clip(np.abs(closing) + 1.5, 2, WIDEST)[:, None, None]
-    share = (np.arange(WIDEST) + 0.5)[:, None] / WIDEST
+    step = np.arange(1.0, WIDEST_STRIP + 1)
+    inside = step <= np.clip(np.abs(closing) + 1.5, 2, WIDEST_STRIP)[:, None, None]
+    share = (np.arange(WIDEST_STRIP) + 0.5)[:, None] / WIDEST_STRIP
     between = landed[0][:, :, None] + (landed[1] - landed[0])[:, :, None] * share
     gap = _colours(after, between)
     covered, uncovered = np.full((2, len(rows), 2), np.nan)

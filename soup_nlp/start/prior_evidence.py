@@ -21,10 +21,10 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
 from soup_nlp.start.bending import RELIEF, displaced, fit_robustly, least_gap, trimmed_mean
-from soup_nlp.start.components import SCENE
 from soup_nlp.start.epipolar import Motion
 from soup_nlp.start.labelling import CLIP
 from soup_nlp.start.propose import Start
+from soup_nlp.start.regions import SCENE
 from soup_nlp.start.settle import common_error, most_probable
 from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
 
@@ -41,16 +41,16 @@ COMPARED = 8
 """Least number of superpixels whose flow is compared with a prior."""
 DEEPEST = 50.0
 """Largest depth relative to the median where an inverse depth has a shift."""
-SIDE = 320
+COMPARED_SIDE = 320
 """Longer side of the maps that are compared, pixels."""
-PIECES = 300
+JUDGED_PIECES = 300
 """Superpixels with which a prior is judged, whatever a solve has. With 1,000 the flow of
 omd_occlusion_161 does not confirm its depth warped by 20 % (0.66 instead of 0.56), and maps that
 are shifted over the image vary little within superpixels, too."""
-TRIALS, FARTHEST, NEAREST = 60, 1 / 3, 0.1
+SHIFT_TRIALS, MOST_SHIFT, LEAST_SHIFT = 60, 1 / 3, 0.1
 """Shifted maps, every other one mirrored; the largest shift relative to the side, and the least one
 of a map that is not mirrored, relative to the width."""
-LEAST = 3.0
+LEAST_MARGIN = 3.0
 """Standard deviations by which a right map follows superpixels (counted twice) and edges better
 than the shifted ones. Where no flow confirms them right maps have 3.2 and more, maps of other
 scenes 2.8 and less."""
@@ -80,7 +80,9 @@ class PriorEvidence:
 
     def __str__(self) -> str:
         by_flow = f"it explains {self.explained:.0%} of the relief by flow, limit {EXPLAINED:.0%}"
-        by_edges = f"it follows edges by {self.margin:.1f} deviations from chance, limit {LEAST:g}"
+        by_edges = (
+            f"it follows edges by {self.margin:.1f} deviations from chance, limit {LEAST_MARGIN:g}"
+        )
         why = by_flow if np.isnan(self.margin) else by_edges
         if not self.used:
             return f"the depth prior is not used: {why}"
@@ -201,7 +203,7 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
     """Evidence of flow and image for the depth prior of a pair.
 
     Args:
-        start: Start without the prior, with about `PIECES` superpixels.
+        start: Start without the prior, with about `JUDGED_PIECES` superpixels.
         pair: Images and depth prior.
         flow: The flow of these superpixels.
         kind: Kind of the prior's values; None to find it.
@@ -237,7 +239,7 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
         if evidence.confirmed:
             return evidence
     margin = np.nan if determined else edge_margin(log_depth(whole), pair.image_ref)
-    sigma = UNCONFIRMED if margin > LEAST else np.inf
+    sigma = UNCONFIRMED if margin > LEAST_MARGIN else np.inf
     return PriorEvidence(kind, log_depth, ratio, sigma, determined, margin)
 
 
@@ -261,7 +263,7 @@ def as_log_depth(kind: Kind, value: Float, shift: float = 0.0) -> Callable[[Floa
 def edge_margin(values: Float, image: Image) -> float:
     """Standard deviations by which a map (H, W) follows superpixels and edges of its image better
     than by chance; -inf for one that varies within superpixels, or not at all."""
-    rows, columns = (max(8, round(n * SIDE / max(values.shape))) for n in values.shape)
+    rows, columns = (max(8, round(n * COMPARED_SIDE / max(values.shape))) for n in values.shape)
 
     def resized(values: Any) -> Any:
         return cv2.resize(values, (columns, rows), interpolation=cv2.INTER_AREA)
@@ -271,7 +273,7 @@ def edge_margin(values: Float, image: Image) -> float:
         return -np.inf
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(float), (0, 0), 1.5)
     edges, steps = _ranks(resized(_gradient(grey))), _ranks(_gradient(small))
-    superpixel = segment(resized(image), PIECES)
+    superpixel = segment(resized(image), JUDGED_PIECES)
     count = np.maximum(np.bincount(superpixel.ravel()), 1)
 
     def scores(mirrored: int, right: float, down: float) -> tuple[float, float]:
@@ -289,10 +291,10 @@ def edge_margin(values: Float, image: Image) -> float:
 
     rng = np.random.default_rng(0)
     trials: list[tuple[float, float]] = []
-    while len(trials) < TRIALS:
-        down, right = np.trunc(FARTHEST * rng.uniform(-1, 1, 2) * (rows, columns))
+    while len(trials) < SHIFT_TRIALS:
+        down, right = np.trunc(MOST_SHIFT * rng.uniform(-1, 1, 2) * (rows, columns))
         mirrored = len(trials) % 2
-        if mirrored or abs(down) + abs(right) >= NEAREST * columns:
+        if mirrored or abs(down) + abs(right) >= LEAST_SHIFT * columns:
             trials.append(scores(mirrored, -right, -down))
     chance = np.array(trials)
     unshifted = np.array(scores(0, 0.0, 0.0))

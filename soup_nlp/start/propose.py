@@ -17,14 +17,6 @@ from soup_nlp.start.bending import (
     torn,
     turn_alone,
 )
-from soup_nlp.start.components import (
-    SCENE,
-    TIES,
-    connected_labels,
-    connected_pieces,
-    continued,
-    numbered,
-)
 from soup_nlp.start.epipolar import SIDEWAYS, Matches, Motion, essential_motion, stacked
 from soup_nlp.start.labelling import (
     LEAST_NOISE,
@@ -35,6 +27,14 @@ from soup_nlp.start.labelling import (
     limited_noise,
 )
 from soup_nlp.start.occlusion import vote
+from soup_nlp.start.regions import (
+    SCENE,
+    TIES,
+    connected_labels,
+    connected_pieces,
+    continued,
+    numbered,
+)
 from soup_nlp.start.scales import ground, held, on_ground, scaled
 from soup_nlp.start.settle import settle
 from soup_nlp.start.views import LEAST_PARALLAX_PX, LEAST_PIXELS, LEAST_SEEN, FlowFit, Views
@@ -299,7 +299,7 @@ def receding(views: Views, soup: Soup) -> Soup:
 
 # --- the paper's initialisation: epipolar geometry and homography of every superpixel -------------
 
-MOST_PIXELS = 400
+PATCH_PIXELS = 400
 """Largest number of correspondences to which a motion is fitted."""
 
 
@@ -334,11 +334,11 @@ def _patch(flow: FlowFit, i: int) -> tuple[Motion, Float] | None:
     None if its flow does not determine them.
     """
     views, o = flow.views, flow.options
-    inside = views.subset(np.array([i])).matches().confident(MOST_PIXELS)
+    inside = views.subset(np.array([i])).matches().confident(PATCH_PIXELS)
     if len(inside.ray) < LEAST_PIXELS:
         return None
     around = views.subset(np.append(i, flow.seg.knn[i])).matches()
-    motion = essential_motion(around.confident(MOST_PIXELS), o.threshold_px)
+    motion = essential_motion(around.confident(PATCH_PIXELS), o.threshold_px)
     if motion is None:
         return None
     m, seen = plane_of(motion, inside), np.vstack([inside.ray, views.anchor[i]])

@@ -7,7 +7,8 @@ pair of neighbours and x the log scales, the program adds up
   outline of a component, which hides what is behind it; below it, where it stands, it counts more;
 * pace: what a component moves farther than the scene;
 * ground: how far a component reaches below the ground of the scene;
-* order: by how much a component that covers another one is less than `IN_FRONT` before it.
+* order: by how much a component that covers another one is less than `LEAST_STEP_IN_FRONT`
+  before it.
 
 What stands on the ground or lies below it: a superpixel without usable flow (it leaves the image,
 is dark or moves too fast) borrows its depth from its neighbours, and a component without a known
@@ -25,17 +26,17 @@ from scipy.optimize import linprog
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.components import (
+from soup_nlp.start.occlusion import CLOSING_PX, CONTRAST
+from soup_nlp.start.regions import (
     FIXED,
     SCENE,
-    STEEP,
+    STEEP_COSINE,
     TIES,
     TOO_FAST,
     numbered,
     outlines,
     quantile,
 )
-from soup_nlp.start.occlusion import CLOSING_PX, CONTRAST
 from soup_nlp.start.views import FlowFit
 
 HIDES = 0.3
@@ -45,16 +46,16 @@ STRONG = 3.0
 contact of a whole outline."""
 FASTER = 1.5
 """Price of a log unit by which a component moves farther than the scene."""
-FREE = 1.0
+FREE_PACE = 1.0
 """Log units by which a component that stands on something may move farther than the scene."""
 UNDER = 2.0
 """Price of a log unit by which a component lies below the ground."""
-IN_FRONT = 0.3
+LEAST_STEP_IN_FRONT = 0.3
 """Least step of log depth along the outline of what covers something: true steps have medians of
 0.2 to 1.9."""
-UNKNOWN = np.log(100.0)
+MOST_LOG_PACE = np.log(100.0)
 """If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
-MOST = 6.0
+MOST_LOG_SCALE = 6.0
 """Largest log scale."""
 LEAST_DISPLACEMENT = 1e-12
 """Displacements count as at least this, so that their ratio is finite."""
@@ -89,7 +90,7 @@ def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
     A = sparse.coo_matrix(
         (np.concatenate([one, -one, -one, one]), (np.tile(each, 4), columns)), (m, count + 2 * m)
     )
-    bounds = np.tile([-MOST, MOST], (count, 1))
+    bounds = np.tile([-MOST_LOG_SCALE, MOST_LOG_SCALE], (count, 1))
     bounds[still] = 0.0
     slack = np.tile([0.0, np.inf], (2 * m, 1))
     cost = np.concatenate([np.zeros(count), r.up, r.down])
@@ -122,8 +123,8 @@ def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> Rows:
 def pace(flow: FlowFit, soup: Soup, label: Int) -> Rows:
     """Rows of the displacement of components (N,)."""
     far = log_pace(displacement(soup, flow.views.anchor, label), label)
-    c = np.flatnonzero((np.abs(far) < UNKNOWN) & (np.arange(len(far)) != SCENE))
-    return rows(c, np.array(SCENE), FREE - far[c], FASTER, 0.0, "too fast")
+    c = np.flatnonzero((np.abs(far) < MOST_LOG_PACE) & (np.arange(len(far)) != SCENE))
+    return rows(c, np.array(SCENE), FREE_PACE - far[c], FASTER, 0.0, "too fast")
 
 
 def above(flow: FlowFit, soup: Soup, label: Int, floor: Float) -> Rows:
@@ -144,14 +145,14 @@ def before(flow: FlowFit, soup: Soup, label: Int, order: Float) -> Rows:
     seg, at = flow.seg, np.flatnonzero(order)
     ends = np.where(order[at, None] > 0, seg.pairs[at, ::-1], seg.pairs[at])
     way = np.diff(seg.anchors[ends], axis=1)[:, 0]
-    steps = (not flow.options.upright) | (way[:, 1] <= STEEP * np.linalg.norm(way, axis=1))
+    steps = (not flow.options.upright) | (way[:, 1] <= STEEP_COSINE * np.linalg.norm(way, axis=1))
     at, ends = at[steps], ends[steps]
     front, back = label[ends].T
     z = soup.depth_across(ends, flow.middle[at])
     length = seg.boundary_length[at].astype(float)
     outline = numbered(front * (int(label.max()) + 1) + back)
     weight = STRONG * length / np.bincount(outline, length)[outline]
-    return rows(front, back, np.log(z[1] / z[0]) - IN_FRONT, weight, 0.0, "occlusion")
+    return rows(front, back, np.log(z[1] / z[0]) - LEAST_STEP_IN_FRONT, weight, 0.0, "occlusion")
 
 
 def scaled(
@@ -245,7 +246,7 @@ second on it lies below."""
 LEAST_ON, MOST_BELOW = 0.05, 0.05
 """Of the area with known depth, the least share on the ground and the largest share of another
 surface below it. Of wrong flow less must lie below it than on it."""
-TRIALS = 500
+GROUND_TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
 
@@ -263,7 +264,7 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
     low = at[ray[at, 1] > np.quantile(ray[at, 1], 0.4)]
     if len(low) < 3:
         return none
-    three = np.random.default_rng(o.seed).choice(low, (TRIALS, 3))
+    three = np.random.default_rng(o.seed).choice(low, (GROUND_TRIALS, 3))
     three = three[np.abs(np.linalg.det(ray[three])) > 1e-6]
     planes = np.linalg.solve(ray[three], mu[three][..., None])[..., 0]
     planes = planes[planes[:, 1] > LEVEL * np.linalg.norm(planes, axis=1)]

@@ -13,26 +13,26 @@ from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float
 from soup_nlp.start.bending import RELIEF
-from soup_nlp.start.epipolar import STEPS, Matches, Motion, around, triangulate
-from soup_nlp.start.labelling import PIECE_SIZE, SHARED, Labelling
+from soup_nlp.start.epipolar import EVALUATIONS, Matches, Motion, around, triangulate
+from soup_nlp.start.labelling import PIECE_SIZE, SHARED_SCALE, Labelling
 from soup_nlp.start.views import FlowFit
 
-SYSTEMATIC, MOST_SYSTEMATIC_PX = 1.5, 0.15
+COMMON_NOISES, MOST_COMMON_PX = 1.5, 0.15
 """Error of the flow that is the same over large parts of the image, in units of its noise, and its
 limit in pixels: more noise than that averages out."""
 MOST_RELIEF = 3.0
 """Limit of a log depth relative to the median: points at infinity or behind the camera."""
 EXACT_PX = 0.005
 """Shared error below which the flow is exact and leaves no motion open, pixels."""
-CHANGE = np.array([0.01] * 3 + [0.1] * 2)
+MOTION_CHANGE = np.array([0.01] * 3 + [0.1] * 2)
 """Usual change of rotation (radians) and direction of the translation."""
-CLIP_PX = 0.3
+EPIPOLAR_PX = 0.3
 """Scale of the Cauchy loss of epipolar distances, pixels."""
 
 
 def common_error(noise: float) -> float:
     """Error, pixels, that large parts of a flow with this noise have in common."""
-    return min(SYSTEMATIC * noise, MOST_SYSTEMATIC_PX)
+    return min(COMMON_NOISES * noise, MOST_COMMON_PX)
 
 
 def settle(flow: FlowFit, choice: Labelling) -> Labelling:
@@ -46,7 +46,7 @@ def settle(flow: FlowFit, choice: Labelling) -> Labelling:
         at = np.flatnonzero((choice.label == c) & flow.views.usable)
         if len(at) < PIECE_SIZE:
             continue
-        error = SHARED * float(np.median(choice.excess[at]))
+        error = SHARED_SCALE * float(np.median(choice.excess[at]))
         if error > EXACT_PX:
             motions[c] = most_probable([motion], flow.anchor_matches(at), error)
     return Labelling.of(flow, motions, choice.label, choice.shared)
@@ -61,8 +61,8 @@ def most_probable(
 ) -> Motion:
     """The motion that minimises the mean squared epipolar distance and the relief.
 
-    `mean rho(e, CLIP_PX) / error^2 + mean rho(log(z / median z), spread) / spread^2`, with e the
-    Sampson distance and rho(x, c) = c^2 log(1 + x^2 / c^2) the Cauchy loss.
+    `mean rho(e, EPIPOLAR_PX) / error^2 + mean rho(log(z / median z), spread) / spread^2`, with e
+    the Sampson distance and rho(x, c) = c^2 log(1 + x^2 / c^2) the Cauchy loss.
 
     Args:
         motions: Initial motions; the best result is returned.
@@ -74,13 +74,16 @@ def most_probable(
     root, results = np.sqrt(matches.weight / matches.weight.sum()), []
 
     def residual(motion: Motion) -> Float:
-        distance = cauchy(matches.distance(motion), CLIP_PX)
+        distance = cauchy(matches.distance(motion), EPIPOLAR_PX)
         depth = cauchy(relief(motion, matches.ray, matches.target, expected), spread)
         return np.concatenate([root * distance / error, root * depth / spread])
 
     for moved in map(around, motions):
         end = least_squares(
-            lambda x, moved=moved: residual(moved(x)), np.zeros(5), x_scale=CHANGE, max_nfev=STEPS
+            lambda x, moved=moved: residual(moved(x)),
+            np.zeros(5),
+            x_scale=MOTION_CHANGE,
+            max_nfev=EVALUATIONS,
         )
         results.append((float(end.cost), moved(end.x)))
     return min(results, key=lambda result: result[0])[1]

@@ -216,7 +216,7 @@ class FlowFit(NamedTuple):
         return self.fit[:, 0] - self.views.anchor[:, :2] * self.views.focal
 
 
-QUADRATIC_PX, ROUNDS = 0.1, 8
+QUADRATIC_PX, AFFINE_FITS = 0.1, 8
 """Error of an affine flow below which its loss is quadratic, pixels, and re-weighted fits."""
 
 
@@ -233,7 +233,7 @@ def affine_flow(views: Views) -> tuple[Float, Float]:
     # without confident pixels any affine map will do; the ridge keeps the system regular
     w = confidence = views.weight + 1e-6
     fit = np.zeros((len(basis), 3, 2))
-    for _ in range(ROUNDS):
+    for _ in range(AFFINE_FITS):
         right = (basis * w[..., None]).transpose(0, 2, 1)
         fit = np.linalg.solve(right @ basis + 1e-9 * np.eye(3), right @ target)
         error = np.linalg.norm(basis @ fit - target, axis=2)

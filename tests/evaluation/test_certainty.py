@@ -10,7 +10,7 @@ from soup_nlp.evaluation.confidence import FACTORS, KINDS, confidence, kinds
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.report.findings import ORIGINS
 from soup_nlp.report.summary import certainty
-from soup_nlp.start.components import SCENE, TIES
+from soup_nlp.start.regions import SCENE, TIES
 
 
 def sure_of(run, start, given=None):

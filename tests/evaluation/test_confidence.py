@@ -33,7 +33,7 @@ from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.start.components import FIXED, SCENE, TIES
+from soup_nlp.start.regions import FIXED, SCENE, TIES
 
 FORM = Formulation()
 PRIOR = FACTORS["prior"]

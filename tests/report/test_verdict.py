@@ -14,7 +14,7 @@ from soup_nlp.report import findings
 from soup_nlp.report.check import _constraints
 from soup_nlp.report.verdict import exit_code
 from soup_nlp.start.camera_error import CameraError
-from soup_nlp.start.components import FIXED, SCENE
+from soup_nlp.start.regions import FIXED, SCENE
 
 
 def blamed(evidence, camera):

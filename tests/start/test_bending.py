@@ -33,8 +33,8 @@ from soup_nlp.start.bending import (
     torn,
     turn_alone,
 )
-from soup_nlp.start.components import connected_labels
 from soup_nlp.start.labelling import LEAST_NOISE, dominant, labelled
+from soup_nlp.start.regions import connected_labels
 from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow

@@ -23,10 +23,10 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run
 from soup_nlp.report.summary import summary
 from soup_nlp.start import prior_evidence
-from soup_nlp.start.components import TIES
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
-from soup_nlp.start.prior_evidence import EXPLAINED, LEAST, edge_margin, judged
+from soup_nlp.start.prior_evidence import EXPLAINED, LEAST_MARGIN, edge_margin, judged
 from soup_nlp.start.propose import Start, propose
+from soup_nlp.start.regions import TIES
 
 pytestmark = pytest.mark.slow
 
@@ -175,12 +175,12 @@ def test_steps_on_image_edges_tell_a_map_of_it(monkeypatch):
         image[y : y + h + 9, x : x + w + 9] = rng.integers(0, 255, 3)
         depth[y : y + h + 9, x : x + w + 9] = rng.uniform(1, 5)
     log = np.log(depth)
-    assert edge_margin(log, image) > LEAST
+    assert edge_margin(log, image) > LEAST_MARGIN
     # what is so blurred follows the edges, but the superpixels hardly better than by chance
     for width in (1.5, 3.5):
-        assert edge_margin(cv2.GaussianBlur(log, (0, 0), width), image) > LEAST
-    assert edge_margin(np.roll(log, (31, 47), axis=(0, 1)), image) <= LEAST
-    assert edge_margin(np.ones_like(log), image) <= LEAST
+        assert edge_margin(cv2.GaussianBlur(log, (0, 0), width), image) > LEAST_MARGIN
+    assert edge_margin(np.roll(log, (31, 47), axis=(0, 1)), image) <= LEAST_MARGIN
+    assert edge_margin(np.ones_like(log), image) <= LEAST_MARGIN
 
 
 # --- files -------------------------------------------------------------------------------------

@@ -11,17 +11,17 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start import labelling
-from soup_nlp.start.components import belonging, connected_labels, continued, harmonic, likeness
 from soup_nlp.start.epipolar import SIDEWAYS, Motion
 from soup_nlp.start.labelling import (
-    CHANGE,
-    MOST,
+    CHANGE_COST,
+    MOST_COST,
     flow_affinity,
     labelled,
     price_of_motion,
     smooth,
 )
 from soup_nlp.start.propose import propose
+from soup_nlp.start.regions import belonging, connected_labels, continued, harmonic, likeness
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_an_error_that_the_flow_shares_is_no_motion():
     """Every cost up to the shared error is 0, however many superpixels have it."""
     shared = 0.2
     price = labelling._price(np.array([0.0, 0.1, 0.2, 0.3, 99.0]), shared)
-    np.testing.assert_allclose(price, [0, 0, 0, 0.5, MOST], atol=1e-12)
+    np.testing.assert_allclose(price, [0, 0, 0, 0.5, MOST_COST], atol=1e-12)
 
 
 @pytest.mark.parametrize(("pays", "saved"), [(True, 1.1), (False, 0.9)])
@@ -75,8 +75,8 @@ def test_a_motion_stays_if_it_saves_its_price(pays, saved):
     own = np.isin(np.arange(100) // 10, (0, 1)) & (np.arange(100) % 10 < 4)
     cost = np.zeros((100, 3))
     cost[own, 0] = saved * price_of_motion(100) / own.sum()
-    cost[~own, 1] = MOST
-    cost[:, 2] = 0.5 * MOST
+    cost[~own, 1] = MOST_COST
+    cost[:, 2] = 0.5 * MOST_COST
     still = fitted_like(seg)
     used, label = labelling._paying(still._replace(jump=np.full(len(seg.pairs), 9.0)), cost)
     assert used == ([0, 1] if pays else [0])
@@ -100,7 +100,7 @@ def test_neighbours_agree_unless_the_flow_jumps(world):
     # each component prefers its own label by half the price, a fifth of them the wrong one
     wrong = rng.random(n) < 0.2
     mine = np.where(wrong, 1 - component, component)[:, None]
-    cost = np.where(np.arange(2) == mine, 0.0, 0.5 * CHANGE)
+    cost = np.where(np.arange(2) == mine, 0.0, 0.5 * CHANGE_COST)
     near = flow_affinity(flow)
     assert near.max() <= 1
     assert near[flow.jump > 3 * flow.options.discontinuity_px].max() < 0.01
@@ -110,7 +110,7 @@ def test_neighbours_agree_unless_the_flow_jumps(world):
     i, k = seg.pairs.T
     length = seg.boundary_length.astype(float)
     rim = np.bincount(i, length, n) + np.bincount(k, length, n)
-    weight = CHANGE * near * length * (1 / rim[i] + 1 / rim[k])
+    weight = CHANGE_COST * near * length * (1 / rim[i] + 1 / rim[k])
     tables = weight[:, None, None] * (1 - np.eye(2))
     best = mrf_energy(label, cost, seg.pairs, tables)
     for s in range(n):

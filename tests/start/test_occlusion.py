@@ -15,10 +15,10 @@ from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
-from soup_nlp.start.components import TIES
 from soup_nlp.start.occlusion import LEAST_ORDER, covering, vote
 from soup_nlp.start.propose import Start, propose
-from soup_nlp.start.scales import IN_FRONT
+from soup_nlp.start.regions import TIES
+from soup_nlp.start.scales import LEAST_STEP_IN_FRONT
 
 HEIGHT, WIDTH, CELL = 96, 128, 16
 K = camera.intrinsics(120.0, 120.0, 63.5, 47.5)
@@ -104,7 +104,7 @@ def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     assert moves.sum() == 12
     # relative to the plane on which all of the image is drawn
     step = np.median(z[~moves]) - np.median(z[moves])
-    assert step == pytest.approx(IN_FRONT if covers else -IN_FRONT, rel=1e-6)
+    assert step == pytest.approx(LEAST_STEP_IN_FRONT if covers else -LEAST_STEP_IN_FRONT, rel=1e-6)
     # the flow is explained as before, and the mover is a component
     np.testing.assert_allclose(start.error, before.error)
     flows = [reconstruct(soup, seg.labels, K, K).flow for soup in (start.soup, before.soup)]

@@ -6,8 +6,8 @@ from helpers_start import squares
 
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
-from soup_nlp.start.components import FIXED
 from soup_nlp.start.propose import propose
+from soup_nlp.start.regions import FIXED
 from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow

@@ -5,8 +5,8 @@ import pytest
 from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry import camera
-from soup_nlp.start.components import TIES, TOO_FAST
-from soup_nlp.start.scales import FREE, IN_FRONT, Rows, held, minimum, rows, scaled
+from soup_nlp.start.regions import TIES, TOO_FAST
+from soup_nlp.start.scales import FREE_PACE, LEAST_STEP_IN_FRONT, Rows, held, minimum, rows, scaled
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 HANGS = [[0] * 5, [0, 0, 1, 0, 0], [0] * 5, [0] * 5]
@@ -77,7 +77,7 @@ def test_what_contact_would_make_too_fast_has_the_pace_of_the_scene():
     wall = np.full((4, 5), 8.0)
     log_scale, tie = found(wall, CUT_OFF, far=1.0)
     assert tie == "too fast"
-    np.testing.assert_allclose(log_scale, FREE, atol=1e-6)
+    np.testing.assert_allclose(log_scale, FREE_PACE, atol=1e-6)
     log_scale, tie = found(wall, HANGS, far=1e-3)
     assert tie == "contact below"
     np.testing.assert_allclose(log_scale, np.log(8), rtol=1e-6)
@@ -104,7 +104,7 @@ def test_what_covers_is_in_front_of_all_but_what_it_stands_on():
     wall = np.full((4, 5), 8.0)
     log_scale, tie = found(wall, HANGS, far=1e-3, order=covers, upright=False)
     assert tie == "occlusion"
-    np.testing.assert_allclose(log_scale, np.log(8) - IN_FRONT, rtol=1e-6)
+    np.testing.assert_allclose(log_scale, np.log(8) - LEAST_STEP_IN_FRONT, rtol=1e-6)
     wall[-1] = 4.0
     log_scale, tie = found(wall, STANDS, far=1e-3, order=covers)
     assert tie == "contact below"

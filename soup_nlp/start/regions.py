@@ -38,7 +38,7 @@ SCENE = 0
 """Index of the component that is the static scene: depths and motions refer to it."""
 
 
-STEEP = 0.5
+STEEP_COSINE = 0.5
 """Cosine of the angle to the vertical up to which a neighbour lies below."""
 TIES = (
     "reference",
@@ -88,7 +88,7 @@ def outlines(label: Int, seg: Segmentation) -> Outlines:
     contact = np.tile(seg.boundary_length[across], 2).astype(float)
     way = np.diff(seg.anchors[seg.pairs[across]], axis=1)[:, 0]
     down = way[:, 1] / np.linalg.norm(way, axis=1)
-    below = np.concatenate([down, -down]) > STEEP
+    below = np.concatenate([down, -down]) > STEEP_COSINE
     return Outlines(component, other, neighbour, contact, below)
 
 
@@ -99,7 +99,7 @@ def quantile(value: Float, weight: Float, share: float) -> float:
 
 # --- what is not seen continues what is around it -------------------------------------------------
 
-CONTRAST = 3.0
+COLOUR_EXPONENT = 3.0
 """Fall-off of the weight of a pair with the difference of its colours in [0, 1]."""
 JOINED = 1e-6
 """Weight of pairs across components, relative to those inside: it keeps the system regular."""
@@ -108,7 +108,7 @@ JOINED = 1e-6
 def likeness(seg: Segmentation) -> Float:
     """(P,) weight of two neighbours: the length of their boundary, less where colours differ."""
     colour = seg.pair_weight / seg.pair_weight.max(initial=1e-12)
-    return np.asarray(seg.boundary_length * colour**CONTRAST)
+    return np.asarray(seg.boundary_length * colour**COLOUR_EXPONENT)
 
 
 def laplacian(weight: Float, seg: Segmentation) -> sparse.csr_matrix:

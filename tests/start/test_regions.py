@@ -14,7 +14,7 @@ from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.pipeline.run import run
-from soup_nlp.start.components import TIES
+from soup_nlp.start.regions import TIES
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 
