@@ -13,7 +13,7 @@ from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import LEAST_FACING
 
-ALIKE = 1.1
+SAME_SHAPE = 1.1
 """Largest ratio of two focal lengths between which flow methods are reliable."""
 
 
@@ -111,7 +111,7 @@ def at_common_focal(pair: Pair) -> Pair:
     A blurred image would shift against a sharp one.
     """
     ratio = np.diag(pair.K_next)[1::-1] / np.diag(pair.K_ref)[1::-1]
-    if 1 / ALIKE <= np.sqrt(ratio.prod()) <= ALIKE:
+    if 1 / SAME_SHAPE <= np.sqrt(ratio.prod()) <= SAME_SHAPE:
         return pair
     return _at_sizes(pair, np.minimum([ratio, 1 / ratio], 1.0))
 

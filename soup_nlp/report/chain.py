@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
 """Unit of lengths in files."""
-SHOWN = 12
+SHOWN_FRAMES = 12
 """Largest number of frames of a chain that a notebook shows."""
 AXES = "x right, y down, z ahead"
 """Axes of a camera, in words."""
@@ -235,7 +235,7 @@ class Chain:
 
     def _repr_html_(self) -> str:
         near, far = depth_range(self.depths)
-        chosen = sorted({*np.linspace(0, len(self) - 1, min(SHOWN, len(self))).astype(int)})
+        chosen = sorted({*np.linspace(0, len(self) - 1, min(SHOWN_FRAMES, len(self))).astype(int)})
         panels = [self[k].picture(near, far, f"depth of frame {self.names[k]}") for k in chosen]
         return shown(str(self), strip(panels, ""))
 

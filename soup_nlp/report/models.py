@@ -19,7 +19,7 @@ from soup_nlp.storage.files import PathLike, write_bytes, write_text
 
 VOXEL = 0.004
 """Side of a voxel relative to the median distance of the points from the first camera."""
-MOST = 300_000
+MOST_POINTS = 300_000
 """Largest number of points that enter the fusion, all frames together."""
 IN_FRONT = 0.8
 """A point contradicts a frame if its depth is below this share of the depth of the frame there."""
@@ -98,7 +98,7 @@ def write_fused(path: Path, chain: Chain) -> None:
     write_ply(path, cloud["points"], cloud["colours"], None, scalars, comments)
 
 
-def fuse(chain: Chain, most: int = MOST) -> Cloud:
+def fuse(chain: Chain, most: int = MOST_POINTS) -> Cloud:
     """The static scene of all frames: sure points without conflicts, one per voxel.
 
     A point in front of the static surface of a neighbouring frame is removed if that frame is more
@@ -107,7 +107,7 @@ def fuse(chain: Chain, most: int = MOST) -> Cloud:
     """
     count = len(chain.pairs)
     frames = Lazy(chain.__getitem__, count)
-    step = max(1, math.ceil(math.sqrt(count * frames[0].depth.size / MOST)))
+    step = max(1, math.ceil(math.sqrt(count * frames[0].depth.size / MOST_POINTS)))
     clouds = []
     for k, frame in enumerate(frames):
         chosen = np.zeros_like(frame.sure)

@@ -39,12 +39,12 @@ MODES = {
     "error": "error",
 }
 """Labels of the buttons that colour the 3D view, by name of the picture."""
-SHOWN = 3
+LEAST_PATH = 3
 """Smallest number of frames of a path of a chain that is shown; shorter ones are mostly no
 objects."""
 SIDE, MANY = 1600, 4
 """Larger side of a picture, pixels; number of pairs above which pictures are smaller."""
-MOST = 100
+MOST_PAIRS = 100
 """Largest number of pairs on a page; of a longer chain so many across all of it."""
 PIXELS = 600_000, 4_000_000
 """Largest number of shown pixels of a pair, and of all pairs; larger images are subsampled."""
@@ -136,7 +136,7 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "deepest": median depth, depth beyond which points are hidden at first, largest depth.
         "origins": words for what gives a component its scale. "kinds": words for kinds of depth.
     """
-    metre, count = chain.metre or 1.0, min(len(chain.pairs), MOST)
+    metre, count = chain.metre or 1.0, min(len(chain.pairs), MOST_PAIRS)
     at = np.linspace(0, len(chain.pairs) - 1, count).astype(int).tolist()
     pairs = []
     for k in at:
@@ -177,7 +177,7 @@ def _paths(chain: Chain, metre: float) -> list[dict[str, Any]]:
     for track, path in chain.paths.items():
         points = [metre * point for point in path.values()]
         moved = np.linalg.norm(points[-1] - points[0]) > 0.01 * abs(points[0][2])
-        if moved if chain.single else len(points) >= SHOWN:
+        if moved if chain.single else len(points) >= LEAST_PATH:
             out.append({"colour": _css(colours[track]), "points": points})
     return out
 

@@ -28,7 +28,7 @@ from soup_nlp.storage.rows import failed, read_rows
 
 CHAIN = "chain.json"
 """File that makes a folder that of a chain."""
-SAME = 1e-6
+DEPTH_TOLERANCE = 1e-6
 """Largest relative difference of stored scales and poses from recomputed ones."""
 SINGLE = CHAIN, "trajectory.tum", PAGE
 """Files of a chain that are not made for each frame."""
@@ -92,7 +92,7 @@ def check(folder: Path) -> CheckReport:
         # null in JSON becomes NaN, which is no rounding error
         claimed = np.array(stored, float)
         gap = float(np.abs(claimed - found).max()) if claimed.shape == found.shape else np.inf
-        tolerance = SAME * float(np.abs(found).max(initial=1.0))
+        tolerance = DEPTH_TOLERANCE * float(np.abs(found).max(initial=1.0))
         claims.append(Claim(name, 0.0, np.nan_to_num(gap, nan=np.inf), tolerance))
     return CheckReport((*claims, *written(folder, {*chain_files(len(chain))})))
 

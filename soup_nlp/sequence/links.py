@@ -21,7 +21,7 @@ MIN_PIXELS = 200
 MOST_DRAWN = 0.5
 """A pair has no parallax if a larger share of its background has the depth of neighbours, and a
 chain is not good if a larger share of all its images is drawn."""
-SAME = 0.3
+LEAST_OVERLAP = 0.3
 """Smallest intersection over union of two components of one track."""
 KEPT = ("input", "start", "truth", "solution", "weights", "energy")
 """Groups of arrays of a pair that a chain needs."""
@@ -135,7 +135,7 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
     share = overlap_shares(before[visible], after[visible])
     # the background has no track
     share[0], share[:, 0] = 0, 0
-    share[share < SAME] = 0
+    share[share < LEAST_OVERLAP] = 0
     matched = zip(*linear_sum_assignment(share, maximize=True))
     return {int(i): int(k) for i, k in matched if share[i, k] > 0}
 

@@ -55,7 +55,7 @@ def test_a_long_chain_reads_few_pairs_at_once(tmp_path, monkeypatch):
     np.testing.assert_allclose(lazy.scales, many.scales)
     assert '["6.png", "7.png"], ["7.png", "8.png"]]' in (tmp_path / "report.html").read_text()
     # a page does not grow with the number of pairs
-    monkeypatch.setattr(report_page, "MOST", 3)
+    monkeypatch.setattr(report_page, "MOST_PAIRS", 3)
     scene = report_page.make_scene(many)
     assert scene["names"] == [["0.png", "1.png"], ["3.png", "4.png"], ["7.png", "8.png"]]
     ends = [many.world_from_camera[k].matrix for k in (3, 4)]

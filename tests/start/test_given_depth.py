@@ -287,7 +287,7 @@ def test_superpixels_end_at_steps_of_an_unconfirmed_prior(pan, swing):
 
 @pytest.mark.slow
 def test_evidence_for_a_prior_is_independent_of_superpixel_count(swing, monkeypatch):
-    monkeypatch.setattr(pipeline_case, "PIECES", 80)
+    monkeypatch.setattr(pipeline_case, "JUDGED_PIECES", 80)
     numbers = []
     for count in (80, 120):
         raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": count}}
