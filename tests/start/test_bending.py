@@ -156,6 +156,12 @@ def test_a_bending_surface_is_found_beside_rigid_ones():
     assert not case("banner", "start.bending=false").start.bending
 
 
+@pytest.mark.xfail(strict=True, reason="the flow jumps too little: MRE 0.06, 0.03 at most if found")
+def test_a_bending_surface_is_found_in_a_small_picture():
+    small = problem("banner", "input.width=320", "input.height=136")
+    assert 0.2 < prepare(small).start.bends.mean() < 0.5
+
+
 def test_depth_starts_on_one_plane_where_the_camera_is_at_rest():
     """An upright scene recedes upwards; nothing tells more."""
     c = case("still", UNORDERED)

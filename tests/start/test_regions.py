@@ -76,6 +76,7 @@ def test_the_nlp_keeps_a_swinging_box_off_the_wall(seed):
     held, free = result(10.0), result(0.0)
     placed = np.isin(held.start.tie, [TIES.index("occlusion"), TIES.index("too fast")])
     assert placed.any()
-    assert held.metrics["solution"].mre < 0.75 * free.metrics["solution"].mre
+    # 0.6 of the 0.369 that a start which disliked slow components had without the order
+    assert held.metrics["solution"].mre < min(0.22, 0.75 * free.metrics["solution"].mre)
     # where it is exactly remains a guess
     assert held.confidence.sigma[placed[held.segmentation.labels]].min() > 0.25
