@@ -6,6 +6,7 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
 from soup_nlp.config.problem import Problem, load_problem
@@ -14,7 +15,6 @@ from soup_nlp.model.formulation import Coordinates
 from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.symbolic import make_oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
@@ -106,3 +106,35 @@ def nlp(
     oracle, values = make_oracle(record)
     f, g = oracle(x, ca.vertcat(p, values[len(record.theta) :]))
     return SymbolicNLP(case, record, layout, x, p, f, g, Functions(record))
+
+
+def make_oracle(nlp: NLP) -> tuple[ca.Function, Float]:
+    """The sum of an NLP's kernels over their tables as a function (x, p) -> f, g.
+
+    With it come the (np,) values of p: theta, then the data of every group, by elements. Its
+    evaluation is slow, as every call copies them; `NLP.value` and the others are fast.
+    """
+    values = np.concatenate([nlp.thetas(), *(g.data.ravel() for g in nlp.groups)])
+    x, p = ca.MX.sym("x", nlp.nx), ca.MX.sym("p", len(values))
+    at = len(nlp.theta)
+    theta, f = p[:at], ca.MX(0.0)
+    rows, local = list[NDArray[np.integer]](), list[ca.MX]()
+    for group in nlp.groups:
+        size, width = group.data.shape
+        data = ca.reshape(p[at : at + size * width], width, size)
+        at += size * width
+        own = ca.reshape(x[group.index.ravel().tolist()], group.kernel.nx, size)
+        given = own, data, ca.repmat(theta, 1, size)
+        functions = group.kernel.first_order()
+        if "f" in functions:
+            f += ca.sum2(functions["f"].map(size)(*given))
+        if "con" in functions:
+            rows.append(group.rows.ravel())
+            local.append(ca.vec(functions["con"].map(size)(*given)))
+    g = ca.MX.zeros(nlp.ng)
+    if local:
+        # out[rows] += local is the transposed derivative of out -> out[rows], which CasADi runs as
+        # one loop; a constant 0/1 matrix takes twenty times as long to build
+        out = ca.MX.sym("out", nlp.ng)
+        g = ca.jtimes(out[np.concatenate(rows).tolist()], out, ca.vertcat(*local), True)
+    return ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]), values

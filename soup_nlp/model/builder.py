@@ -25,13 +25,8 @@ _SYMBOLS = ca.SX.sym("theta", len(THETA))
 
 
 class Block(NamedTuple):
-    """Consecutive constraint rows of one kind.
-
-    Attributes:
-        label: Of the kind.
-        lower, upper: Bounds of each.
-        superpixels: (M, a) of each, for its name; a = 0 where that is the label alone.
-    """
+    """Consecutive constraint rows of one kind: its label, the bounds of each row, and (M, a) the
+    superpixels in its name; a = 0 where that is the label alone."""
 
     label: str
     lower: float
@@ -106,11 +101,9 @@ class Builder:
         """
         size, count = len(index), body.numel()
         own = np.zeros((1, 0), int) if total else np.repeat(np.arange(size), count)[:, None]
-        block = Block(name.removeprefix("t_"), lower, upper, own)
-        first = sum(len(row.superpixels) for row in self.rows)
-        numbers = first + np.arange(len(own))
+        numbers = sum(len(known.superpixels) for known in self.rows) + np.arange(len(own))
         rows = np.broadcast_to(numbers.reshape(-1, count), (size, count))
-        self.rows.append(block)
+        self.rows.append(Block(name.removeprefix("t_"), lower, upper, own))
         symbols = ca.SX.sym("none", 0) if row is None else row
         kernel = Kernel(name, x, symbols, _SYMBOLS, constraints=body)
         data = np.zeros((size, 0)) if data is None else data
@@ -125,16 +118,11 @@ class Builder:
         self.groups.append(Group(kernel, index, metric[:, None], none))
 
     def finish(self, name: str, x0: Float, lbx: Float, ubx: Float) -> NLP:
-        """The NLP of everything that was added.
+        """The NLP of everything that was added, from the start and bounds of its variables.
 
-        In the names of variables and rows the first index is the superpixel; for an edge or a
-        neighbour pair the first two are its two superpixels. A further index counts from 1: the
-        rows of R'R = I in the order 11 12 22 13 23 33, rim rays (in matrix coordinates 1 is the
-        anchor), or sampled pixels.
-
-        Args:
-            name: Of the NLP.
-            x0, lbx, ubx: Start and bounds of the layout's variables.
+        In the names of variables and rows the first index is the superpixel. A further one counts
+        from 1: the rows of R'R = I in the order 11 12 22 13 23 33, or rim rays (in matrix
+        coordinates 1 is the anchor).
         """
         count = [len(row.superpixels) for row in self.rows]
         f = self.form
@@ -167,14 +155,9 @@ def _kernel(
     x = ca.SX.sym("x", stride * arity)
     row = {k: ca.SX.sym(k, c) for k, c in fields}
     views = [view(v, row, a, option) for a, v in enumerate(ca.vertsplit(x, stride))]
-    forms = [
-        solver_form(norm, x, _SYMBOLS[2]) for norm in norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
-    ]
-    return Kernel(
-        name,
-        x,
-        ca.vertcat(*row.values()),
-        _SYMBOLS,
-        objective=sum((f.objective for f in forms), ca.SX(0)),
-        curvature=sum((f.curvature for f in forms), ca.SX(0)),
+    made = norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
+    objective, curvature = (
+        sum(parts, ca.SX(0)) for parts in zip(*(solver_form(n, x, _SYMBOLS[2]) for n in made))
     )
+    data = ca.vertcat(*row.values())
+    return Kernel(name, x, data, _SYMBOLS, objective=objective, curvature=curvature)

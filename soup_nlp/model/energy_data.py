@@ -1,6 +1,6 @@
 """The numbers of the energy: sampled pixels, graphs, weights. No symbolic expressions."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,18 +108,14 @@ class EnergyData:
 
     def arrays(self) -> dict[str, Float]:
         """Every array by name, for storing."""
-        out = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {k: np.asarray(v) for k, v in out.items()}
+        return {k: np.asarray(v) for k, v in vars(self).items()}
 
 
 def sample_pixels(
     labels: NDArray[np.int32], flow: Flow, samples: int | None, seed: int
 ) -> tuple[Int, Mask]:
-    """A random sample of every superpixel's pixels of nonzero confidence, None for all of them.
-
-    Returns:
-        (N, S) flat pixel indices and (N, S) bool, False where a superpixel has fewer pixels.
-    """
+    """(N, S) flat indices of a random sample of every superpixel's pixels of nonzero confidence,
+    None for all of them, and (N, S) bool, False where a superpixel has fewer."""
     n = int(labels.max()) + 1
     rng = np.random.default_rng(seed)
     flat = labels.ravel()

@@ -19,10 +19,7 @@ from soup_nlp.model.energy_options import Weights
 
 
 class States:
-    """L states of N superpixels; arrays have their components first, (c, N, L).
-
-    Arrays that are subtracted for every pair of states have the type `dtype`.
-    """
+    """L states of N superpixels; arrays have their components first, (c, N, L)."""
 
     def __init__(
         self,
@@ -33,15 +30,10 @@ class States:
         anchor_ray: Float,
         dtype: type | np.dtype = np.float64,
     ) -> None:
-        """Planes `n . X + D = 0` and motions `X' = R X + T`.
+        """Planes `n . X + D = 0` and motions `X' = R X + T` of N x L states.
 
-        Args:
-            n: (N, L, 3) unit normals.
-            D: (N, L) distances.
-            R: (N, L, 3, 3) rotations.
-            T: (N, L, 3) translations.
-            anchor_ray: (N, 3).
-            dtype: float64, or float32 for half the memory.
+        Arrays that are subtracted for every pair of states have the type `dtype`: float64, or
+        float32 for half the memory.
         """
         self.dtype, self.anchor_ray = dtype, anchor_ray
         self._plane, self._motion = (n, D), (R, T)

@@ -70,7 +70,7 @@ class MatrixLayout:
     def pack(self, soup: Soup) -> Float:
         """Solver vector (size,) of a soup, brought to this gauge and length unit."""
         s = soup.normalised(self.share)
-        D, T, R = s.distance, s.translation, s.R.transpose(0, 2, 1).reshape(-1, 9)
+        T, R = s.translation, s.R.transpose(0, 2, 1).reshape(-1, 9)
         if self.gauge == "unit-offset":
             lam = self.count * s.lam
             return np.column_stack([lam, s.n, R, T / lam[:, None]]).ravel()
@@ -81,7 +81,7 @@ class MatrixLayout:
         length = np.linalg.norm(T, axis=1)
         tau = float(length.mean())
         lam = length / tau
-        x = np.column_stack([lam, s.n, D / lam, R, T / lam[:, None]])
+        x = np.column_stack([lam, s.n, s.distance / lam, R, T / lam[:, None]])
         return np.append(x.ravel(), tau)
 
     def unpack(self, x: Float) -> Soup:
@@ -94,13 +94,12 @@ class MatrixLayout:
 
     def names(self) -> list[str]:
         """Readable names in order: `lam[17]`, `n[17,2]`, `R[17,2,1]` (row, column from 1)."""
-        labels = ["lam[{i}]", *(f"n[{{i}},{c}]" for c in (1, 2, 3))]
-        if self.gauge != "unit-offset":
-            labels.append("d[{i}]")
-        labels += [f"R[{{i}},{r},{c}]" for c in (1, 2, 3) for r in (1, 2, 3)]
-        labels += [f"t[{{i}},{c}]" for c in (1, 2, 3)]
-        out = [s.format(i=i) for i in range(self.count) for s in labels]
-        return out + (["tau"] if self.gauge == "unit-translation" else [])
+        own, more = ([], []) if self.gauge == "unit-offset" else (["d[{i}]"], ["tau"])
+        axes = (1, 2, 3)
+        labels = ["lam[{i}]", *(f"n[{{i}},{c}]" for c in axes), *own]
+        labels += [f"R[{{i}},{r},{c}]" for c in axes for r in axes]
+        labels += [f"t[{{i}},{c}]" for c in axes]
+        return [s.format(i=i) for i in range(self.count) for s in labels] + more
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Self
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -49,19 +48,19 @@ class NLP:
 
     def value(self, x: Float, theta: Float | None = None) -> float:
         """f at x (nx,); theta (nt,) of another smoothing."""
-        return float(self._sum(self._first["f"], x, theta)[0])
+        return float(self._sum("f", x, theta)[0])
 
     def gradient(self, x: Float, theta: Float | None = None) -> Float:
         """Gradient of f (nx,)."""
-        return self._sum(self._first["grad"], x, theta)
+        return self._sum("grad", x, theta)
 
     def constraints(self, x: Float, theta: Float | None = None) -> Float:
         """g (ng,)."""
-        return self._sum(self._first["con"], x, theta)
+        return self._sum("con", x, theta)
 
     def jacobian_nonzeros(self, x: Float, theta: Float | None = None) -> Float:
         """Nonzeros of g's Jacobian, in the order of `jacobian_pattern`."""
-        return self._sum(self._first["jac"], x, theta)
+        return self._sum("jac", x, theta)
 
     def jacobian(self, x: Float) -> sparse.csr_matrix:
         """(ng, nx) Jacobian of g."""
@@ -72,7 +71,7 @@ class NLP:
     ) -> Float:
         """Nonzeros of the upper triangle of `lam_f f + lam_g . g`, in the order of
         `hessian_pattern`."""
-        return self._sum(self._second["hess"], x, theta, lam_f, lam_g)
+        return self._sum("hess", x, theta, lam_f, lam_g)
 
     def hessian(
         self, x: Float, lam_g: Float, lam_f: float = 1.0, theta: Float | None = None
@@ -83,21 +82,17 @@ class NLP:
 
     def _sum(
         self,
-        terms: Terms,
+        key: str,
         x: Float,
         theta: Float | None,
         lam_f: float = 1.0,
         lam_g: Float | None = None,
     ) -> Float:
-        """The vector of the terms at x; the multipliers are for Hessians.
-
-        Raises:
-            ValueError: a vector has another length.
-        """
+        """The sum of a key of `_terms` at x; ValueError for a vector of another length."""
         theta = self.thetas() if theta is None else theta
         given = _vector("x", x, self.nx), _vector("theta", theta, len(self.theta))
         lam_g = lam_g if lam_g is None else _vector("lam_g", lam_g, self.ng)
-        size, summands, target = terms
+        size, summands, target = self._terms(key)
         entries, at = np.empty(len(target)), 0
         for term in summands:
             end = at + term.entries
@@ -107,42 +102,39 @@ class NLP:
         return np.asarray(np.bincount(target, entries, size + 1)[:size], float)
 
     @cached_property
-    def _first(self) -> Mapping[str, Terms]:
-        """f, its gradient, g, its Jacobian."""
-        groups = self.groups
-        places = {
-            "f": (1, [np.zeros((len(g), 1), int) for g in groups]),
-            "grad": (self.nx, [g.index for g in groups]),
-            "con": (self.ng, [g.rows for g in groups]),
-            "jac": (self.nnzj, self.jacobian_pattern.places),
-        }
-        return self._terms([g.kernel.first_order() for g in groups], places)
+    def _known(self) -> dict[str, Terms]:
+        return {}
 
-    @cached_property
-    def _second(self) -> Mapping[str, Terms]:
-        """The Hessian, apart from the rest, since a start at a KKT point does not need it."""
-        functions = [g.kernel.second_order(self.hessian_kind) for g in self.groups]
-        return self._terms(functions, {"hess": (self.nnzh, self.hessian_pattern.places)})
-
-    def _terms(
-        self,
-        functions: Sequence[Mapping[str, ca.Function]],
-        places: Mapping[str, tuple[int, Sequence[NDArray[np.integer]]]],
-    ) -> Mapping[str, Terms]:
-        """Terms of sums, of functions of every group; `places` has the size of every sum, and where
-        (E, k) the entries of every group are added."""
-        out = dict[str, Terms]()
-        for key, (size, targets) in places.items():
-            every = zip(self.groups, functions, targets)
+    def _terms(self, key: str) -> Terms:
+        """Terms of "f", "grad", "con", "jac" or "hess", made when first asked for: a start at a KKT
+        point does not need the Hessian."""
+        if key not in self._known:
+            size, places = self._places(key)
+            first, kind = key != "hess", self.hessian_kind
+            kernels = [g.kernel for g in self.groups]
+            functions = [k.first_order() if first else k.second_order(kind) for k in kernels]
+            every = zip(self.groups, functions, places)
             own = [(Vectors(f[key], group), at) for group, f, at in every if key in f]
             target = [term.ordered(at, size) for term, at in own]
             none: NDArray[np.integer] = np.zeros(0, np.int64)
-            out[key] = size, [term for term, _ in own], np.concatenate([none, *target])
-        return out
+            self._known[key] = size, [term for term, _ in own], np.concatenate([none, *target])
+        return self._known[key]
+
+    def _places(self, key: str) -> tuple[int, Sequence[NDArray[np.integer]]]:
+        """Size of a sum, and where (E, k) it adds the entries of every group."""
+        if key == "f":
+            return 1, [np.zeros((len(g), 1), int) for g in self.groups]
+        if key == "grad":
+            return self.nx, [g.index for g in self.groups]
+        if key == "con":
+            return self.ng, [g.rows for g in self.groups]
+        pattern = self.jacobian_pattern if key == "jac" else self.hessian_pattern
+        return len(pattern.rows), pattern.places
 
     def evaluated(self) -> Self:
         """The same, with all its functions made now, so that later timings exclude it."""
-        _ = self._first, self._second
+        for key in ("f", "grad", "con", "jac", "hess"):
+            self._terms(key)
         return self
 
     @cached_property

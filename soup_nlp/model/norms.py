@@ -5,11 +5,9 @@ exact sum is the energy that is reported; a solver gets `sqrt(|vector|^2 + eps^2
 """
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import casadi as ca
-
-Kind = Literal["norm", "half_square"]
 
 
 @dataclass(frozen=True)
@@ -29,15 +27,8 @@ class Norm:
     vector: ca.SX
     eps: ca.SX
     sigma: ca.SX | None = None
-    kind: Kind = "norm"
+    kind: Literal["norm", "half_square"] = "norm"
     leak: ca.SX | float = 0.0
-
-
-class Form(NamedTuple):
-    """A norm in solver form, and its positive semidefinite majorant over the kernel's variables."""
-
-    objective: ca.SX
-    curvature: ca.SX
 
 
 def smooth_min(y: ca.SX, sigma: ca.SX, width: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -50,37 +41,29 @@ def smooth_min(y: ca.SX, sigma: ca.SX, width: ca.SX) -> tuple[ca.SX, ca.SX]:
     return (y + sigma - root) / 2 - at_zero, (1 - (y - sigma) / root) / 2
 
 
-def _corner(eps: ca.SX, sigma: ca.SX) -> ca.SX:
-    """Width of a truncation's corner; one as sharp as eps would be as stiff as the norm itself."""
-    return ca.fmax(eps, 0.3 * sigma)
+def solver_form(norm: Norm, x: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """The norm as a solver sees it, and its positive semidefinite majorant.
 
-
-def solver_form(norm: Norm, x: ca.SX, theta: ca.SX) -> Form:
-    """The norm as a solver sees it.
-
-    Args:
-        norm: The robust norm.
-        x: All local variables of the kernel.
-        theta: Share of the curvature along the residual that is removed (0: reweighted least
-            squares, 1: Newton's; see docs/solving.md).
+    The majorant is one over all local variables x of the kernel; `theta` is the share of the
+    curvature along the residual that it leaves out (0: reweighted least squares, 1: Newton's; see
+    docs/solving.md).
     """
     v = norm.vector
     J = ca.jacobian(v, x)
     square = ca.dot(v, v)
-    if norm.kind == "half_square":
-        y, dy = square / 2, ca.SX(1.0)
-        outer = ca.mtimes(J.T, J)
-    else:
-        root = ca.sqrt(square + norm.eps**2)
-        y, dy = root - norm.eps, 1 / root
-        along = ca.mtimes(J.T, v / root)
-        if norm.sigma is not None:
-            # near its corner a truncated norm is concave along the residual: there only the full
-            # reweighted curvature still bounds it from above
-            theta = theta * smooth_min(y, norm.sigma, _corner(norm.eps, norm.sigma))[1] ** 2
-        outer = ca.mtimes(J.T, J) - theta * ca.mtimes(along, along.T)
+    root = ca.sqrt(square + norm.eps**2)
+    half = norm.kind == "half_square"
+    y, dy = (square / 2, ca.SX(1.0)) if half else (root - norm.eps, 1 / root)
     value, slope = y, ca.SX(1.0)
     if norm.sigma is not None:
-        value, slope = smooth_min(y, norm.sigma, _corner(norm.eps, norm.sigma))
-        value, slope = (1 - norm.leak) * value + norm.leak * y, norm.leak + (1 - norm.leak) * slope
-    return Form(norm.weight * value, norm.weight * slope * dy * outer)
+        # a corner as sharp as eps would be as stiff as the norm itself
+        cut, slope = smooth_min(y, norm.sigma, ca.fmax(norm.eps, 0.3 * norm.sigma))
+        # near its corner a truncated norm is concave along the residual: there only the full
+        # reweighted curvature still bounds it from above
+        theta = theta * slope**2
+        value, slope = (1 - norm.leak) * cut + norm.leak * y, norm.leak + (1 - norm.leak) * slope
+    outer = ca.mtimes(J.T, J)
+    if not half:
+        along = ca.mtimes(J.T, v / root)
+        outer = outer - theta * ca.mtimes(along, along.T)
+    return norm.weight * value, norm.weight * slope * dy * outer

@@ -87,26 +87,30 @@ Instruction = tuple[int, list[int], list[int], float]
 """CasADi's number of an operation; the register that takes the result, or output and nonzero of the
 function (OP_OUTPUT); registers of the operands, or input and nonzero (OP_INPUT); the value of
 OP_CONST, else 0."""
-
-
-def instructions(function: ca.Function) -> tuple[Instruction, ...]:
-    """What an SX function computes, step by step."""
-    return (_of_small if function.n_instructions() < LARGE else _of_large)(function)
-
-
 LARGE = 20_000
 """Instructions from which a function's list takes megabytes: only those of one solve are kept."""
 
 
 def _instructions(f: ca.Function) -> tuple[Instruction, ...]:
     numbers = [f.instruction_id(k) for k in range(f.n_instructions())]
-    values = [f.instruction_constant(k) if n == ca.OP_CONST else 0.0 for k, n in enumerate(numbers)]
-    places = [(f.instruction_output(k), f.instruction_input(k)) for k in range(len(numbers))]
-    return tuple((n, *place, value) for n, place, value in zip(numbers, places, values))
+    return tuple(
+        (
+            number,
+            f.instruction_output(k),
+            f.instruction_input(k),
+            f.instruction_constant(k) if number == ca.OP_CONST else 0.0,
+        )
+        for k, number in enumerate(numbers)
+    )
 
 
 _of_small = lru_cache(maxsize=200)(_instructions)
 _of_large = lru_cache(maxsize=16)(_instructions)
+
+
+def instructions(function: ca.Function) -> tuple[Instruction, ...]:
+    """What an SX function computes, step by step."""
+    return (_of_small if function.n_instructions() < LARGE else _of_large)(function)
 
 
 # --- kernels summed over their table --------------------------------------------------------------

@@ -32,10 +32,8 @@ def values(
     weights: Weights,
     ends: Mapping[GraphName, Ends] | None = None,
 ) -> Float:
-    """A term of every superpixel ("proj", (N,)), edge (E,) or neighbour pair (P,), without factor.
-
-    The name is one of `elements.TERMS`, `ends` are `ends_of` the soup where they are known.
-    """
+    """A term of `elements.TERMS` of every superpixel ("proj", (N,)), edge (E,) or neighbour pair
+    (P,), without factor; `ends` are `ends_of` the soup where they are known."""
     term = TERMS[name]
     if term is PROJ:
         H = soup.R - soup.t[:, :, None] * soup.n[:, None, :] / soup.d[:, None, None]

@@ -24,18 +24,14 @@ MIN_SCALE = 1e-4
 def build_matrix_nlp(
     soup: Soup, data: EnergyData, weights: Weights, form: Formulation
 ) -> tuple[NLP, MatrixLayout]:
-    """The constrained NLP from a soup, whose SO(3) and unit normals should hold.
-
-    Returns:
-        The NLP and the layout that turns its vectors into soups.
-    """
+    """The constrained NLP from a soup, whose SO(3) and unit normals should hold, and the layout
+    that turns its vectors into soups."""
     n = len(data)
     layout = MatrixLayout(data.share, form.gauge)
     b = Builder(form, layout, matrix_view, form.gauge)
     stride = layout.stride
     for name, element in elements(data, weights, layout).items():
         b.add_norms(name, element)
-
     _add_constraints(b, layout, data, form)
     x0 = layout.pack(soup)
     b.add_ridge(_metric(layout, x0, data))
@@ -110,16 +106,13 @@ def build_tangent_nlp(
     chart: Chart = "depth",
     layout: TangentLayout | None = None,
 ) -> tuple[NLP, TangentLayout]:
-    """The presolve from a soup: 9 coordinates per superpixel, linear constraints only.
+    """The presolve from a soup: 9 coordinates per superpixel, linear constraints only; and the
+    layout that turns its vectors into soups.
 
     The coordinates are about the soup. About the base of a given `layout` the program is the same
     for every start, and the simplex is exact.
-
-    Returns:
-        The NLP and the layout that turns its vectors into soups.
     """
-    n = len(data)
-    base = layout
+    n, base = len(data), layout
     layout = TangentLayout.about(soup, data, chart) if base is None else base
     chart = layout.chart
     b = Builder(form, layout, tangent_view, chart)

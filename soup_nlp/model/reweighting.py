@@ -17,8 +17,6 @@ from soup_nlp.model.formulas import relief
 OF_EDGES: tuple[str, ...] = ("edges", "edge_weight", "edge_unit", "rotation_scale")
 OF_EDGES += ("prior_weight", "prior_relief", "depth_weight", "depth_change")
 """Arrays of `EnergyData` with a row per edge."""
-
-
 HELD = 30.0
 """Factor of E_prior where it keeps the relief of the start: of what is not seen, and from there to
 what is. With 1, unseen parts run away on alley_1 and kitti_tracking 0 (MRE 33 and 0.66)."""

@@ -61,10 +61,8 @@ class View:
         return self.point(ray) if self.depth is None else self.depth * ray
 
     def next_gap(self, X: ca.SX, other: View, Y: ca.SX) -> ca.SX:
-        """Difference of the next-frame points `R X + lam t` of X and, by another view, of Y.
-
-        It is a sum of small differences.
-        """
+        """Difference of the next-frame points `R X + lam t` of X and, by another view, of Y: a sum
+        of small differences."""
         return self._turned_gap(self.R, X, other, Y)
 
     def stretch(self, X: ca.SX, other: View, Y: ca.SX) -> ca.SX:
@@ -88,26 +86,20 @@ class View:
 
 
 def matrix_view(x: ca.SX, row: Mapping[str, ca.SX], position: int, gauge: str) -> View:
-    """View of the constrained NLP's variables of one superpixel.
+    """View of the constrained NLP's variables of one superpixel, at its position in an element.
 
     Args:
         x: (16x1) `lam n R t` for gauge "unit-offset", else (17x1) `lam n d R t`; R by
             columns; lam, d and t scaled by N, 1/N and 1/N so that numbers are near 1.
-        row: The data row of an element: "offset_0" and so on are d in gauge "unit-offset".
-        position: Of the superpixel in the element.
-        gauge: "unit-offset" or "unit-translation".
+        row: The data row of the element: "offset_0" and so on are d in gauge "unit-offset".
     """
-    lam, n = x[0], x[1:4]
-    if gauge == "unit-offset":
-        d, rest = row[f"offset_{position}"], x[4:]
-    else:
-        d, rest = x[4], x[5:]
-    t = rest[9:12]
-    return View(lam=lam, m=-n / d, n=n, turn=ca.reshape(rest[0:9], 3, 3), t=t, drift=lam * t)
+    lam, n, R, t = x[0], x[1:4], x[-12:-3], x[-3:]
+    d = row[f"offset_{position}"] if gauge == "unit-offset" else x[4]
+    return View(lam=lam, m=-n / d, n=n, turn=ca.reshape(R, 3, 3), t=t, drift=lam * t)
 
 
 def tangent_view(x: ca.SX, row: Mapping[str, ca.SX], position: int, chart: str) -> View:
-    """View of the presolve's variables of one superpixel.
+    """View of the presolve's variables of one superpixel, at its position in an element.
 
     `1 / Z(r) = (1 + s . (r - r_a) / h) / Z`, Z = lam Z0 the depth of the anchor; rotation
     `R = R0 Cayley(w)` about the anchor: `X' = R (X - Z r_a) + Z (q0 + q)`, `q0 = R0 r_a + t0`. A
@@ -119,11 +111,9 @@ def tangent_view(x: ca.SX, row: Mapping[str, ca.SX], position: int, chart: str) 
     Args:
         x: (9x1) `lam s w q`: relative scale, slopes (2), rotation (3), shift of the moved anchor
             / Z (3); chart "inverse-depth" has `rho = 1 / lam` and `rho s`.
-        row: The data row of an element: "anchor_0" and so on are (3x1) anchor rays r_a, "radius_0"
+        row: The data row of the element: "anchor_0" and so on are (3x1) anchor rays r_a, "radius_0"
             h in ray units, "depth_0" the depths Z0 of the anchors in the base, "R0_0" (9x1) the
             base's rotations by columns, "t0_0" (3x1) its translations / Z0.
-        position: Of the superpixel in the element.
-        chart: "depth" or "inverse-depth".
     """
     anchor, radius, depth, R0, t0 = (
         row[f"{k}_{position}"] for k in ("anchor", "radius", "depth", "R0", "t0")

@@ -25,10 +25,8 @@ Row = Mapping[str, ca.SX]
 
 def arap(a: View, b: View, row: Row, eps: ca.SX, at_anchors: bool) -> list[Norm]:
     """E_arap of an edge, Eq. 1: rotation, translation and distance of the anchors."""
-    sigma, leak = row.get("sigma"), row["leak"]
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
-    weight, unit = row["weight"], row["unit"]
-    length_eps, angle_eps = eps, eps
+    unit, length_eps, angle_eps = row["unit"], eps, eps
     if "pixel" in row:
         length_eps, angle_eps = eps * row["pixel"], eps * row["angle"]
     else:
@@ -37,11 +35,11 @@ def arap(a: View, b: View, row: Row, eps: ca.SX, at_anchors: bool) -> list[Norm]
     translation = a.drift_from(b)
     if at_anchors:
         translation = translation + a.turn_from(b) @ ((Xa + Xb) / 2)
-    distance = a.stretch(Xa, b, Xb)
+    lengths = translation / unit, a.stretch(Xa, b, Xb) / unit
+    weight, cut = row["weight"], {"sigma": row.get("sigma"), "leak": row["leak"]}
     return [
-        Norm(weight, rotation, angle_eps, sigma, leak=leak),
-        Norm(weight, translation / unit, length_eps, sigma, leak=leak),
-        Norm(weight, distance / unit, length_eps, sigma, leak=leak),
+        Norm(weight, rotation, angle_eps, **cut),
+        *(Norm(weight, length, length_eps, **cut) for length in lengths),
     ]
 
 

@@ -1,6 +1,6 @@
 """What `nlpsol` calls, as CasADi callbacks: the functions of an NLP.
 
-CasADi's own graph of an NLP (`model.symbolic`) takes the data of all tables as a parameter,
+CasADi's own graph of an NLP (`export.symbolic`) takes the data of all tables as a parameter,
 which it copies at every call, and takes seconds to build at real sizes. Only theta is one here.
 """
 

@@ -30,7 +30,7 @@ from benchmarks.family.instances import (
 from benchmarks.family.write import check_sol, published
 from soup_nlp.errors import ConfigError
 from soup_nlp.export.nl import write_nl
-from soup_nlp.model.symbolic import make_oracle
+from soup_nlp.export.symbolic import make_oracle
 
 pytestmark = pytest.mark.slow
 

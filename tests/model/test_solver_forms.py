@@ -34,8 +34,8 @@ def test_a_linear_residual_has_its_exact_hessian_at_theta_one():
     x, eps, theta = ca.SX.sym("x", 3), ca.SX.sym("eps"), ca.SX.sym("theta")
     A = np.random.default_rng(0).normal(size=(4, 3))
     norm = Norm(ca.SX(1.7), A @ x - [0.1, 0.2, 0.3, 0.4], eps)
-    made = solver_form(norm, x, theta)
-    f = ca.Function("gap", [x, eps, theta], [ca.hessian(made.objective, x)[0] - made.curvature])
+    objective, curvature = solver_form(norm, x, theta)
+    f = ca.Function("gap", [x, eps, theta], [ca.hessian(objective, x)[0] - curvature])
     at = [0.3, -0.2, 0.4]
     np.testing.assert_allclose(np.asarray(f(at, 0.3, 1.0)), 0, atol=1e-12)
     # with less of the curvature along the residual left out the matrix is a majorant
@@ -46,8 +46,8 @@ def test_curvature_near_a_truncation_is_kept_along_the_residual():
     x, theta = ca.SX.sym("x", 2), 0.9
     norm = Norm(ca.SX(1.0), x, ca.SX(0.1), sigma=ca.SX(0.5))
     at = np.array([0.4, 0.3])
-    made = solver_form(norm, x, ca.SX(theta))
-    found = np.asarray(ca.Function("c", [x], [made.curvature])(at))
+    _, curvature = solver_form(norm, x, ca.SX(theta))
+    found = np.asarray(ca.Function("c", [x], [curvature])(at))
     root = np.sqrt(at @ at + 0.01)
     slope = float(ca.evalf(smooth_min(ca.SX(root - 0.1), ca.SX(0.5), ca.SX(0.15))[1]))
     assert 0.3 < slope < 0.8

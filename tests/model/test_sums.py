@@ -7,12 +7,12 @@ from helpers_model import GAUGES
 from helpers_nl import plain_nlp
 
 from soup_nlp.errors import ModelError
+from soup_nlp.export.symbolic import make_oracle
 from soup_nlp.model import operations
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp
-from soup_nlp.model.symbolic import make_oracle
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
 
