@@ -103,7 +103,7 @@ def sol_table(imported: Imported) -> list[Kind]:
     run = imported.run
     found = constraints(run.answer, run.data.rim_ray, run.problem.formulation.min_facing)
     rows = [replace(row, limit=FEASIBLE) for row in found.values()]
-    return rows + [kind(k, v, FEASIBLE, False) for k, v in imported.violations.items()]
+    return rows + [kind(k, v, FEASIBLE) for k, v in imported.violations.items()]
 
 
 def foreign_run(

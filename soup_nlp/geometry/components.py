@@ -10,7 +10,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.motion import RigidMotion, fit_motion
+from soup_nlp.geometry.rotation import RigidMotion, fit_motion
 from soup_nlp.geometry.soup import Soup
 
 SAME_PX = 0.5
@@ -60,10 +60,7 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """All rigid components, the background first, then by decreasing number of pixels.
-
-    The background is the component of the static scene; the camera's motion is the inverse of its
-    motion.
+    """All rigid components: that of the static scene, then by decreasing number of pixels.
 
     Attributes:
         of_superpixel: (N,) label of every superpixel.
@@ -124,12 +121,17 @@ def find_components(
     """One rigid motion for every group of superpixels; groups with the same motion are joined.
 
     A motion is fitted to the anchors and rims as their superpixels' motions move them: least
-    absolute distances in the next image by re-weighted Procrustes fits. The first of the groups
-    (N,) is the background; `borrowed` (N,) marks superpixels with the depth of neighbours.
+    absolute distances in the next image by re-weighted Procrustes fits; without a point in front of
+    both cameras it is that of the first superpixel. The first of the groups (N,) is the background;
+    `borrowed` (N,) marks superpixels with the depth of neighbours.
     """
     ray = rays(K_ref, np.concatenate([seg.anchors[:, None], seg.rim], axis=1))
     before = soup.points(ray)
     after = soup.moved(before)
+    # points in front of both cameras are used
+    front = (before[..., 2] > 0) & (after[..., 2] > 0)
+    front &= np.isfinite(before).all(axis=2) & np.isfinite(after).all(axis=2)
+    weight = np.broadcast_to(seg.sizes[:, None].astype(float), front.shape)
     label = np.unique(group, return_inverse=True)[1].ravel()
     count = np.bincount(label)
     motions: list[RigidMotion] = []
@@ -137,13 +139,16 @@ def find_components(
     # then large groups first: a small group joins the large one with the same motion
     for c in [0, *(1 + np.argsort(-count[1:], kind="stable"))]:
         mask = label == c
-        x, y, weight = _usable(before[mask], after[mask], seg.sizes[mask])
+        used = front & mask[:, None]
+        x, y = before[used], after[used]
         gap = [float(np.median(_gap(m, x, y, K_next))) if len(x) else np.inf for m in motions]
         if gap and min(gap) <= SAME_PX:
             joined[c] = int(np.argmin(gap))
             continue
         joined[c] = len(motions)
-        motions.append(_fit(x, y, weight, K_next) if len(x) else _first(soup, mask))
+        first = int(np.argmax(mask))
+        own = RigidMotion(soup.R[first], soup.translation[first])
+        motions.append(_fit(x, y, weight[used], K_next) if len(x) else own)
     label = joined[label]
     pixels = np.bincount(label, seg.sizes, len(motions)).astype(np.int64)
     order = np.concatenate([[0], 1 + np.argsort(-pixels[1:], kind="stable")])
@@ -152,28 +157,21 @@ def find_components(
     members = []
     for c, old in enumerate(order):
         mask = label == c
-        x, y, _ = _usable(before[mask], after[mask], seg.sizes[mask])
-        motion = motions[old]
+        used = front & mask[:, None]
+        x, motion = before[used], motions[old]
+        off = _gap(motion, x, after[used], K_next)
         members.append(
             Component(
                 label=c,
                 motion=motion,
                 superpixels=int(mask.sum()),
                 pixels=int(pixels[old]),
-                residual_px=float(np.median(_gap(motion, x, y, K_next))) if len(x) else np.nan,
+                residual_px=float(np.median(off)) if len(x) else np.nan,
                 borrowed=float(seg.sizes[mask & lent].sum() / pixels[old]),
                 centre=np.median(x, axis=0) if len(x) else np.full(3, np.nan),
             )
         )
     return Components(label, label[seg.labels].astype(np.int32), tuple(members))
-
-
-def _usable(before: Float, after: Float, size: Int) -> tuple[Float, Float, Float]:
-    """Points (M, 3) in front of both cameras, before and after, and their weights."""
-    x, y = before.reshape(-1, 3), after.reshape(-1, 3)
-    weight = np.repeat(size, before.shape[1]).astype(float)
-    front = np.isfinite(x).all(1) & np.isfinite(y).all(1) & (x[:, 2] > 0) & (y[:, 2] > 0)
-    return x[front], y[front], weight[front]
 
 
 def _gap(motion: RigidMotion, x: Float, y: Float, K: Float) -> Float:
@@ -192,9 +190,3 @@ def _fit(x: Float, y: Float, size: Float, K: Float) -> RigidMotion:
     for _ in range(FITS):
         motion = fit_motion(x, y, base / np.maximum(_gap(motion, x, y, K), LEAST_PX))
     return motion
-
-
-def _first(soup: Soup, mask: Mask) -> RigidMotion:
-    """The motion of a group's first superpixel, for a group without a point in front."""
-    i = int(np.argmax(mask))
-    return RigidMotion(soup.R[i], soup.translation[i])

@@ -1,6 +1,6 @@
 """The constraints of a soup, as residuals that anyone can test: the one definition of them."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -45,13 +45,16 @@ class Kind:
         values: (N,) violation by superpixel, nonnegative, inf where a number is not finite; one of
             the simplex.
         limit: Largest allowed violation.
-        superpixels: Whether the values belong to superpixels.
     """
 
     name: str
     values: Float = field(repr=False)
     limit: float
-    superpixels: bool = True
+
+    @property
+    def superpixels(self) -> bool:
+        """Whether the values belong to superpixels."""
+        return self.name not in ("simplex", "bounds", "rows")
 
     @property
     def largest(self) -> float:
@@ -80,31 +83,30 @@ class Kind:
         if not self.worst:
             return ""
         count = f"{self.beyond} of {len(self.values)} beyond {self.limit:.1e}; "
-        listed = "  ".join(f"{i} ({v:.1e})" for i, v in self.worst)
-        return f"{count if self.beyond else ''}worst superpixels {listed}"
+        return f"{count if self.beyond else ''}worst superpixels {self._listed}"
+
+    @property
+    def _listed(self) -> str:
+        return "  ".join(f"{i} ({v:.1e})" for i, v in self.worst)
 
     def __str__(self) -> str:
-        listed = "  ".join(f"{i} ({v:.1e})" for i, v in self.worst)
         return (
             f"{'ok  ' if self.ok else 'FAIL'} {self.name:<9}"
             f" {DEFINITIONS[self.name].equation:<17}{self.largest:>9.1e} {self.limit:>9.1e}"
-            f" {self.beyond:>6} of {len(self.values):<6} {listed}"
+            f" {self.beyond:>6} of {len(self.values):<6} {self._listed}"
         ).rstrip()
 
 
-def kind(name: str, violation: Float, limit: float | None = None, superpixels: bool = True) -> Kind:
+def kind(name: str, violation: Float, limit: float | None = None) -> Kind:
     """A kind of nonnegative violations (M,); NaN is an infinite one. The default limit is ours."""
     values = np.where(np.isfinite(violation), violation, np.inf)
-    return Kind(name, values, DEFINITIONS[name].limit if limit is None else limit, superpixels)
+    return Kind(name, values, DEFINITIONS[name].limit if limit is None else limit)
 
 
-def table(kinds: list[Kind]) -> str:
+def table(kinds: Iterable[Kind]) -> str:
     """Kinds as a table with its header."""
-    head = (
-        f"     {'kind':<9} {'equation':<17}{'largest':>9} {'limit':>9} {'beyond':>9}"
-        f"{'':<8}worst superpixels"
-    )
-    return "\n".join([head, *map(str, kinds)])
+    head = f"     {'kind':<9} {'equation':<17}{'largest':>9} {'limit':>9} {'beyond':>9}"
+    return "\n".join([f"{head}{'':<8}worst superpixels", *map(str, kinds)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +119,9 @@ class Constraints(Mapping[str, Kind]):
     kinds: tuple[Kind, ...]
 
     def __getitem__(self, name: str) -> Kind:
-        """The kind of a name."""
         return {k.name: k for k in self.kinds}[name]
 
     def __iter__(self) -> Iterator[str]:
-        """Names of the kinds."""
         return (k.name for k in self.kinds)
 
     def __len__(self) -> int:
@@ -147,12 +147,13 @@ class Constraints(Mapping[str, Kind]):
         Those are 1e-8 for so3, det and normal, 1e-10 for the simplex, 1e-6 for visibility, and
         0 for positive: lam and d are above 0, whatever `tol` is.
         """
-        limits = {k.name: k.limit if tol is None or not k.limit else tol for k in self.kinds}
-        return all(k.largest <= limits[k.name] for k in self.kinds)
+        return all(
+            k.largest <= (tol if tol is not None and k.limit else k.limit) for k in self.kinds
+        )
 
     def __str__(self) -> str:
         units = (f"     {k.name:<9} in units of {DEFINITIONS[k.name].unit}" for k in self.kinds)
-        return "\n".join([table(list(self.kinds)), *units])
+        return "\n".join([table(self.kinds), *units])
 
     __repr__ = __str__
 
@@ -186,10 +187,9 @@ def constraints(
     count = np.size(state["lam"]) if "lam" in state else 0
     shapes = {"lam": (count,), "n": (count, 3), "d": (count,), "R": (count, 3, 3), "t": (count, 3)}
     given = {k: _array(state.get(k), k, shape) for k, shape in shapes.items()}
-    lam, n, d, R, t = given.values()
-    broken = ~np.all([np.isfinite(a).reshape(count, -1).all(axis=1) for a in (n, d, R, t)], axis=0)
-    broken |= ~np.isfinite(lam)
-    least = np.minimum(lam, d)
+    lam, n, d, R, _ = given.values()
+    whole = [np.isfinite(a).reshape(count, -1).all(axis=1) for a in given.values()]
+    broken, least = ~np.all(whole, axis=0), np.minimum(lam, d)
     # the arrays of a solver that failed may hold anything
     with np.errstate(all="ignore"):
         off = {
@@ -205,7 +205,7 @@ def constraints(
             facing = -np.einsum("nc,nvc->nv", n, rays)
             off["visible"] = np.maximum(0.0, (min_facing - facing).max(axis=1))
     off = {k: v if k == "simplex" else np.where(broken, np.inf, v) for k, v in off.items()}
-    return Constraints(tuple(kind(k, v, superpixels=k != "simplex") for k, v in off.items()))
+    return Constraints(tuple(kind(k, v) for k, v in off.items()))
 
 
 def _array(value: object, name: str, shape: tuple[int, ...]) -> Float:

@@ -104,7 +104,8 @@ def build_segmentation(
     anchors = np.stack([np.bincount(flat, w, n) / sizes for w in (u, v)], axis=1)
     moment = np.bincount(flat, (u - anchors[flat, 0]) ** 2 + (v - anchors[flat, 1]) ** 2, n)
     knn = _nearest(anchors, neighbours)
-    edges, multiplicity = _fold(knn)
+    directed = np.stack([np.repeat(np.arange(n), knn.shape[1]), knn.ravel()], axis=1)
+    edges, multiplicity = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
     distance = np.linalg.norm(anchors[edges[:, 0]] - anchors[edges[:, 1]], axis=1)
     pairs, boundary, length, weight = _shared_boundaries(labels, image, boundary_samples)
     return Segmentation(
@@ -136,14 +137,6 @@ def _nearest(anchors: Float, k: int) -> Int:
     far[index == np.arange(n)[:, None]] = np.inf
     order = np.argsort(far, axis=1, kind="stable")[:, :k]
     return np.take_along_axis(index, order, axis=1).astype(np.int64)
-
-
-def _fold(knn: Int) -> tuple[Int, Int]:
-    n, k = knn.shape
-    directed = np.stack([np.repeat(np.arange(n), k), knn.ravel()], axis=1)
-    directed.sort(axis=1)
-    edges, count = np.unique(directed, axis=0, return_counts=True)
-    return edges.reshape(-1, 2), count
 
 
 def _shared_boundaries(
@@ -200,21 +193,17 @@ def _sample_along(points: Float, which: Int, count: Int, samples: int | None) ->
 
 def connected(links: Int, count: int) -> Int:
     """(count,) component of every node of a graph with these links (L, 2)."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_matrix((np.ones(len(links)), tuple(links.T)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    sparse = scipy.sparse
+    graph = sparse.coo_matrix((np.ones(len(links)), tuple(links.T)), shape=(count, count))
+    return np.asarray(sparse.csgraph.connected_components(graph, directed=False)[1], np.int64)
 
 
 def _rim(labels: NDArray[np.int32], u: Float, v: Float, n: int) -> Float:
     """(N, RIM, 2) extreme pixels of every superpixel by direction."""
     order = np.argsort(labels.ravel(), kind="stable")
-    count = np.bincount(labels.ravel(), minlength=n)
-    start = np.cumsum(count) - count
     owner, u, v = labels.ravel()[order], u[order], v[order]
+    start, last = np.searchsorted(owner, np.arange(n)), np.empty(n, np.int64)
     out = np.empty((n, RIM, 2))
-    last = np.empty(n, np.int64)
     for k in range(RIM):
         angle = 2 * np.pi * k / RIM
         reach = u * np.cos(angle) + v * np.sin(angle)

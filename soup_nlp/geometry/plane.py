@@ -29,10 +29,8 @@ def normal_and_distance(m: Float) -> tuple[Float, Float]:
 
 
 def at_anchor(m: Float, anchor_ray: Float) -> tuple[Float, Float]:
-    """Depth (...) at the anchor rays (..., 3) and slopes (..., 2), per ray unit.
-
-    A depth is negative where the plane passes the anchor behind the camera.
-    """
+    """Depth (...) at the anchor rays (..., 3), negative where the plane passes them behind the
+    camera, and slopes (..., 2), per ray unit."""
     Z = 1.0 / np.einsum("...c,...c->...", m, anchor_ray)
     return Z, m[..., :2] * Z[..., None]
 
@@ -44,10 +42,10 @@ def about_anchor(Z: Float, g: Float, anchor_ray: Float) -> Float:
 
 
 def tilt_to_camera(soup: Soup, anchor_ray: Float, visibility_ray: Float, min_facing: float) -> Soup:
-    """The soup with planes that break visibility tilted about their anchors until they satisfy it.
+    """The soup with planes that break visibility, `-n . v >= min_facing` at rays v (N, V, 3),
+    tilted about their anchors until they satisfy it, as a plane parallel to the image does.
 
-    It is `-n . v >= min_facing` at rays v (N, V, 3). The depth at the anchor rays (N, 3), which is
-    positive, is kept. A plane parallel to the image satisfies every row.
+    The depth at the anchor rays (N, 3), which is positive, is kept.
     """
     Z, g = at_anchor(inverse_depth(soup.n, soup.distance), anchor_ray)
     share = np.ones(len(soup))
@@ -92,10 +90,8 @@ class PlaneFit:
     parallax: Float
 
     def penalised(self) -> Float:
-        """(N, C) cost in pixels, increased where the plane lies behind the camera.
-
-        A point without parallax is at infinity, and rounding decides its sign.
-        """
+        """(N, C) cost in pixels, increased where the plane lies behind the camera."""
+        # a point without parallax is at infinity, and rounding decides its sign
         shift = self.parallax * self.inverse_depth
         return self.cost + np.where(shift < -ROUNDING_PX, 1.0 - 0.5 * shift, 0.0)
 
@@ -113,13 +109,10 @@ def fit_planes(
     """Fit `mu(r) = mu_a + g . (r - r_a) / h` with `q ~ R r + mu t` to the flow.
 
     Args:
-        R: (N, C, 3, 3) rotations.
-        t: (N, C, 3) translations.
+        R, t: (N, C, 3, 3) rotations and (N, C, 3) translations.
         ray: (N, S, 3) rays of sampled pixels.
-        target: (N, S, 3) rays of their flow targets (next camera).
-        weight: (N, S) confidence.
-        anchor: (N, 3) anchor rays.
-        radius: (N,) reach in ray units (h).
+        target, weight: (N, S, 3) rays of their flow targets (next camera), (N, S) confidence.
+        anchor, radius: (N, 3) anchor rays, (N,) reach in ray units (h).
         focal: (2,) focal lengths of the next camera: errors are in pixels.
     """
     # one array (N, C, S) per coordinate, the pixels contiguous
@@ -137,11 +130,10 @@ def fit_planes(
     b2 = bx * bx + by * by
     ab = ax * bx + ay * by
     mu = np.zeros((*front.shape[:2], 3))
-    floor = 1e-12
     for step in range(ROUNDS):
         s = w / depth_like**2
         if step == 0:
-            mu[..., 0] = -np.sum(s * ab, axis=2) / np.maximum(np.sum(s * b2, axis=2), floor)
+            mu[..., 0] = -np.sum(s * ab, axis=2) / np.maximum(np.sum(s * b2, axis=2), 1e-12)
         else:
             A = ((s * b2) @ outer).reshape(*mu.shape, 3)
             rhs = -(s * ab) @ basis
@@ -150,7 +142,7 @@ def fit_planes(
             A[..., 1, 1] += prior
             A[..., 2, 2] += prior
             size = np.trace(A, axis1=-2, axis2=-1)[..., None, None]
-            A += (floor * size + 1e-18) * np.eye(3)
+            A += (1e-12 * size + 1e-18) * np.eye(3)
             mu = np.linalg.solve(A, rhs[..., None])[..., 0]
             limit = MOST_SLOPE * np.abs(mu[..., :1])
             mu[..., 1:] = np.clip(mu[..., 1:], -limit, limit)

@@ -71,10 +71,8 @@ class Soup:
         return self.distance.reshape(-1, *[1] * (ray.ndim - 2)) / facing
 
     def depth_across(self, superpixels: Int, ray: Float) -> Float:
-        """(S, P) z of every ray (P, 3) on the planes of S superpixels each, `superpixels` (P, S).
-
-        `-n . ray` is taken as 1e-3 where it is less.
-        """
+        """(S, P) z of every ray (P, 3) on the planes of S superpixels each, `superpixels` (P, S);
+        `-n . ray` is at least 1e-3."""
         facing = np.maximum(-np.einsum("psc,pc->sp", self.n[superpixels], ray), 1e-3)
         return np.asarray(self.distance[superpixels.T] / facing)
 
@@ -88,11 +86,8 @@ class Soup:
         return np.einsum("nij,n...j->n...i", self.R, points) + T
 
     def normalised(self, share: Float | None = None) -> Soup:
-        """Same geometry with sum(lam) = 1, where lam_i = share_i x plane distance.
-
-        Args:
-            share: (N,) positive; default 1/N, then the mean plane distance becomes 1.
-        """
+        """Same geometry with sum(lam) = 1, where lam_i = share_i x plane distance; by default the
+        shares (N,) are 1/N, and the mean plane distance becomes 1."""
         n = len(self)
         c = np.full(n, 1.0 / n) if share is None else share
         unit = float(np.sum(c * self.distance))
@@ -102,17 +97,14 @@ class Soup:
 
     def retracted(self) -> Soup:
         """Nearest soup that satisfies SO(3), unit normals and the simplex to rounding."""
-        n = self.n / np.linalg.norm(self.n, axis=1, keepdims=True)
+        length = np.linalg.norm(self.n, axis=1)
+        n = self.n / length[:, None]
         # the plane does not move: d belongs to a normal of unit length
-        d = self.d / np.linalg.norm(self.n, axis=1)
-        total = self.lam.sum()
-        return Soup(self.lam / total, n, d, nearest(self.R), self.t)
+        return Soup(self.lam / self.lam.sum(), n, self.d / length, nearest(self.R), self.t)
 
     def parallax(self, ray: Float) -> Float:
-        """(N, 2) image motion, in ray units, by the translations of points along rays (N, 3).
-
-        It is the displacement in the next image from the points moved by the rotation alone.
-        """
+        """(N, 2) displacement in the next image, in ray units, of points along rays (N, 3) from
+        where the rotation alone moves them."""
         far = np.einsum("nij,nj->ni", self.R, self.points(ray))
         near = far + self.translation
         return near[:, :2] / near[:, 2:] - far[:, :2] / far[:, 2:]
@@ -178,28 +170,26 @@ def reconstruct(
     `labels` (H, W) are the superpixels of the pixels, `size_next` is the (height, width) of the
     next frame, by default that of the reference.
     """
-    height, width = labels.shape
-    uv = pixel_grid(height, width)
+    uv = pixel_grid(*labels.shape)
     r = rays(K_ref, uv)
     facing = -np.einsum("hwc,hwc->hw", soup.n[labels], r)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(facing > LEAST_FACING, soup.distance[labels] / facing, np.nan)
-    points = z[..., None] * r
-    moved = np.einsum("hwij,hwj->hwi", soup.R[labels], points) + soup.translation[labels]
-    with np.errstate(divide="ignore", invalid="ignore"):
+        points = z[..., None] * r
+        moved = np.einsum("hwij,hwj->hwi", soup.R[labels], points) + soup.translation[labels]
         target = project(K_next, moved)
     depth = moved[..., 2]
-    source = nearest_on_top(target, depth, size_next or (height, width))
+    source = nearest_on_top(target, depth, size_next or labels.shape)
     depth_next = np.where(source >= 0, depth.ravel()[source], np.nan)
     return Reconstruction(z, points, moved, target - uv, depth_next, soup, labels, source)
 
 
 def nearest_on_top(target: Float, z: Float, size: tuple[int, int]) -> Int:
-    """Reference pixel that every pixel of the next frame shows: that of the nearest surface.
+    """(height, width) reference pixel that every pixel of the next frame shows, in row order: that
+    of the nearest surface; -1 where nothing lands.
 
-    From the target (H, W, 2) and depth there (H, W) of the reference pixels it is (height, width)
-    indices in row order, -1 where nothing lands. Cracks of one pixel in a stretched surface are
-    closed.
+    From target (H, W, 2) and depth there (H, W) of the reference pixels. Cracks of one pixel in a
+    stretched surface are closed.
     """
     height, width = size
     ok = np.flatnonzero((np.isfinite(target).all(-1) & (z > 0)).ravel())

@@ -25,11 +25,7 @@ SMOOTHING_PX = (0.0, 1.0, 2.0, 4.0)
 into fragments, which are then merged into a few large superpixels. A grid is the last resort."""
 
 
-def segment(
-    image: Image,
-    count: int,
-    method: Literal["slic", "grid"] = "slic",
-) -> Labels:
+def segment(image: Image, count: int, method: Literal["slic", "grid"] = "slic") -> Labels:
     """Superpixel labels (H, W) of an RGB image, each connected (4-neighbourhood) and not empty.
 
     The number differs from `count`, 1 to a quarter of the pixels, by at most 3 %, or by one; a grid
@@ -37,13 +33,7 @@ def segment(
     "grid" (the paper's worst case).
     """
     height, width = image.shape[:2]
-    if not 1 <= count <= height * width // 4:
-        raise DataError(
-            "number of superpixels does not fit the image",
-            where="segmentation.superpixels",
-            found=count,
-            expected=f"1 to {height * width // 4} for {width}x{height}",
-        )
+    check_count(count, height, width)
     if method == "grid" or count == 1 or np.ptp(image) == 0:
         # on an image of one colour SLIC has no edges to follow and would return the grid
         return _grid(height, width, count)
@@ -52,6 +42,17 @@ def segment(
         if labels.max() + 1 >= ENOUGH * count:
             return _as_many(image, labels, count, smoothing)
     return _grid(height, width, count)
+
+
+def check_count(count: int, height: int, width: int) -> None:
+    """Raise DataError for fewer superpixels than one, or more than an image has room for."""
+    if not 1 <= count <= height * width // 4:
+        raise DataError(
+            "number of superpixels does not fit the image",
+            where="segmentation.superpixels",
+            found=count,
+            expected=f"1 to {height * width // 4} for {width}x{height}",
+        )
 
 
 def _slic(image: Image, clusters: int, sigma: float) -> Labels:
@@ -72,12 +73,8 @@ def _slic(image: Image, clusters: int, sigma: float) -> Labels:
 
 
 def _as_many(image: Image, labels: Labels, count: int, sigma: float) -> Labels:
-    """Superpixels whose number is near `count`.
-
-    SLIC's clusters start on a grid of few possible sizes, and the number that vanishes depends on
-    the image. With too few superpixels, SLIC is called with more clusters; with too many, the
-    smallest join their neighbours.
-    """
+    """Superpixels whose number is near `count`: of SLIC with more clusters where they are too few,
+    since it starts them on a grid of few possible sizes and some vanish; too many are joined."""
     near, clusters = max(1.0, NEAR * count), count
     for _ in range(MORE_CALLS):
         n = int(labels.max()) + 1

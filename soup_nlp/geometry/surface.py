@@ -15,11 +15,8 @@ JUMP = 0.1
 
 
 def hidden(rec: Reconstruction) -> Mask:
-    """(H, W) True where a reference pixel is not visible in the next frame.
-
-    It lies behind a nearer surface there, or outside the image, so that the next image does not
-    determine its depth.
-    """
+    """(H, W) True where a reference pixel lies behind a nearer surface in the next frame, or
+    outside its image, which then does not determine its depth."""
     height, width = rec.depth_next.shape
     target = rec.flow + pixel_grid(*rec.depth_ref.shape)
     z = rec.points_next[..., 2]
@@ -27,8 +24,7 @@ def hidden(rec: Reconstruction) -> Mask:
         u, v = np.floor(target[..., 0] + 0.5), np.floor(target[..., 1] + 0.5)
         inside = (z > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
     u, v = (np.where(inside, x, 0).astype(np.int64) for x in (u, v))
-    nearest = rec.depth_next[v, u]
-    return ~inside | ~(z <= nearest * (1 + BEHIND))
+    return ~inside | ~(z <= rec.depth_next[v, u] * (1 + BEHIND))
 
 
 def joined(
@@ -36,14 +32,9 @@ def joined(
 ) -> tuple[Mask, Mask]:
     """Whether pixels are on one continuous surface with those to the right, (H, W - 1), and below.
 
-    They are within a superpixel, and across the border of two superpixels of one group whose planes
+    They are within a superpixel, and across the border of two superpixels, `labels` (H, W), of one
+    `group` (H, W), such as a rigid component, whose `planes` (N, 3), m with depth 1 / (m . ray),
     meet there.
-
-    Args:
-        planes: (N, 3) m of every superpixel, with depth 1 / (m . ray).
-        labels: (H, W) superpixels.
-        group: (H, W) groups such as rigid components.
-        K: (3, 3) intrinsics, pixels.
     """
     ray = rays(K, pixel_grid(*labels.shape))
     out = []
@@ -74,8 +65,7 @@ def at_jumps(right: Mask, below: Mask) -> Mask:
 def whole_cells(right: Mask, below: Mask, keep: Mask, step: int = 1) -> Mask:
     """((H - 1) / step, (W - 1) / step) cells of `step` pixels that no break of the surface crosses.
 
-    `right` and `below` say where it continues, see `joined`; `keep` (H, W) are the pixels that are
-    part of it.
+    `right` and `below` are those of `joined`; `keep` (H, W) are the pixels of the surface.
     """
     height, width = keep.shape
     if min(height, width) <= step:

@@ -12,10 +12,9 @@ from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.working_size import resized_flow, working_size
-from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
-from soup_nlp.geometry.superpixels import Labels, segment
+from soup_nlp.geometry.superpixels import Labels, check_count, segment
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import BENDING_ARAP, WIDEST_BENDING_EPS, Weights
 from soup_nlp.model.reweighting import Known, in_pixels, in_translations, weighted
@@ -298,14 +297,7 @@ NEIGHBOURS = 3
 
 def check_fits(problem: Problem, pair: Pair) -> None:
     """Raise DataError for more superpixels than the image has room for, or too little memory."""
-    (height, width), n = pair.size, problem.segmentation.superpixels
-    if n > height * width // 4:
-        raise DataError(
-            "number of superpixels does not fit the image",
-            where="segmentation.superpixels",
-            found=n,
-            expected=f"1 to {height * width // 4} for {width}x{height}",
-        )
+    check_count(problem.segmentation.superpixels, *pair.size)
     parts = solve_bytes(problem, pair)
     shares = ", ".join(f"{name} {size / 1e9:.3g} GB" for name, size in parts.items())
     hint = "smaller images with their intrinsics, or lower the option behind the largest part"

@@ -16,7 +16,7 @@ from soup_nlp.evaluation.scoring import score_depths
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.constraints import Constraints, constraints
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.rotation import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData

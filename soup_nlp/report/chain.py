@@ -15,7 +15,7 @@ from soup_nlp.arrays import Float, Image, Int, Mask
 from soup_nlp.errors import FrameError
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.components import Component
-from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.rotation import RigidMotion
 from soup_nlp.geometry.surface import joined
 from soup_nlp.report.figures import (
     Picture,

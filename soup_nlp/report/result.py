@@ -19,8 +19,8 @@ from soup_nlp.evaluation.scoring import DEPTHS
 from soup_nlp.geometry.components import Components, find_components
 from soup_nlp.geometry.constraints import Constraints, constraints
 from soup_nlp.geometry.graph import Segmentation
-from soup_nlp.geometry.motion import RigidMotion
 from soup_nlp.geometry.plane import inverse_depth
+from soup_nlp.geometry.rotation import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
 from soup_nlp.geometry.surface import at_jumps, hidden, joined
 from soup_nlp.pipeline.record import Run

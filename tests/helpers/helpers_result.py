@@ -8,8 +8,7 @@ from soup_nlp.evaluation.metrics import depth_metrics
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.geometry.components import find_components
 from soup_nlp.geometry.graph import build_segmentation
-from soup_nlp.geometry.motion import RigidMotion
-from soup_nlp.geometry.rotation import exp
+from soup_nlp.geometry.rotation import RigidMotion, exp
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.report.result import Result
 

@@ -15,7 +15,7 @@ from soup_nlp.cli.main import print_warning
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.pair import Flow, Pair, Truth
 from soup_nlp.errors import DataError
-from soup_nlp.geometry.motion import RigidMotion
+from soup_nlp.geometry.rotation import RigidMotion
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import strip
 from soup_nlp.report.formats import FORMATS

@@ -9,8 +9,7 @@ from helpers_start import facing, squares
 from soup_nlp.config.problem import make_problem
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.geometry.components import find_components
-from soup_nlp.geometry.motion import RigidMotion, fit_motion
-from soup_nlp.geometry.rotation import exp
+from soup_nlp.geometry.rotation import RigidMotion, exp, fit_motion
 from soup_nlp.pipeline.case import prepare
 
 K = intrinsics(100.0, 100.0, 39.5, 29.5)
