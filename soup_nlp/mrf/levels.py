@@ -58,17 +58,11 @@ class Level:
 
 
 def colours(n_nodes: int, edges: np.ndarray) -> np.ndarray:
-    """Greedy colouring, largest degree first (Welsh and Powell 1967).
+    """(N,) colour, from 0, of every node of a graph with these edges (E, 2): greedy, largest degree
+    first (Welsh and Powell 1967).
 
     No two nodes of a colour have an edge between them, and every node has a neighbour in each
     lower colour: there are at most as many colours as the largest degree + 1.
-
-    Args:
-        n_nodes: Number of nodes N.
-        edges: (E, 2) edges.
-
-    Returns:
-        (N,) colour of every node, counted from 0.
     """
     near: list[list[int]] = [[] for _ in range(n_nodes)]
     for a, b in edges.tolist():
@@ -82,12 +76,7 @@ def colours(n_nodes: int, edges: np.ndarray) -> np.ndarray:
 
 
 def plan_levels(colour: np.ndarray, edges: np.ndarray) -> list[Level]:
-    """The levels of a colouring, first to last in the forward pass.
-
-    Args:
-        colour: (N,) from :func:`colours`.
-        edges: (E, 2) edges.
-    """
+    """The levels of a colouring (N,) of edges (E, 2), first to last in the forward pass."""
     n, count = len(colour), int(colour.max()) + 1
     forwards = colour[edges[:, 0]] < colour[edges[:, 1]]
     early = np.where(forwards, edges[:, 0], edges[:, 1])
@@ -109,15 +98,8 @@ def plan_levels(colour: np.ndarray, edges: np.ndarray) -> list[Level]:
 def _sides(
     near: np.ndarray, far: np.ndarray, head: np.ndarray, level: np.ndarray, position: np.ndarray
 ) -> list[Side]:
-    """One :class:`Side` per level, of the edges seen from their ``near`` node.
-
-    Args:
-        near: (E,) node on this side of every edge.
-        far: (E,) node at the far end.
-        head: (E,) whether ``near`` comes first in its edge.
-        level: (N,) level of every node.
-        position: (N,) position of every node in its level.
-    """
+    """One :class:`Side` per level, of the edges seen from their ``near`` node (E,); ``head`` (E,)
+    says whether it comes first in its edge, ``position`` (N,) is that of a node in its level."""
     ids = np.lexsort((position[near], level[near]))
     cuts = np.searchsorted(level[near[ids]], np.arange(int(level.max()) + 2))
     out = []

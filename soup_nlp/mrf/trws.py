@@ -121,28 +121,14 @@ def solve_trws(
 def mrf_energy(
     labels: np.ndarray, unary: np.ndarray, edges: np.ndarray, pairwise: np.ndarray
 ) -> float:
-    """Energy of a labelling in float64, by plain look-up of the inputs of :func:`solve_trws`.
-
-    Args:
-        labels: (N,) integers.
-        unary: (N, L) costs.
-        edges: (E, 2) node numbers.
-        pairwise: (E, L, L) tables.
-    """
+    """Energy of a labelling (N,) in float64, by plain look-up of inputs of :func:`solve_trws`."""
     edge_costs = pairwise[np.arange(len(edges)), labels[edges[:, 0]], labels[edges[:, 1]]]
     node_costs = np.asarray(unary, np.float64)[np.arange(len(labels)), labels]
     return float(node_costs.sum()) + math.fsum(edge_costs.tolist())
 
 
 class _Passes:
-    """Messages and passes of one problem.
-
-    Args:
-        costs: (N, L) unary costs, +inf where a label is forbidden.
-        plan: Levels, first to last.
-        table: (E, L, L) tables of the edges in the working type; axis 1 belongs to ``edges[e, 0]``.
-            They are read block by block and never copied as a whole.
-    """
+    """Messages and passes of one problem, whose tables are read block by block."""
 
     def __init__(self, costs: np.ndarray, plan: list[Level], table: np.ndarray) -> None:
         with np.errstate(over="ignore", invalid="ignore"):

@@ -29,17 +29,8 @@ def feasible(p: Particles, visibility_ray: Float, min_facing: float) -> Mask:
 def unary_costs(
     p: Particles, data: EnergyData, weights: Weights, superpixels: Int | None = None
 ) -> tuple[Float, Mask]:
-    """alpha1 E_proj of every particle, and whether it keeps its pixels in front of the camera.
-
-    Args:
-        p: (N, L) particles.
-        data: Pixels of the pair, all or sampled.
-        weights: alpha1 and its truncation.
-        superpixels: (N,) superpixels that the particles belong to; None for all, in order.
-
-    Returns:
-        (N, L) costs and (N, L) bool.
-    """
+    """(N, L) alpha1 E_proj of every particle, and whether it keeps its pixels in front of the
+    camera; the particles are those of `superpixels` (N,), by default of all in order."""
     n_nodes, n_labels = p.shape
     out, ahead = np.empty(p.shape), np.empty(p.shape, bool)
     index = np.arange(n_nodes) if superpixels is None else superpixels
@@ -57,10 +48,6 @@ class PairCosts:
     Attributes:
         edges: (E, 2) union of `data.edges` and `data.pairs`, i < k, each pair once.
         rows: For both graphs by name, (E,) the row of each of these, -1 where there is none.
-
-    Args:
-        data: Graphs and weights of the pair.
-        weights: Factors and truncations.
     """
 
     def __init__(self, data: EnergyData, weights: Weights) -> None:
@@ -69,20 +56,18 @@ class PairCosts:
         graphs: dict[GraphName, Int] = {"edges": data.edges, "pairs": data.pairs}
         keys = {name: e[:, 0] * n + e[:, 1] for name, e in graphs.items()}
         key = np.union1d(*keys.values())
-        self.edges = np.stack([key // n, key % n], axis=1).astype(np.int64)
-        self.rows = {name: np.full(len(key), -1, np.int64) for name in keys}
-        for name, term_key in keys.items():
-            self.rows[name][np.searchsorted(key, term_key)] = np.arange(len(term_key))
+        self.edges: Int = np.stack([key // n, key % n], axis=1)
+        self.rows = {name: np.full(len(key), -1) for name in keys}
+        for name, own in keys.items():
+            self.rows[name][np.searchsorted(key, own)] = np.arange(len(own))
 
     def tables(
         self, p: Particles, unit: float = 1.0, dtype: type | np.dtype = np.float64
     ) -> AnyFloat:
         """(E, L, L) weighted sum of all terms but E_proj, by edge and pair of labels.
 
-        Args:
-            p: (N, L) particles.
-            unit: The scene's length unit `sum_i c_i D_i` where lengths are not local.
-            dtype: float64, or float32 for half the memory.
+        `unit` is the scene's, `sum_i c_i D_i`, where lengths are not local; float32 takes half the
+        memory of float64.
         """
         data, labels = self.data, p.shape[1]
         out = np.zeros((len(self.edges), labels, labels), dtype)

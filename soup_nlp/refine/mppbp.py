@@ -95,25 +95,16 @@ def refine_soup(
     o = options or RefineOptions()
     rounds = Rounds(best, energy, data, weights, o, photo, (rays, min_facing), seed)
     status = rounds.run(watch or Watch(), time.process_time() + o.max_seconds)
-    return Refined(
-        rounds.best,
-        before,
-        energy,
-        rounds.energy,
-        tuple(rounds.done),
-        status,
-        time.perf_counter() - begin,
-        0 if photo is None else int(photo.contradicted.sum()),
-    )
+    contradicted = 0 if photo is None else int(photo.contradicted.sum())
+    ends, seconds = (before, energy, rounds.energy), time.perf_counter() - begin
+    return Refined(rounds.best, *ends, tuple(rounds.done), status, seconds, contradicted)
 
 
 def objective(
     soup: Soup, data: EnergyData, weights: Weights, photo: Photometric | None = None
 ) -> Mapping[str, float]:
-    """Objective of the refinement by term: E; with images also E_photo.
-
-    Where the images contradict the flow, E_proj is weaker (`Photometric.costs_of_flow`).
-    """
+    """Objective of the refinement by term: E; with images also E_photo, and a weaker E_proj where
+    they contradict the flow (`Photometric.costs_of_flow`)."""
     E = oracle.energy(soup, data, weights)
     if photo is None:
         return E
@@ -126,12 +117,8 @@ def objective(
 def length_slope(soup: Soup, data: EnergyData, weights: Weights) -> float:
     """`-dE / d log u`: by how much E rises when the scene's length unit shrinks, all else fixed."""
     h = 1e-4
-    up, down = (
-        oracle.energy(
-            soup, replace(data, edge_unit=data.edge_unit * s, pair_unit=data.pair_unit * s), weights
-        )["total"]
-        for s in (1 + h, 1 - h)
-    )
+    units = [{k: getattr(data, k) * s for k in ("edge_unit", "pair_unit")} for s in (1 + h, 1 - h)]
+    up, down = (oracle.energy(soup, replace(data, **u), weights)["total"] for u in units)
     return (down - up) / (2 * h)
 
 
@@ -142,13 +129,10 @@ class Rounds:
     Attributes:
         best: Soup of the lowest energy so far; at first the soup to begin with.
         energy: Its energy by term, see `objective`.
-        data: Numbers of the energy.
-        weights: Its constants.
-        options: Rounds, particles, limits.
-        photo: Photometric term; None for the flow alone.
         visibility: (N, V, 3) rays where visibility is imposed, and the least facing there.
-        seed: Seed of all draws.
         done: Rounds that have ended.
+
+    The others are arguments of `refine_soup`.
     """
 
     best: Soup
@@ -198,10 +182,8 @@ class Rounds:
         return "agreed" if most < o.rounds else "rounds"
 
     def costs(self, p: Particles) -> tuple[Float, NDArray[np.floating]]:
-        """The exact energy over particles as a pairwise MRF: unary and pairwise costs.
-
-        Infeasible particles have infinite cost.
-        """
+        """The exact energy over particles as a pairwise MRF: unary costs, infinite for those that
+        are infeasible, and pairwise ones."""
         data, best, photo = self.data, self.best, self.photo
         flow = photo.costs_of_flow if photo else unary_costs
         unary, allowed = flow(p, data, self.weights)

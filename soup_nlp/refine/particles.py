@@ -70,19 +70,17 @@ class Particles:
 
     def joined(self, *others: Particles) -> Particles:
         """The particles of several sets, concatenated."""
-        sets = (self, *others)
-        return Particles(
-            *(np.concatenate([getattr(p, k) for p in sets], axis=1) for k in ("n", "D", "R", "T"))
-        )
+        arrays = zip(*(vars(p).values() for p in (self, *others)))
+        return Particles(*(np.concatenate(a, axis=1) for a in arrays))
 
     def take(self, which: Int) -> Particles:
         """The particles with the numbers `which` (N, C)."""
         rows = np.arange(len(self.D))[:, None]
-        return Particles(*(a[rows, which] for a in (self.n, self.D, self.R, self.T)))
+        return Particles(*(a[rows, which] for a in vars(self).values()))
 
     def subset(self, which: Int | slice) -> Particles:
         """The particles of the superpixels `which`."""
-        return Particles(self.n[which], self.D[which], self.R[which], self.T[which])
+        return Particles(*(a[which] for a in vars(self).values()))
 
     def soup(self, labels: Int, share: Float) -> Soup:
         """The soup of labels (N,), with sum(lam) = 1 exactly restored (`Soup.normalised`)."""
@@ -98,28 +96,18 @@ def from_anchor(Z: Float, g: Float, R: Float, T: Float, anchor_ray: Float) -> Pa
 
 
 def neighbours(edges: Int, anchor_ray: Float) -> Int:
-    """(N, K) neighbours of every superpixel on a graph (E, 2), nearest anchors (N, 3) first.
-
-    K is the smallest degree.
-    """
-    n = len(anchor_ray)
-    if not len(edges):
-        return np.zeros((n, 0), np.int64)
-    node = np.concatenate([edges[:, 0], edges[:, 1]])
-    neighbour = np.concatenate([edges[:, 1], edges[:, 0]])
+    """(N, K) neighbours of every superpixel on a graph (E, 2), nearest anchors (N, 3) first; K is
+    the smallest degree."""
+    node, neighbour = np.concatenate([edges, edges[:, ::-1]]).T
     gap = np.linalg.norm(anchor_ray[node] - anchor_ray[neighbour], axis=1)
     order = np.lexsort((gap, node))
-    degree = np.bincount(node, minlength=n)
-    start = np.concatenate([[0], np.cumsum(degree)[:-1]])
-    k = int(degree.min())
-    return neighbour[order][start[:, None] + np.arange(k)].astype(np.int64)
+    degree = np.bincount(node, minlength=len(anchor_ray))
+    start = np.cumsum(degree) - degree
+    return neighbour[order][start[:, None] + np.arange(degree.min())]
 
 
 def counts(shares: Mapping[str, float], total: int, near: int) -> dict[str, int]:
-    """`total` proposals split by shares.
-
-    At most `near` neighbours can be taken over; random steps replace the proposals beyond.
-    """
+    """`total` proposals split by shares; random steps replace what is beyond `near` neighbours."""
     share = np.cumsum(list(shares.values()))
     ends = np.rint(total * share / share[-1]).astype(int)
     split = dict(zip(shares, np.diff(ends, prepend=0).tolist(), strict=True))
@@ -129,13 +117,8 @@ def counts(shares: Mapping[str, float], total: int, near: int) -> dict[str, int]
 
 
 class Proposer:
-    """Makes proposals for one pair.
-
-    Args:
-        data: Rays and radii of the superpixels.
-        near: (N, K) neighbours of every superpixel, nearest first.
-        seed: Seed of all draws.
-    """
+    """Makes proposals for one pair; `near` (N, K) are the neighbours of every superpixel, nearest
+    first."""
 
     def __init__(self, data: EnergyData, near: Int, seed: int) -> None:
         self.data, self.near = data, near
@@ -182,21 +165,16 @@ class Proposer:
         return from_anchor(Z, g, R, T, ray)
 
     def _units(self, soup: Soup) -> tuple[Float, Float]:
-        """Changes (N, 1) of log Z or g x radius, and of T, that move the image by one pixel.
-
-        The parallax of a superpixel is the image motion by its translation, at least half a pixel,
-        because without parallax only the other terms limit its depth.
-        """
+        """Changes (N, 1) of log Z or g x radius, and of T, that move the image by one pixel."""
         ray = self.data.anchor_ray
+        # without parallax only the other terms limit a depth: half a pixel is the least taken
         parallax = self.focal * np.linalg.norm(soup.parallax(ray), axis=1)
         z = np.maximum(soup.moved(soup.points(ray))[:, 2], 1e-9)
         return 1.0 / np.maximum(parallax, 0.5)[:, None], z[:, None] / self.focal
 
     def _random_neighbours(self, count: int) -> Int:
         """(N, count) different neighbours, the nearer ones preferred."""
-        n, k = self.near.shape
-        rank = np.arange(k) + 1.0
-        key = self.rng.exponential(size=(n, k)) * rank
+        key = self.rng.exponential(size=self.near.shape) * (np.arange(self.near.shape[1]) + 1.0)
         order = np.argsort(key, axis=1)[:, :count]
         return np.take_along_axis(self.near, order, axis=1)
 

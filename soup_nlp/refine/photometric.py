@@ -226,13 +226,8 @@ def swept(
 def common_motions(
     soup: Soup, data: EnergyData, count: int, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """At most `count` present motions under which most anchors move as under their own.
-
-    Each is chosen by how much it lowers the sum of the limited distances, after those before.
-
-    Returns:
-        (C, 3, 3) rotations and (C, 3) translations.
-    """
+    """At most `count` present motions, (C, 3, 3) and (C, 3), under which most anchors move as under
+    their own; each by how much it lowers the sum of the limited distances after those before."""
     pick = rng.choice(len(soup), min(TRIED, len(soup)), replace=False)
     X = soup.points(data.anchor_ray)
     moved = np.einsum("mij,nj->nmi", soup.R[pick], X) + soup.translation[pick]
