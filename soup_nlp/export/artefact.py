@@ -48,9 +48,8 @@ def export_case(
     Args:
         case: Problem with its start.
         form: Coordinates and gauge; the Hessian of a .nl file is exact.
-        folder: Output folder.
+        folder: Of the export; with `overwrite` also files that the program did not make are lost.
         presolved: The case starts at the answer of the presolve (for the manifest).
-        overwrite: Overwrite files that the program did not make.
         lift: See `nl.write_nl`.
 
     Raises:
@@ -60,10 +59,8 @@ def export_case(
     nlp, layout = case.nlp(form.replace(hessian="exact"))
     target = claim(folder, EXPORT_FILES, overwrite, case.problem.subject)
     with staged(target, True, overwrite, case.problem.subject) as new:
-        duals = examine(nlp, nlp.x0, None) if presolved else None
-        if duals is not None and not duals.dual <= STATIONARY:
-            duals = None
-        lam_g = None if duals is None else duals.lam_g
+        at_start = examine(nlp, nlp.x0, None) if presolved else None
+        lam_g = at_start.lam_g if at_start and at_start.dual <= STATIONARY else None
         file = write_nl(new / f"{STUB}.nl", nlp, lam_g, lift)
         write_text(new / "problem.yaml", dump_problem(case.problem))
         sizes = {
@@ -80,7 +77,7 @@ def export_case(
             "sizes": {**sizes, **nlp.sizes(), **file.counts},
             "nl": {"file": f"{STUB}.nl", "bytes": file.size, "sha256": file.sha256},
             "start": "presolve" if presolved else "proposal",
-            "initial_duals": duals is not None,
+            "initial_duals": lam_g is not None,
             "lifted": file.lifted,
             "objective_at_start": nlp.value(nlp.x0),
             "exact_energy_at_start": oracle.energy(case.soup, case.data, case.weights),

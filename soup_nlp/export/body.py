@@ -12,7 +12,7 @@ from scipy import sparse
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.export.program import Program
-from soup_nlp.export.template import DEFINED, NUMBER, PLUS, SUM, VARIABLE, Template, Text, number
+from soup_nlp.export.template import DEFINED, NUMBER, VARIABLE, Template, Text, number, plus
 
 
 @dataclass
@@ -47,9 +47,8 @@ class _Part:
         return out
 
     def write(self, text: Text, elements: Int | slice, final: Int, shift: int) -> list[str]:
-        """Texts of elements; `final` are the numbers of defined variables in the file, and `shift`
-        is that of the first of the other variables.
-        """
+        """Texts of elements; `final` are the numbers of defined variables in the file, `shift` is
+        that of the first of the others."""
         columns: list[list[object]] = []
         for (kind, _), column in zip(text.holes, self.columns(text, elements, final)):
             if kind == NUMBER:
@@ -75,8 +74,7 @@ class NlBody:
 
     def __init__(self, program: Program, column: Int, row: Int, lift: bool = False) -> None:
         """Number the defined variables; `column` (nx,) and `row` (ng,) are indices in the file, and
-        with `lift` variables with rows are written instead.
-        """
+        with `lift` variables with rows are written instead."""
         # the objective is the last row
         last, goals = len(row), np.append(row, len(row))
         self._program, self._row = program, goals
@@ -174,10 +172,8 @@ class NlBody:
         return out
 
     def with_lifted(self, linear: sparse.spmatrix) -> sparse.csr_matrix:
-        """Entries of the rows of the file, 0 where they are nonlinear.
-
-        `linear` (ng + 1, nx) has those of a file without lifted variables.
-        """
+        """Entries of the rows of the file, 0 where they are nonlinear, from those of a file without
+        lifted variables (ng + 1, nx)."""
         k = self.lifted
         given = linear.tocoo()
         # what is nonlinear moves to other rows
@@ -207,7 +203,4 @@ def _total(terms: list[str], constant: float) -> str:
     """Prefix text of the sum of terms and a number."""
     if constant or not terms:
         terms = [*terms, f"n{number(constant)}"]
-    if len(terms) == 1:
-        return terms[0]
-    head = PLUS if len(terms) == 2 else f"{SUM}\n{len(terms)}"
-    return "\n".join([head, *terms])
+    return terms[0] if len(terms) == 1 else "\n".join([plus(len(terms)), *terms])

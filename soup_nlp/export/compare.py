@@ -66,10 +66,6 @@ def make_task(case: Case, nlp: NLP, layout: Layout, form: Formulation, limits: L
     return Task(nlp.evaluated(), layout, soup, case.data, case.weights, form, limits)
 
 
-def _of_case(case: Case, form: Formulation, limits: Limits) -> Task:
-    return make_task(case, *case.nlp(form), form, limits)
-
-
 def problem_task(case: Case, coordinates: str) -> Labelled:
     """Label of a case and the maker of its task; its energy limit is that of the initialisation."""
     form = case.formulation(coordinates=coordinates, hessian="exact")
@@ -82,7 +78,7 @@ def problem_task(case: Case, coordinates: str) -> Labelled:
         "start": "proposal",
         "energy_limit": ceiling * (1 + ENERGY_SLACK),
     }
-    return label, partial(_of_case, case, form)
+    return label, lambda limits: make_task(case, *case.nlp(form), form, limits)
 
 
 def compare(

@@ -65,11 +65,7 @@ class Imported:
 
 
 def import_sol(folder: str | Path, sol: str | Path) -> Imported:
-    """Read a .sol file for an exported problem and recompute energy and residuals.
-
-    Args:
-        folder: Exported folder.
-        sol: The .sol file.
+    """Read a .sol file for the problem of an exported folder; recompute energy and residuals.
 
     Raises:
         ExportError: a file is missing, or the files do not belong together.
@@ -94,7 +90,7 @@ def import_sol(folder: str | Path, sol: str | Path) -> Imported:
     # values at an arbitrary point may be infinite or NaN; such an answer is not verified
     with np.errstate(all="ignore"):
         r = examine(nlp, answer.x, answer.lam_g)
-        run = foreign_run(case, form, nlp, layout, answer, r, source=Path(sol).name)
+        run = _run(case, form, nlp, layout, answer, r, Path(sol).name)
     return Imported(run, answer, manifest, violations(nlp, answer.x), r)
 
 
@@ -106,14 +102,8 @@ def sol_table(imported: Imported) -> list[Kind]:
     return rows + [kind(k, v, FEASIBLE) for k, v in imported.violations.items()]
 
 
-def foreign_run(
-    case: Case,
-    form: Formulation,
-    nlp: NLP,
-    layout: Layout,
-    answer: Sol,
-    r: Residuals,
-    source: str,
+def _run(
+    case: Case, form: Formulation, nlp: NLP, layout: Layout, answer: Sol, r: Residuals, name: str
 ) -> Run:
     """A run whose solution is the answer of another solver.
 
@@ -126,15 +116,7 @@ def foreign_run(
     good = answer.solved and r.optimal and energy["total"] <= (1 + ENERGY_SLACK) * start["total"]
     off = f"violation {r.primal:.1e}, dual {r.dual:.1e}, compl. {r.complementarity:.1e}"
     status = "Solve_Succeeded" if good else f"{answer.status}, {off}"
-    stage = Stage(
-        name=source,
-        status=status,
-        converged=good,
-        x=answer.x,
-        lam_x=r.lam_x,
-        lam_g=r.lam_g,
-        objective=nlp.value(answer.x),
-    )
+    stage = Stage(name, status, good, answer.x, r.lam_x, r.lam_g, nlp.value(answer.x))
     # a run holds its last iterate in matrices
     matrices = MatrixLayout(case.data.share, form.gauge).pack(point)
     solution = Solution(

@@ -36,11 +36,8 @@ class Program:
 
 
 def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Program:
-    """Split and trace every kernel.
-
-    Raises:
-        ExportError: an operation has no opcode, or a number is not finite.
-    """
+    """Split and trace every kernel; ExportError for an operation without an opcode, or a number
+    that is not finite."""
     in_rows, in_objective = np.zeros(nx, bool), np.zeros(nx, bool)
     curved, constant = np.zeros(ng + 1, bool), np.zeros(ng + 1)
     stamped = []
@@ -91,12 +88,7 @@ def orders(program: Program) -> tuple[Int, Int]:
     Variables: nonlinear in rows and objective, in rows only, in the objective only, linear. Rows:
     nonlinear, linear. The order of the NLP is kept within a class.
     """
-    kind = np.where(
-        program.in_rows,
-        np.where(program.in_objective, 0, 1),
-        np.where(program.in_objective, 2, 3),
-    )
-    variables = np.argsort(kind, kind="stable")
+    variables = np.lexsort((~program.in_objective, ~program.in_rows))
     return variables, np.argsort(~program.curved[:-1], kind="stable")
 
 
@@ -114,9 +106,6 @@ def split(group: Group, theta: Float) -> tuple[ca.SX, Int, Int, Mask, Float]:
     Returns:
         (m,) expressions without their linear variables; of every Jacobian nonzero (k,) output,
         local variable and whether it is linear; (E, k) its value for every element, 0 if not.
-
-    Raises:
-        ExportError: an operation has no opcode.
     """
     kernel = group.kernel
     given = [part for part in (kernel.objective, kernel.constraints) if part is not None]
@@ -136,10 +125,7 @@ def split(group: Group, theta: Float) -> tuple[ca.SX, Int, Int, Mask, Float]:
     coefficient = np.where(linear, np.asarray(value).T, 0.0)
     parts = []
     for k in range(out.numel()):
-        part, gone = out[k], column[linear & (row == k)]
-        if len(gone):
-            removed = ca.vertcat(*[kernel.x[int(j)] for j in gone])
-            part = ca.substitute(part, removed, ca.SX.zeros(len(gone)))
-        parts.append(part)
-    nonlinear = ca.densify(ca.cse(ca.vertcat(*parts)))
-    return nonlinear, row, column, linear, coefficient
+        gone = column[linear & (row == k)].tolist()
+        zero = ca.SX.zeros(len(gone))
+        parts.append(ca.substitute(out[k], kernel.x[gone], zero) if gone else out[k])
+    return ca.densify(ca.cse(ca.vertcat(*parts))), row, column, linear, coefficient

@@ -42,7 +42,7 @@ class Sol:
     @property
     def headline(self) -> str:
         """First line of the message, or ""."""
-        return next(iter(self.message.splitlines()), "")
+        return self.message.partition("\n")[0]
 
     @property
     def solved(self) -> bool:
@@ -135,10 +135,5 @@ def read_sol(path: str | Path, variables: Int, rows: Int, lifted: int = 0) -> So
                 code = int(words[2])
             except (IndexError, ValueError):
                 raise wrong(line, "objno, objective, code") from None
-    x = np.empty(len(variables))
-    x[variables] = z[lifted:]
-    lam_g = None
-    if sizes[1]:
-        lam_g = np.empty(len(rows))
-        lam_g[rows] = -y[lifted:]
-    return Sol("\n".join(said), code, x, lam_g)
+    lam_g = -y[lifted:][np.argsort(rows)] if sizes[1] else None
+    return Sol("\n".join(said), code, z[lifted:][np.argsort(variables)], lam_g)

@@ -104,10 +104,9 @@ def ipopt(different: Mapping[str, Any], task: Task) -> Answer:
     """Solve with Ipopt and the derivatives of this package."""
     nlp, functions = task.nlp, Functions(task.nlp)
     limits = {k: getattr(task.limits, name) for k, name in TOLERANCES.items()}
-    derivatives = {k: getattr(functions, k) for k in ("grad_f", "jac_g", "hess_lag")}
-    # CasADi would differentiate them for its own multipliers
-    own = {"no_nlp_grad": True, "calc_lam_p": False, "print_time": False}
-    options = {"ipopt": {**COMMON, "sb": "yes", **different, **limits}, **derivatives, **own}
+    # CasADi would differentiate the derivatives for its own multipliers
+    own = {**functions.derivatives, "no_nlp_grad": True, "calc_lam_p": False, "print_time": False}
+    options = {"ipopt": {**COMMON, "sb": "yes", **different, **limits}, **own}
     solver = ca.nlpsol("solver", "ipopt", functions.oracle, options)
     bounds = {k: getattr(nlp, k) for k in ("x0", "lbx", "ubx", "lbg", "ubg")}
     out, stats = solver(p=nlp.thetas(), **bounds), solver.stats()

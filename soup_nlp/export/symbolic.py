@@ -52,7 +52,7 @@ class SymbolicNLP:
     @property
     def derivatives(self) -> dict[str, ca.Function]:
         """Options of `nlpsol` that spare it the derivation, while this object exists."""
-        return {k: getattr(self.functions, k) for k in ("grad_f", "jac_g", "hess_lag")}
+        return self.functions.derivatives
 
     @property
     def start(self) -> dict[str, Float]:

@@ -16,8 +16,6 @@ from soup_nlp.errors import ExportError
 from soup_nlp.model.kernel import Group
 from soup_nlp.model.operations import NAMES, OPERATIONS, instructions
 
-PLUS, SUM = "o0", "o54"
-"""Opcodes of a sum of two terms, and of more, which is followed by their number."""
 COMMUTATIVE = frozenset({ca.OP_ADD, ca.OP_MUL, ca.OP_FMIN, ca.OP_FMAX})
 WORTH_NAMING = 4
 """Smallest number of operations and leaves of a defined variable."""
@@ -86,10 +84,7 @@ class _Graph:
 
 def trace(outputs: ca.SX, group: Group, theta: Float) -> _Graph:
     """Expression graph of the outputs; numbers are scalars, or (E,) if they depend on data.
-
-    Raises:
-        ExportError: an operation has no opcode.
-    """
+    ExportError for an operation without an opcode."""
     kernel = group.kernel
     function = ca.Function("f", [kernel.x, kernel.row, kernel.theta], [ca.densify(outputs)])
     graph = _Graph(roots=[-1] * outputs.numel())
@@ -103,9 +98,9 @@ def trace(outputs: ca.SX, group: Group, theta: Float) -> _Graph:
             work[target] = graph.node((0, inputs[1]))
             graph.variable[work[target]] = inputs[1]
         elif op == ca.OP_INPUT:
-            which, nonzero = inputs
-            values = group.data[:, nonzero] if which == 1 else np.asarray(theta[nonzero])
-            work[target] = graph.constant((which, nonzero), values)
+            column, nonzero = inputs[0] == 1, inputs[1]
+            values = group.data[:, nonzero] if column else np.asarray(theta[nonzero])
+            work[target] = graph.constant(tuple(inputs), values)
         elif op in OPERATIONS and OPERATIONS[op].nl:
             work[target] = graph.apply(op, tuple(work[a] for a in inputs))
         else:
@@ -135,11 +130,7 @@ class Template:
 
 
 def make_template(outputs: ca.SX, group: Group, theta: Float) -> Template:
-    """Make the template of (m,) expressions of a kernel's x, row and theta.
-
-    Raises:
-        ExportError: an operation has no .nl opcode.
-    """
+    """Make the template of (m,) expressions of a kernel's x, row and theta."""
     graph = trace(outputs, group, theta)
     names = _defined(graph, group)
     defined = tuple((n, _emit(graph, n, names)) for n in sorted(names))
@@ -247,7 +238,7 @@ def _emit(graph: _Graph, top: int, names: set[int], root: bool = False) -> Text:
                     todo += reversed(graph.args[term])
                 else:
                     terms.append(term)
-            lines.append(PLUS if len(terms) == 2 else f"{SUM}\n{len(terms)}")
+            lines.append(plus(len(terms)))
             operands: list[str | int] = [*terms]
         elif op == ca.OP_SQ and (args[0] in names or args[0] in graph.variable):
             lines.append("o2")
@@ -264,6 +255,11 @@ def _emit(graph: _Graph, top: int, names: set[int], root: bool = False) -> Text:
 
     write(top, inside=root)
     return Text("\n".join(lines), tuple(holes))
+
+
+def plus(count: int) -> str:
+    """Head of a sum of terms, o0 of two; o54 of more is followed by their number."""
+    return "o0" if count == 2 else f"o54\n{count}"
 
 
 def number(value: float) -> str:

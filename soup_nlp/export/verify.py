@@ -91,11 +91,8 @@ def violations(nlp: NLP, x: Float) -> dict[str, Float]:
 
 
 def examine(nlp: NLP, x: Float, lam_g: Float | None) -> Residuals:
-    """Residuals of a point x (nx,) with the multipliers lam_g (ng,) or with least-squares ones.
-
-    The multipliers with the smaller residuals are used. Those of the bounds follow from the point.
-    NaN counts as infinite.
-    """
+    """Residuals of a point x (nx,) with the multipliers lam_g (ng,) or with least-squares ones,
+    whichever are smaller; those of the bounds follow from the point. NaN counts as infinite."""
     primal = max(float(v.max(initial=0.0)) for v in violations(nlp, x).values())
     nothing = np.zeros(nlp.ng)
     values = nlp.value(x), nlp.gradient(x), nlp.constraints(x), nlp.jacobian_nonzeros(x)

@@ -104,3 +104,8 @@ class Functions:
         self.hess_lag = Buffered(
             "nlp_hess_l", {**at, "lam_f": 1, "lam_g": nlp.ng}, {"triu_hess_gamma_x_x": hessian}
         )
+
+    @property
+    def derivatives(self) -> dict[str, ca.Function]:
+        """Options of `nlpsol` that spare it the derivation."""
+        return {"grad_f": self.grad_f, "jac_g": self.jac_g, "hess_lag": self.hess_lag}

@@ -172,25 +172,16 @@ class Ipopt:
 
     def _solver(self, iterations: _Iterations, max_iter: int, tol: float) -> Any:
         functions, log_file = self.functions, iterations.watch.log_file
-        ipopt: dict[str, Any] = {
-            **DEFAULTS,
-            "max_iter": max_iter,
-            "tol": tol,
-            "dual_inf_tol": tol,
-            "print_level": 0,
-            "sb": "yes",
-            **self.below,
-            **self.options,
-        }
+        ipopt: dict[str, Any] = {**DEFAULTS, "print_level": 0, "sb": "yes"}
+        ipopt |= {"max_iter": max_iter, "tol": tol, "dual_inf_tol": tol}
+        ipopt |= {**self.below, **self.options}
         if log_file:
             # without its log where that cannot be opened
             with suppress(OSError), open(log_file, "a"):
                 ipopt |= {"output_file": log_file, "file_print_level": 5, "file_append": "yes"}
         options = {
             "ipopt": ipopt,
-            "grad_f": functions.grad_f,
-            "jac_g": functions.jac_g,
-            "hess_lag": functions.hess_lag,
+            **functions.derivatives,
             "iteration_callback": iterations.callback,
             "print_time": False,
             "calc_lam_p": False,

@@ -83,11 +83,7 @@ class Presolve:
 
     Attributes:
         soup: Where the last stage ended.
-        data: Pixels, graphs and weights of the pair.
-        weights: Constants of the energy.
-        form: Visibility.
-        o: Widths, limits and stagnation.
-        watch: Listeners, stop event and log.
+        data, weights, form, o, watch: Those of `solve_soup`.
         deadline: `time.process_time` at which they end.
         rim: (N, V) multipliers of rim visibility, rows divided by the facing of the anchor, after
             the last stage; None where the presolve ended before it.
@@ -123,23 +119,19 @@ class Presolve:
     def _program(
         self, soup: Soup, weights: Weights | None = None, chart: Chart = "depth"
     ) -> _Program:
-        form, energy = majorant(self.form), (self.data, weights or self.weights)
+        energy = self.data, weights or self.weights, majorant(self.form)
         if self.o.coordinates == "matrix":
-            own, matrices = build_matrix_nlp(soup, *energy, form)
-            return _Program(own, matrices, own.x0, np.zeros(own.nx), np.zeros(own.ng))
-        nlp, layout = build_tangent_nlp(soup, *energy, form, chart)
+            return _Program(*build_matrix_nlp(soup, *energy))
+        nlp, layout = build_tangent_nlp(soup, *energy, chart)
         if chart == "inverse-depth":
             # visibility bounds inverse depths and slopes by itself
             free = np.full(nlp.nx, np.inf)
             nlp = replace(nlp, lbx=-free, ubx=free)
-        return _Program(nlp, layout, nlp.x0, np.zeros(nlp.nx), np.zeros(nlp.ng))
+        return _Program(nlp, layout)
 
     def _untruncated(self, start: Soup, before: _Program) -> _Program:
-        """The second strategy: E_arap without its truncation first, then with it.
-
-        Returns:
-            The program of the strategy whose soup has the lower energy, which is `soup` then.
-        """
+        """The second strategy: E_arap without its truncation first, then with it; the program of
+        the strategy whose soup has the lower energy, which is `soup` then."""
         first, o = self.soup, self.o
         program = self._program(start, self.weights.replace(sigma_arap=np.inf))
         widest = max(UNTRUNCATED)
@@ -150,7 +142,7 @@ class Presolve:
         self._run(program, exact, hessian="exact")
         if not self._stopped():
             other = self._program(self.soup)
-            other = replace(other, lam_x=program.lam_x, lam_g=program.lam_g)
+            other.lam_x, other.lam_g = program.lam_x, program.lam_g
             last = o.presolve_eps[-2:]
             self._run(other, [_Planned(f"majorant truncated {eps:g}", eps) for eps in last])
             if self._energy(self.soup) < self._energy(first):
@@ -193,8 +185,7 @@ class Presolve:
     ) -> None:
         """Run stages until one is stopped; `soup` and the program's numbers move along.
 
-        `options` of Ipopt are added to `KEEP`; `max_iter`, of each, is `presolve_iterations` unless
-        it is given.
+        `options` of Ipopt are added to `KEEP`; `max_iter` is `presolve_iterations` by default.
         """
         o, nlp = self.o, program.nlp
         nlp = nlp if hessian is None else replace(nlp, hessian_kind=hessian)
@@ -237,9 +228,9 @@ class _Program:
 
     nlp: NLP
     layout: Layout
-    x: Float
-    lam_x: Float
-    lam_g: Float
+
+    def __post_init__(self) -> None:
+        self.x, self.lam_x, self.lam_g = self.nlp.x0, np.zeros(self.nlp.nx), np.zeros(self.nlp.ng)
 
 
 def _rim(program: _Program, soup: Soup, data: EnergyData) -> Float:

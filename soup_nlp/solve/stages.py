@@ -111,7 +111,6 @@ class _Laps:
         self.begin = self._cpu = time.process_time()
 
     def end(self, stage: str) -> None:
-        """A stage ends here."""
         wall, cpu = time.perf_counter(), time.process_time()
         self.wall[stage], self.cpu[stage] = wall - self._wall, cpu - self._cpu
         self._wall, self._cpu = wall, cpu
@@ -187,22 +186,18 @@ class _Solve:
         )
 
     def energy(self, soup: Soup) -> float:
-        """Exact energy."""
         return oracle.energy(soup, self.data, self.weights)["total"]
 
     def presolve(self) -> tuple[Soup, Float | None]:
         """Soup and multipliers of rim visibility of the presolve; the start where it is off."""
-        soup, rim = self.start, None
+        # the last stage has the rest of the time
+        end = self.laps.begin + 0.7 * self.o.max_seconds
+        energy = self.data, self.weights, self.form
+        first = Presolve(self.start, *energy, self.o, self.watch, end, stages=self.stages)
         if self.o.presolve_iterations:
-            # the last stage has the rest of the time
-            end = self.laps.begin + 0.7 * self.o.max_seconds
-            energy = self.data, self.weights, self.form
-            first = Presolve(soup, *energy, self.o, self.watch, end)
             first.run()
-            self.stages.extend(first.stages)
-            soup, rim = first.soup, first.rim
         self.laps.end("presolve")
-        return soup, rim
+        return first.soup, first.rim
 
     def ipopt(self, nlp: NLP, first: dict[str, Any]) -> Stage:
         """The last stage, from a point with multipliers if there are any."""
