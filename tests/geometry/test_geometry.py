@@ -245,15 +245,3 @@ def test_planes_are_tilted_hardly_more_than_necessary():
     Z, slope = at_anchor(inverse_depth(done.n, done.distance), anchor)
     steeper, _ = normal_and_distance(about_anchor(Z, slope / 0.7, anchor))
     assert (-np.einsum("nc,nvc->nv", steeper, rays).max(axis=1) < 1e-3).all()
-
-
-def test_points_lie_on_their_plane_and_on_their_ray():
-    soup = random_soup(0, 7)
-    ray = np.tile(GRID, (7, 1, 1))
-    X = soup.points(ray)
-    np.testing.assert_allclose(
-        np.einsum("nc,nmc->nm", soup.n, X) + soup.distance[:, None], 0.0, atol=1e-12
-    )
-    np.testing.assert_allclose(np.cross(X, ray), 0.0, atol=1e-12)
-    np.testing.assert_allclose(X[..., 2], soup.depth_at(ray))
-    assert (soup.depth_at(ray) > 0).all()

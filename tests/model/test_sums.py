@@ -9,17 +9,9 @@ from helpers_nl import plain_nlp
 from soup_nlp.errors import ModelError
 from soup_nlp.export.symbolic import make_oracle
 from soup_nlp.model import operations
-from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.programs import build_matrix_nlp
-from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.functions import Functions
-
-
-@pytest.fixture(scope="module")
-def case(small_room: Case) -> Case:
-    return small_room
 
 
 def close(a, b, rtol=1e-9):
@@ -58,8 +50,8 @@ def test_sums_of_every_size_have_the_values_of_their_formula(elements, monkeypat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gauge", GAUGES)
-def test_the_functions_that_ipopt_takes_are_casadis_derivatives(case, gauge):
-    nlp, _ = build_matrix_nlp(case.soup, case.data, case.weights, Formulation(gauge=gauge))
+def test_the_functions_that_ipopt_takes_are_casadis_derivatives(small_room, gauge):
+    nlp, _ = small_room.nlp(small_room.formulation(gauge=gauge))
     at, lam_f, lam_g = nlp.x0, 0.7, np.random.default_rng(3).normal(size=nlp.ng)
     oracle, values = make_oracle(nlp)
     theta = nlp.thetas(eps=0.05)

@@ -56,8 +56,6 @@ def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(result):
     assert 0 < r["contradicted"] <= summary["sizes"]["superpixels"]
     assert set(r["rounds"][0]["accepted"]) == set(KINDS)
     assert r["end"].keys() >= {"total", "arap", "proj", "cont", "orient", "prior"}
-    assert [record["energy"].keys() for record in r["rounds"]] == 3 * [r["end"].keys()]
-    assert all(one["bound"] <= one["mrf_energy"] + 1e-9 for one in r["rounds"])
     with h5py.File(result / "result.h5") as file:
         assert file["depth/nlp_ref"].shape == file["depth/ref"].shape
         assert np.abs(file["nlp/R"][:] - file["solution/R"][:]).max() > 0
@@ -92,12 +90,6 @@ def test_without_the_nlp_the_start_is_refined(without_nlp):
 def test_both_halves_cannot_be_left_out(tmp_path, capsys):
     assert main(["solve", "orbit", "-o", str(tmp_path), "--no-nlp", "--no-refine"]) == 2
     assert "nothing is left to do" in capsys.readouterr().err
-
-
-@pytest.mark.xfail(strict=True, reason="0.995: the start with settled motions is lower")
-def test_the_refinement_lowers_the_start_by_a_hundredth(without_nlp):
-    r = without_nlp[1]["refinement"]
-    assert r["end"]["total"] < 0.99 * r["begin"]["total"]
 
 
 def test_an_interrupted_refinement_keeps_its_best_and_exits_with_1(tmp_path):

@@ -243,15 +243,6 @@ def test_a_nan_in_the_objective_is_a_result_too():
     assert np.isfinite(stage.x).all()
 
 
-def test_a_bound_beyond_the_optimum_is_active():
-    nlp = rosenbrock(2, ubx=0.5)
-    stage = solve(nlp)
-    # on x1 = 0.5 the best x2 is 0.25
-    np.testing.assert_allclose(stage.x, [0.5, 0.25], atol=1e-4)
-    assert stage.lam_x[0] == pytest.approx(1.0, rel=1e-3)
-    assert (stage.x <= 0.5 + 1e-8).all()
-
-
 def test_an_event_stops_and_keeps_the_best_iterate():
     nlp, stop, seen = rosenbrock(10), threading.Event(), []
 
