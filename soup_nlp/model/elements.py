@@ -18,12 +18,10 @@ from soup_nlp.model.superpixel import View
 
 
 class Norms(NamedTuple):
-    """How the norms of an element are made. Equal records share one kernel.
+    """How the norms of an element are made: by a function of `terms`, of views, row, smoothing and
+    further arguments `given`; `in_pixels` of the next frame, these have a smoothing of their own.
 
-    Attributes:
-        term: Function of `terms`.
-        given: Its arguments after views, row and smoothing.
-        in_pixels: Whether its norms are pixels in the next frame, with a smoothing of their own.
+    Equal records share one kernel.
     """
 
     term: Callable[..., list[Norm]]
@@ -104,10 +102,8 @@ def _rays(data: EnergyData, ends: Int) -> dict[str, Float]:
 
 
 def _pixel(data: EnergyData, unit: Float) -> dict[str, Float]:
-    """A pixel as a length, and as an angle, where norms are not in pixels: for their smoothing.
-
-    At the mean plane distance, which is the length 1 / unit.
-    """
+    """A pixel as a length at the mean plane distance 1 / unit, and as an angle, for the smoothing
+    of norms that are not in pixels."""
     if data.local_units:
         return {}
     angle = np.full(len(unit), 1.0 / data.K_next[0, 0])
@@ -142,8 +138,7 @@ def _proj(data: EnergyData, w: Weights) -> Element:
         "K": np.tile(K[nonzero], (count, 1)),
     }
     places = tuple(zip(*(index.tolist() for index in nonzero)))
-    norms = Norms(terms.reprojection, (places,), in_pixels=True)
-    return Element(owner, columns, norms)
+    return Element(owner, columns, Norms(terms.reprojection, (places,), in_pixels=True))
 
 
 def _cont(data: EnergyData, w: Weights) -> Element:

@@ -81,8 +81,7 @@ class Ends:
         unit: float,
         rows: Int | None = None,
     ) -> None:
-        """Take rows (b,) of a graph, default all; lengths that are not local have the scene's unit
-        `sum_i c_i D_i`."""
+        """Take rows (b,) of a graph, default all; `unit` is the scene's `sum_i c_i D_i`."""
         self.states, self.data, self.unit = states, data, unit
         every = getattr(data, graph)
         self.rows = np.arange(len(every)) if rows is None else rows
@@ -215,11 +214,8 @@ def orientation(e: Ends, weights: Weights) -> AnyFloat:
 
 
 def prior(e: Ends, weights: Weights) -> AnyFloat:
-    """E_prior of an edge: slope of the inverse depth between its anchors, relative to it.
-
-    `|(1 / Z_i - 1 / Z_k) / m - relief| / |r_i - r_k|` with anchor rays r and m the mean of both
-    inverse depths that is near the larger.
-    """
+    """E_prior of an edge: slope of the inverse depth between its anchors, relative to it:
+    `|(1 / Z_i - 1 / Z_k) / m - relief| / |r_i - r_k|` with anchor rays r and m `Ends.nearness`."""
     ray = e.states.anchor_ray
     reach = np.linalg.norm(ray[e.i] - ray[e.k], axis=1).astype(e.states.dtype)
     return np.abs(e.relief - e.column(e.data.prior_relief)) / reach[:, None, None]
@@ -235,8 +231,7 @@ def order(e: Ends, weights: Weights) -> AnyFloat:
     """E_order of a neighbour pair: smooth hinge of the inverse depth that the covering superpixel
     f lacks on the boundary before the covered one b.
 
-    `(x + sqrt(x^2 + HINGE^2)) / 2` with `x = ((1 + step) / Z_b - 1 / Z_f) / m` and m the mean of
-    both anchors' inverse depths that is near the larger.
+    `(x + sqrt(x^2 + HINGE^2)) / 2`, `x = ((1 + step) / Z_b - 1 / Z_f) / m`, m `Ends.nearness`.
     """
     ray, sign = e.data.boundary_ray[e.rows].mean(axis=1)[:, None], np.sign(e.data.order_weight)
     i, k = (e.states.inverse_along(j, ray)[0].astype(e.states.dtype) for j in (e.i, e.k))

@@ -108,12 +108,6 @@ class Kernel:
         return {"hess": ca.Function(f"{self.name}_hess", args, ca.cse([H]))}
 
 
-def nonzeros(function: ca.Function | None) -> tuple[Int, Int]:
-    """(row, column) of every nonzero of a function's matrix, in storage order."""
-    row, column = ([], []) if function is None else function.sparsity_out(0).get_triplet()
-    return np.asarray(row, np.int64), np.asarray(column, np.int64)
-
-
 @dataclass(frozen=True)
 class Group:
     """A kernel with its table: the elements of one kind.
@@ -122,8 +116,7 @@ class Group:
         kernel: Of one element.
         index: (E, nx) global variable of every local one.
         data: (E, np) data rows.
-        rows: (E, nc) global constraint row of every local one; rows may repeat (sums);
-            (E, 0) without constraints.
+        rows: (E, nc) global constraint row of every local one; rows may repeat (sums).
 
     Raises:
         ModelError: table and kernel do not fit, or data is not finite.
@@ -207,10 +200,16 @@ class Pattern:
         return sparse.csc_matrix((nonzeros, self.rows, self._union.indptr), self.shape)
 
 
+def _nonzeros(function: ca.Function | None) -> Iterable[Int]:
+    """Rows and columns of the nonzeros of a function's matrix, in storage order."""
+    places = ([], []) if function is None else function.sparsity_out(0).get_triplet()
+    return (np.asarray(k, np.int64) for k in places)
+
+
 def jacobian_entries(groups: Sequence[Group]) -> Iterator[Entries]:
     """Nonzeros of g's Jacobian; one set for every group."""
     for group in groups:
-        r, c = nonzeros(group.kernel.first_order().get("jac"))
+        r, c = _nonzeros(group.kernel.first_order().get("jac"))
         yield group.rows[:, r], group.index[:, c]
 
 
@@ -219,5 +218,5 @@ def hessian_entries(groups: Sequence[Group], hessian: str) -> Iterator[Entries]:
     for group in groups:
         # half the bytes sort in half the time
         index = group.index.astype(np.int32)
-        one, two = (index[:, k] for k in nonzeros(group.kernel.second_order(hessian).get("hess")))
+        one, two = (index[:, k] for k in _nonzeros(group.kernel.second_order(hessian).get("hess")))
         yield np.minimum(one, two), np.maximum(one, two)

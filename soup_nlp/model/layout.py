@@ -22,13 +22,9 @@ class MatrixLayout:
 
     Per superpixel, contiguous: scale `N lam`, normal, offset `d / N` (not in gauge
     "unit-offset", where it is a constant), R by columns, translation `t / N`. Gauge
-    "unit-translation" has one more global variable at the end, the common length tau of all
-    translations: the length unit stays sum_i c_i D_i = 1, so that the gauges describe one and
-    the same problem.
-
-    Attributes:
-        share: (N,) weights c of the length unit.
-        gauge: One of GAUGES.
+    "unit-translation" has one more variable at the end, the common length tau of all translations:
+    the length unit stays sum_i c_i D_i = 1, with the weights c `share` (N,), so that the gauges
+    describe one and the same problem.
     """
 
     share: Float
@@ -51,8 +47,8 @@ class MatrixLayout:
 
     @property
     def size(self) -> int:
-        """Number of superpixel variables, tau included."""
-        return self.count * self.stride + (self.gauge == "unit-translation")
+        """Length of a vector."""
+        return self.tau + (self.gauge == "unit-translation")
 
     @property
     def tau(self) -> int:

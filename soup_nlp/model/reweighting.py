@@ -85,17 +85,15 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
         step = np.where(order > 0, z[0] / z[1], z[1] / z[0]) - 1
         step = np.where(known.placed[data.pairs].any(axis=1), np.maximum(step, 0.0), 0.0)
 
-    def bending(name: str, ends: Int, mask: Mask = bends) -> Float:
-        return np.where(mask[ends].all(axis=1), BENDING[name], 1.0)
+    def bending(name: str, ends: Int) -> Float:
+        return np.where(bends[ends].all(axis=1), BENDING[name], 1.0)
 
     steep = len(data) / 1000 * BENDING["orient"]
+    shown = bending("prior", data.edges) * (1 - by_prior)
     out = replace(
         data,
         edge_weight=joined * data.edge_weight,
-        prior_weight=bending("prior", data.edges)
-        * (1 - by_prior)
-        * np.where(held, HELD, joined)
-        * prior,
+        prior_weight=shown * np.where(held, HELD, joined) * prior,
         prior_relief=np.where(held, relief(soup, data), 0.0),
         depth_weight=depth,
         depth_change=change,
@@ -142,10 +140,9 @@ def in_pixels(
 
     A rotation by an angle a moves the image by `focal a`; a length l at depth Z by `focal l / Z`;
     a depth gap g changes the parallax of a baseline T by `focal g / Z * T / Z`. Z is the depth
-    of the two anchors as they are, so that no term gains from shrinking or growing the scene: with
-    one global unit, the depth of superpixels without parallax diverges, because that shortens all
-    other lengths. It is their power mean of exponent -4, close to the nearer one: with the
-    arithmetic mean the energy falls as one of the two recedes. The ratio T / Z is a constant of the
+    of the two anchors as they are: with one global unit, the depth of superpixels without parallax
+    diverges, because that shortens all other lengths. It is their power mean of exponent -4: with
+    the arithmetic mean the energy falls as one of the two recedes. T / Z is a constant of the
     energy: its median around the superpixels of the soup, the start. Rotations cost next to nothing
     where superpixels bend, `bends` (N,).
     """
@@ -169,9 +166,8 @@ def in_pixels(
 def in_translations(data: EnergyData, soup: Soup) -> EnergyData:
     """The same data in the paper's units with the sum of the translations as unit of length.
 
-    `sum_i lam_i = 1` fixes the unit, and the paper does not say what a scale multiplies; here it is
-    the translation t-hat of unit length. Translations have the ratio to their plane distances that
-    the soup, the start, has.
+    `sum_i lam_i = 1` fixes the unit; the paper does not say what a scale multiplies: here it is the
+    translation of unit length, whose ratio to the plane distance is that of the soup, the start.
     """
     share = np.maximum(np.linalg.norm(soup.translation, axis=1) / soup.distance, 1e-9)
     # lengths have sum_i c_i D_i = 1, shares c add up to 1; the unit is that of sum_i s_i D_i = 1

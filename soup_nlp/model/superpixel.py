@@ -66,11 +66,9 @@ class View:
         return self._turned_gap(self.R, X, other, Y)
 
     def stretch(self, X: ca.SX, other: View, Y: ca.SX) -> ca.SX:
-        """`|X - Y|` less the distance of their next-frame points, see `next_gap`.
-
-        From the small difference of both vectors: lengths of what is far away, in units of the
-        depth of something near, have rounding that held the dual infeasibility at 1e-5.
-        """
+        """`|X - Y|` less the distance of their next-frame points, see `next_gap`."""
+        # from the small difference of both vectors: of lengths of what is far away, rounding held
+        # the dual infeasibility at 1e-5
         gap = X - Y
         change = self._turned_gap((self.R0 - ca.DM.eye(3)) + self.turn, X, other, Y)
         # |X - Y| is smooth wherever two anchors differ, so it needs no smoothing of its own
@@ -104,9 +102,8 @@ def tangent_view(x: ca.SX, row: Mapping[str, ca.SX], position: int, chart: str) 
     `1 / Z(r) = (1 + s . (r - r_a) / h) / Z`, Z = lam Z0 the depth of the anchor; rotation
     `R = R0 Cayley(w)` about the anchor: `X' = R (X - Z r_a) + Z (q0 + q)`, `q0 = R0 r_a + t0`. A
     rotation about the camera centre would move the superpixel across the image, and the translation
-    could undo that to first order only. Turn and shift are counted from the base, so that
-    differences of two superpixels are those of small numbers: of numbers near 1, rounding alone
-    would hold the dual infeasibility near 1e-7, where depths differ much near 1e-6.
+    could undo that to first order only. Turn and shift are counted from the base: with differences
+    of numbers near 1, rounding alone would hold the dual infeasibility near 1e-7.
 
     Args:
         x: (9x1) `lam s w q`: relative scale, slopes (2), rotation (3), shift of the moved anchor
