@@ -3,7 +3,6 @@ input, 3 (check) a point of another solver is feasible but not stationary, 70 a 
 before there was anything to keep, 141 a closed pipe. A bug is reported in a file.
 """
 
-import ast
 import os
 import re
 import signal
@@ -157,23 +156,15 @@ def _load(name: str, home: str) -> Any:
     """The command of a module and function such as "solve:solve"."""
     module, _, function = home.partition(":")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    function_of = getattr(import_module(f"soup_nlp.cli.{module}"), function)
-    alone.command(name=name)(function_of)
+    alone.command(name=name)(getattr(import_module(f"soup_nlp.cli.{module}"), function))
     return typer.main.get_command(alone)
 
 
-@cache
-def _functions(module: str) -> dict[str, str]:
-    """First line of the docstring of every function of a module, which is not imported."""
-    tree = ast.parse(Path(__file__).with_name(f"{module}.py").read_text(encoding="utf-8"))
-    functions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
-    return {node.name: (ast.get_docstring(node) or "").partition("\n")[0] for node in functions}
-
-
-def first_line(home: str) -> str:
-    """Line that describes a command in the help; `home` as in `COMMANDS`."""
+def _first_line(home: str) -> str:
+    """First line of the docstring of a command, whose module is not imported."""
     module, _, function = home.partition(":")
-    return _functions(module)[function]
+    text = Path(__file__).with_name(f"{module}.py").read_text(encoding="utf-8")
+    return re.findall(rf'^def {function}\(.*?"""([^"\n]*)', text, re.MULTILINE | re.DOTALL)[0]
 
 
 def _version(asked: bool) -> None:
@@ -190,7 +181,7 @@ app = typer.Typer(
 )
 for _name, _home in COMMANDS.items():
     # the command itself is imported when it is called
-    app.command(name=_name, help=first_line(_home))(lambda: None)
+    app.command(name=_name, help=_first_line(_home))(lambda: None)
 
 
 @app.callback()

@@ -188,11 +188,6 @@ class SolveLog:
         self.now = self.console.status("") if self.console.is_terminal and not quiet else None
         self._detail, self._warned, self._mark = "", set[str](), time.perf_counter()
 
-    @property
-    def listeners(self) -> dict[str, Any]:
-        """What `pipeline.run` reports to."""
-        return {"listener": self.iteration, "log": self.say, "on_stage": self.stage}
-
     @contextmanager
     def warnings(self) -> Iterator[None]:
         """Context in which warnings about the input become lines; those of libraries do not."""

@@ -7,13 +7,7 @@ import typer
 
 from soup_nlp.cli import options
 from soup_nlp.cli.options import option, out_option
-from soup_nlp.config.problem import (
-    description,
-    dump_problem,
-    load_problem,
-    shipped_problems,
-    title,
-)
+from soup_nlp.config.problem import dump_problem, load_problem, shipped_problems, title
 from soup_nlp.config.trees import PRESET_FILES
 from soup_nlp.data.scenes.catalogue import LAYOUTS
 from soup_nlp.errors import ConfigError
@@ -60,7 +54,8 @@ def show(
 def list_() -> None:
     """Print the problems, scenes and formats of the package."""
     for name, path in shipped_problems().items():
-        print(f"{name:<14} {description(path)}")
+        comment = path.read_text("utf-8").splitlines()[0]
+        print(f"{name:<14} {comment.removeprefix('# ')}")
     print("\nsoup-nlp solve NAME; templates take --set input.root=DIR, folder input.path=DIR")
     print(f"soup-nlp chain scene:NAME, of {', '.join(LAYOUTS)}")
     print(f"soup-nlp convert RESULT --to {','.join(RESULT_FORMATS)}")

@@ -160,8 +160,12 @@ def solve_problem(
     with interrupt as stop, log.warnings(), log.now or nullcontext(), scratch() as temporary:
         ipopt_log = temporary / "ipopt.log"
         try:
-            listeners = {**log.listeners, "on_stage": on_stage}
-            run = run_problem(chosen, stop=stop, ipopt_log=str(ipopt_log), **listeners)
+            heard: dict[str, Any] = {
+                "listener": log.iteration,
+                "log": log.say,
+                "on_stage": on_stage,
+            }
+            run = run_problem(chosen, stop=stop, ipopt_log=str(ipopt_log), **heard)
             if interrupt.aborted:
                 # in native code, which discarded it
                 raise KeyboardInterrupt

@@ -217,11 +217,6 @@ def load_problem(
     return make_problem(raw, overrides, where=str(path), lines=lines)
 
 
-def description(path: Path) -> str:
-    """The comment in the first line of a shipped problem file."""
-    return path.read_text("utf-8").partition("\n")[0].removeprefix("# ")
-
-
 def _find(path: Path) -> tuple[Path, Path]:
     """A problem file, and the folder that its relative paths start from."""
     bare = len(path.parts) == 1 and not path.suffix and not is_file(path)

@@ -8,7 +8,7 @@ import difflib
 import re
 import reprlib
 from collections.abc import Mapping
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic._internal._model_construction import ModelMetaclass
@@ -98,16 +98,12 @@ def _sections(model: type[BaseModel], tree: Mapping[str, Any]) -> dict[Keys, typ
         below = tree.get(key)
         below = below if isinstance(below, Mapping) else {}
         if info.discriminator:
-            section = next((m for m in section.__args__ if below.get("kind") in _tags(m)), None)
+            kind = below.get("kind")
+            tagged = {m: m.model_fields["kind"].annotation for m in get_args(section)}
+            section = next((m for m, tags in tagged.items() if kind in get_args(tags)), None)
         if isinstance(section, type) and issubclass(section, BaseModel):
             out |= {(key, *path): part for path, part in _sections(section, below).items()}
     return out
-
-
-def _tags(model: type[BaseModel]) -> tuple[str, ...]:
-    """Values of `kind` that a section stands for."""
-    kinds: Any = model.model_fields["kind"].annotation
-    return tuple(kinds.__args__)
 
 
 def nearest(word: str, allowed: list[str]) -> str | None:
