@@ -160,12 +160,14 @@ def solve_problem(
     with interrupt as stop, log.warnings(), log.now or nullcontext(), scratch() as temporary:
         ipopt_log = temporary / "ipopt.log"
         try:
-            heard: dict[str, Any] = {
-                "listener": log.iteration,
-                "log": log.say,
-                "on_stage": on_stage,
-            }
-            run = run_problem(chosen, stop=stop, ipopt_log=str(ipopt_log), **heard)
+            run = run_problem(
+                chosen,
+                listener=log.iteration,
+                stop=stop,
+                log=log.say,
+                on_stage=on_stage,
+                ipopt_log=str(ipopt_log),
+            )
             if interrupt.aborted:
                 # in native code, which discarded it
                 raise KeyboardInterrupt

@@ -107,12 +107,16 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.slow
-def test_after_ctrl_c_no_worker_and_no_temporary_folder_is_left(tmp_path):
-    words = [sys.executable, "-", str(tmp_path)]
+@pytest.mark.parametrize("script", ["script.py", "-"])
+def test_after_ctrl_c_no_worker_and_no_temporary_folder_is_left(script, tmp_path, monkeypatch):
+    """The script has no guard, or comes from stdin."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "script.py").write_text(INTERRUPTED)
+    words = [sys.executable, script, str(tmp_path / "out")]
     ended = subprocess.run(words, input=INTERRUPTED, capture_output=True, text=True, check=True)
     first, kept = ended.stdout.splitlines()
     assert (kept, ended.stderr) == ("kept", "")
-    assert [path.name for path in tmp_path.iterdir()] == ["0"]
+    assert os.listdir("out") == ["0"]
     with pytest.raises(ProcessLookupError):
         os.kill(int(first.split()[1]), 0)
 
@@ -136,25 +140,6 @@ def test_a_worker_whose_parent_was_killed_before_it_began_ends():
     # the pipe is open until both processes have ended
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr) == ("", "")
-
-
-SCRIPT = """
-from functools import partial
-from soup_nlp.storage.each import each
-
-def square(number):
-    return {"square": number * number}
-
-print(sorted(row["square"] for _, row in each({str(k): partial(square, k) for k in range(3)}, 2)))
-"""
-
-
-@pytest.mark.slow
-def test_a_script_needs_no_guard(tmp_path):
-    (tmp_path / "script.py").write_text(SCRIPT)
-    words = [sys.executable, str(tmp_path / "script.py")]
-    ended = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert ended.stdout == "[0, 1, 4]\n"
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another library than glibc")

@@ -1,12 +1,12 @@
 """Output folders are written whole or not at all, and what is the user's stays."""
 
-import contextlib
 import os
+import shutil
 import signal
 import subprocess
-import sys
 from collections.abc import Mapping
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -30,6 +30,7 @@ from soup_nlp.storage.folders import (
     staged,
     write_sums,
 )
+from soup_nlp.storage.store import write_h5
 from soup_nlp.storage.system import deferred_signals, scratch
 
 
@@ -91,8 +92,8 @@ def test_results_and_files_of_the_user_share_a_folder(steps):
             assert os.listdir(home) == ["out"] * bool(made or mine)
 
 
-def foreign(folder: Path, kind: str) -> Path:
-    path = folder / "a"
+def foreign(folder: Path, kind: str, name: str = "a") -> Path:
+    path = folder / name
     if kind == "file":
         path.write_text("precious")
     elif kind == "changed":
@@ -172,19 +173,16 @@ def test_foreign_files_are_not_overwritten(kind, tmp_path):
 
 @pytest.mark.parametrize("kind", ["file", "link", "dangling link"])
 def test_a_list_of_the_user_is_kept(kind, tmp_path):
-    target, victim = tmp_path / "out", tmp_path / "victim"
+    target, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     target.mkdir()
+    foreign(target, kind, SUMS)
+    # the list of another folder, to which a link leads
     write_sums(tmp_path, Sums({}))
-    text = (tmp_path / SUMS).read_text()
-    (tmp_path / SUMS).rename(victim)
-    if kind == "file":
-        (target / SUMS).write_text("mine")
-    else:
-        (target / SUMS).symlink_to(victim if kind == "link" else "nowhere")
+    text = (tmp_path / SUMS).rename(elsewhere).read_text()
     with pytest.raises(DataError, match=f"found: {SUMS}"):
         claim(target, ["a"])
     write(target, overwrite=True, a="1")
-    assert victim.read_text() == text
+    assert elsewhere.read_text() == text
     assert not (target / SUMS).is_symlink()
     assert read_sums(target).files.keys() == {"a"}
 
@@ -193,13 +191,7 @@ def test_a_list_of_the_user_is_kept(kind, tmp_path):
 def test_a_journal_of_the_user_is_not_continued(kind, tmp_path):
     target = tmp_path / "out"
     target.mkdir()
-    journal = target / "rows"
-    if kind == "folder":
-        journal.mkdir()
-    elif kind == "link":
-        journal.symlink_to(tmp_path / "elsewhere")
-    else:
-        journal.write_text("mine")
+    foreign(target, kind, "rows")
     for overwrite in (False, True):
         with pytest.raises(DataError, match="rows"):
             claim(target, ["a"], overwrite, "s", "rows")
@@ -261,49 +253,53 @@ def test_files_of_the_user_are_refused_before_anything_is_computed(
 # --- kills, signals, several processes and full disks ---------------------------------------------
 
 
-def test_a_disk_that_reports_late_that_it_is_full(tmp_path, monkeypatch):
+@pytest.mark.parametrize("late", [False, True])
+def test_a_file_that_cannot_be_written_ends_in_an_error(late, tmp_path, monkeypatch):
+    """A disk is full at a file, or says so only when all are written."""
     target = tmp_path / "out"
     write(target, a="1")
 
-    def full(handle: int) -> None:
+    def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    with monkeypatch.context() as m:
-        m.setattr(os, "fsync", full)
-        with pytest.raises(DataError, match=r"cannot be written[\s\S]*found: No space left"):
-            write(target, a="2")
+    where = target if late else target / "r.h5"
+    words = rf"cannot be written\n  where: {where}\n  found: No space left"
+    monkeypatch.setattr(*((os, "fsync") if late else (Path, "write_bytes")), full)
+    with pytest.raises(DataError, match=words), staged(target, True) as new:
+        write_h5(new / "r.h5", {"x": 1.0}, {})
     assert content(target) == {"a": "1"}
     assert os.listdir(tmp_path) == ["out"]
 
 
-KILLED = """
-import os, shutil, signal, sys
-from soup_nlp.storage.folders import staged
-moves = int(sys.argv[2])
-def killing(function):
-    def wrapped(*args, **options):
-        global moves
-        if not moves:
-            os.kill(os.getpid(), signal.SIGKILL)
-        moves -= 1
-        function(*args, **options)
-    return wrapped
-os.rename, shutil.rmtree = killing(os.rename), killing(shutil.rmtree)
-with staged(sys.argv[1], True) as new:
-    for name in "acd":
-        (new / name).write_text("2")
-"""
+def killed(moves: int, target: Path, whole: bool, **files: str) -> None:
+    """Write a result in a process that is killed after some of its moves."""
+    if child := os.fork():
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+        return
+    left = iter(range(moves))
+
+    def killing(move):
+        def moved(*args, **options):
+            if next(left, None) is None:
+                os.kill(os.getpid(), signal.SIGKILL)
+            move(*args, **options)
+
+        return moved
+
+    os.rename, os.replace, shutil.rmtree = map(killing, (os.rename, os.replace, shutil.rmtree))
+    try:
+        write(target, whole, **files)
+    finally:
+        os._exit(0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("moves", range(5))
 def test_a_kill_leaves_the_old_or_the_new_result(moves, tmp_path):
     """Killed before a move: old folder aside, new one in its place, the user's file, clean up."""
     target = tmp_path / "out"
     write(target, a="1", b="1")
     put(target, {"mine": "mine"})
-    ended = subprocess.run([sys.executable, "-c", KILLED, str(target), str(moves)])
-    assert ended.returncode == -signal.SIGKILL
+    killed(moves, target, True, a="2", c="2", d="2")
     (aside,) = tmp_path.glob(f"{UNFINISHED}*")
     (mine,) = tmp_path.rglob("mine")
     assert mine.read_text() == "mine"
@@ -314,48 +310,31 @@ def test_a_kill_leaves_the_old_or_the_new_result(moves, tmp_path):
 
 
 @pytest.mark.parametrize("moves", range(5))
-def test_a_kill_between_files_leaves_them_the_programs(moves, tmp_path, monkeypatch):
-    """In a folder that goes on: before the list of both, files a and b, the list, never."""
-    target, left, replace = tmp_path / "out", moves, os.replace
+def test_a_kill_between_files_leaves_them_the_programs(moves, tmp_path):
+    """In a folder that goes on: before the list of both, files a and b, the list, clean up."""
+    target = tmp_path / "out"
     write(target, a="1", c="1")
-
-    def ended(source, place):
-        nonlocal left
-        if not left:
-            raise KeyboardInterrupt
-        left -= 1
-        replace(source, place)
-
-    with monkeypatch.context() as patch, contextlib.suppress(KeyboardInterrupt):
-        patch.setattr(os, "replace", ended)
-        with staged(target) as new:
-            put(new, {"a": "2", "b": "2"})
+    killed(moves, target, False, a="2", b="2")
     there = content(target)
     assert there == {"a": "12"[moves > 1], "c": "1"} | ({"b": "2"} if moves > 2 else {})
     assert read_sums(target).files == {name: digest_of(target / name) for name in there}
     claim(target, ["a", "b", "c"])
-    with staged(target) as new:
-        put(new, {"a": "3"})
+    write(target, False, a="3")
     assert read_sums(target).files == {name: digest_of(target / name) for name in there}
 
 
-WRITER = """
-import sys
-from soup_nlp.storage.folders import staged
-for k in range(8):
-    with staged(sys.argv[1]) as new:
-        (new / f"{sys.argv[2]}{k}").write_text("1")
-        (new / sys.argv[2]).write_text(str(k))
-"""
-
-
-@pytest.mark.slow
 def test_processes_that_write_into_one_folder_lose_no_files(tmp_path):
     target = tmp_path / "out"
-    writers = [
-        subprocess.Popen([sys.executable, "-c", WRITER, str(target), name]) for name in "abc"
-    ]
-    assert [writer.wait() for writer in writers] == [0, 0, 0]
+
+    def work(name: str) -> None:
+        for k in range(8):
+            write(target, False, **{f"{name}{k}": "1", name: str(k)})
+
+    workers = [get_context("fork").Process(target=work, args=(name,)) for name in "abc"]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
     expected = {f"{name}{k}": "1" for name in "abc" for k in range(8)} | dict.fromkeys("abc", "7")
     assert content(target) == expected
     assert read_sums(target).files == {name: digest_of(target / name) for name in expected}
@@ -363,13 +342,11 @@ def test_processes_that_write_into_one_folder_lose_no_files(tmp_path):
 
 def test_scratch_folders_of_other_processes_stay(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    # of a process in another container, as far as anyone can tell
-    other = tmp_path / "soup_nlp-x"
-    other.mkdir()
+    (tmp_path / "soup_nlp-x").mkdir()
     with scratch() as first, scratch() as second:
         assert first != second
         assert first.is_dir()
-    assert os.listdir(tmp_path) == [other.name]
+    assert os.listdir(tmp_path) == ["soup_nlp-x"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -405,25 +382,6 @@ def test_kills_and_full_disks_leave_whole_folders(rows_of):
         assert row.get("earlier kept") or row.get("disk") != "taken", row
 
 
-LIMITED = """
-import resource, sys
-from soup_nlp.cli.main import main
-from soup_nlp.errors import DataError
-from soup_nlp.storage.folders import staged
-from soup_nlp.storage.files import write_json
-from soup_nlp.storage.store import write_h5
-import numpy as np
-resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
-try:
-    with staged(sys.argv[1], True) as new:
-        write_json(new / "small.json", {})
-        write_h5(new / "r.h5", {"x": np.random.default_rng(0).random(20_000)}, {})
-except DataError as error:
-    print(error)
-    sys.exit(2)
-"""
-
-
 def test_sha256sum_reads_the_list(tmp_path):
     write(tmp_path / "out", a="1", **{"b/c": "2"})
     check = partial(subprocess.run, ["sha256sum", "--strict", "-c", SUMS], cwd=tmp_path / "out")
@@ -454,17 +412,3 @@ def test_a_failure_log_overwrites_only_where_allowed(tmp_path):
     assert log.read_text() == "mine"
     write_failure(tmp_path, "failed\n", missing, overwrite=True)
     assert content(tmp_path) == {"failed.log": "failed\n"}
-
-
-@pytest.mark.slow
-def test_a_file_that_cannot_be_written_ends_in_an_error(tmp_path):
-    target = tmp_path / "out"
-    write(target, a="1")
-    done = subprocess.run(
-        [sys.executable, "-c", LIMITED, str(target)], capture_output=True, text=True
-    )
-    assert done.returncode == 2, done.stderr
-    assert "cannot be written" in done.stdout
-    assert f"where: {target / 'r.h5'}\n" in done.stdout
-    assert content(target) == {"a": "1"}
-    assert os.listdir(tmp_path) == ["out"]
