@@ -21,7 +21,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.context import ForkProcess
 from pathlib import Path
@@ -50,17 +49,8 @@ SIGNALS: Mapping[str, Sequence[int]] = {
 }
 
 
-@dataclass(frozen=True)
-class Command:
-    """A command line and the folder that it writes."""
-
-    name: str
-    words: list[str]
-    folder: Path
-
-
-def commands(root: Path, names: Sequence[str]) -> list[Command]:
-    """The commands of the table."""
+def commands(root: Path, names: Sequence[str]) -> dict[str, list[str]]:
+    """The commands of the table, which write into folders of their names."""
     overrides = [word for text in TINY for word in ("--set", text)]
     export = ["export", "orbit", "-q", *overrides]
     out = {name: root / name for name in NAMES}
@@ -84,7 +74,7 @@ def commands(root: Path, names: Sequence[str]) -> list[Command]:
         case = prepare(problem)
         nlp, _ = case.nlp(case.formulation(hessian="exact"))
         write_sol(root / "a.sol", nlp.x0, None, *file_orders(nlp))
-    return [Command(name, words[name], out[name]) for name in names]
+    return {name: words[name] for name in names}
 
 
 def problem_files(root: Path) -> Path:
@@ -134,50 +124,37 @@ def _command(words: Sequence[str]) -> None:
 
 def run(words: Sequence[str]) -> tuple[int, float]:
     """Exit code and seconds of an undisturbed run."""
-    begin = time.perf_counter()
-    return exit_code(start(words)), time.perf_counter() - begin
-
-
-def exit_code(process: ForkProcess) -> int:
-    """Exit code of a process, negative after a signal."""
+    begin, process = time.perf_counter(), start(words)
     process.join()
-    return int(process.exitcode or 0)
-
-
-def busy(folder: Path) -> bool:
-    """Whether files are being written for a folder."""
-    return bool(unfinished(folder.parent, folder / "pairs"))
+    return int(process.exitcode or 0), time.perf_counter() - begin
 
 
 def disturbed(
-    command: Command, numbers: Sequence[int], delay: float, writing: bool
+    words: Sequence[str], folder: Path, numbers: Sequence[int], delay: float, writing: bool
 ) -> tuple[str, float]:
     """Run a command and send signals after a delay, which begins with the writing if asked.
 
     Returns:
         How it ended, "before" where that was before the first signal; the seconds that it ran.
     """
-    for path in command.folder.glob("*.jsonl"):
+    for path in folder.glob("*.jsonl"):
         # rows that are stored are not measured again
         path.unlink()
-    stale = busy(command.folder)
-    process = start(command.words)
+    process = start(words)
     begin = time.perf_counter()
     waiting, until = writing, begin + delay
     while waiting or time.perf_counter() < until:
         # at other moments than those of writing, nobody has to look often
         time.sleep(0.0005 if writing else 0.01)
-        now = writing and busy(command.folder)
-        stale = stale and now
-        if waiting and now and not stale:
+        if waiting and unfinished(folder.parent, folder / "pairs"):
             waiting, until = False, time.perf_counter() + delay
         if not process.is_alive():
             return "before", time.perf_counter() - begin
     for number in numbers:
         os.kill(process.pid, number)
         time.sleep(0.02)
-    code = exit_code(process)
-    spent = time.perf_counter() - begin
+    process.join()
+    code, spent = int(process.exitcode or 0), time.perf_counter() - begin
     return signal.Signals(-code).name if code < 0 else f"exit {code}", spent
 
 
@@ -224,17 +201,15 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
         root = Path(place)
         (root / "tmp").mkdir()
         with patch.dict(os.environ, TMPDIR=str(root / "tmp")):
-            every = commands(root, names)
-            for command in every:
-                name, folder = command.name, command.folder
-                _, seconds = run(command.words)
-                share = kills // len(every) + (command is every[0]) * (kills % len(every))
+            for number, (name, words) in enumerate(commands(root, names).items()):
+                folder, (_, seconds) = root / name, run(words)
+                share = kills // len(names) + (number == 0) * (kills % len(names))
                 for k in range(share):
                     word = list(SIGNALS)[k % len(SIGNALS)]
                     writing, how = k % 8 >= 4, "before"
                     while how == "before":
                         delay = rng.uniform(0, 0.1 if writing else seconds)
-                        how, spent = disturbed(command, SIGNALS[word], delay, writing)
+                        how, spent = disturbed(words, folder, SIGNALS[word], delay, writing)
                         seconds = spent if how == "before" and not writing else seconds
                     time.sleep(0.3)
                     when = f"writing + {delay:.3f} s" if writing else f"{delay:.2f} s"
@@ -245,7 +220,7 @@ def table(kills: int, names: Sequence[str], seed: int = 0) -> Rows:
                     told(rows, **row, left=[] if how == "SIGKILL" else [*map(str, left)])
                     for path in left:
                         shutil.rmtree(path)
-                ended, bad = f"exit {run(command.words)[0]}", broken(folder)
+                ended, bad = f"exit {run(words)[0]}", broken(folder)
                 told(rows, command=name, signal="none", ended=ended, broken=bad)
     return rows
 
@@ -284,14 +259,14 @@ def full_disks(names: Sequence[str]) -> Rows:
     rows = Rows()
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
-        for command in commands(root, names):
-            run(command.words)
-            files = [p for p in command.folder.rglob("*") if p.is_file()]
+        for name, words in commands(root, names).items():
+            run(words)
+            files = [p for p in (root / name).rglob("*") if p.is_file()]
             # whole pages, and the folders
             size = sum(-(-p.stat().st_size // 4096) * 4096 + 4096 for p in files)
-            shutil.rmtree(command.folder)
-            target = root / "disk" / command.name
-            words = [w.replace(str(command.folder), str(target)) for w in command.words]
+            shutil.rmtree(root / name)
+            target = root / "disk" / name
+            words = [w.replace(str(root / name), str(target)) for w in words]
             spaces = {("free", "taken"): 2 * size + (1 << 18), ("small",): size // 2}
             for states, space in spaces.items():
                 with disk(root / "disk", space):
@@ -299,7 +274,7 @@ def full_disks(names: Sequence[str]) -> Rows:
                         before = listed(target)
                         if state == "taken":
                             fill(root / "disk")
-                        row = {"command": command.name, "disk": state, "size": space}
+                        row = {"command": name, "disk": state, "size": space}
                         row |= {"exit": run(words)[0], "broken": broken(target)}
                         kept, left = listed(target) == before, unfinished(root / "disk", target)
                         told(rows, **row, left=[*map(str, left)], **{"earlier kept": kept})
