@@ -95,9 +95,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     prepare_streams()
     keep_memory()
-    if argv is None:
-        # pictures go to files, so that the backend of the user does not matter
-        os.environ["MPLBACKEND"] = "agg"
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         # a shell has its commands in the background ignore Ctrl-C

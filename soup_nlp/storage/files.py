@@ -107,12 +107,10 @@ def _neighbours(path: Path) -> str:
     return f"check the name; the folder holds: {shown or 'nothing'}"
 
 
-def read_text(
-    path: PathLike, what: str, *, error: type[SoupError] = DataError, most: int = MOST_TEXT
-) -> str:
+def read_text(path: PathLike, what: str, *, error: type[SoupError] = DataError) -> str:
     """The content of a UTF-8 text file, see `read_bytes`."""
     try:
-        return read_bytes(path, what, error=error, most=most).decode("utf-8-sig")
+        return read_bytes(path, what, error=error, most=MOST_TEXT).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise error(
             f"{what} is not text", where=path, found="binary content", expected="UTF-8 text"

@@ -45,17 +45,15 @@ class Sums(NamedTuple):
 
 def read_sums(folder: Path) -> Sums | None:
     """The list of a folder; None if the program has made nothing there."""
-    path = folder / SUMS
-    try:
+    path, text = folder / SUMS, ""
+    with suppress(DataError):
         text = "" if path.is_symlink() else read_text(path, SUMS)
-    except DataError:
-        return None
     head, _, lines = text.partition("\n")
     if not head.startswith(_HEAD):
         return None
-    rows = re.findall(rf"^({_NEXT})?([0-9a-f]{{64}})  (\S.*)$", lines, re.MULTILINE)
     files: dict[str, str] = {}
-    for coming, digest, name in rows:
+    row = rf"^({_NEXT})?([0-9a-f]{{64}})  (\S.*)$"
+    for coming, digest, name in re.findall(row, lines, re.MULTILINE):
         # a damaged list must not name files outside the folder
         inside = not PurePosixPath(name).is_absolute() and ".." not in name
         if inside and (not coming or _state(folder, name, {name: digest}) == "made"):

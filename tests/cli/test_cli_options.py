@@ -1,4 +1,4 @@
-"""Options of `solve` that can, or cannot, be combined with a problem file."""
+"""What a solve may read and write, and the surroundings of a command."""
 
 import json
 import os
@@ -25,16 +25,6 @@ SMALL = sets(
     "input.width=112 input.height=84 refine.enabled=false segmentation.superpixels=16"
     " segmentation.neighbours=5 solver.presolve_iterations=0 solver.max_iter=0 output.page=false"
 )
-
-
-@pytest.mark.parametrize(
-    "option", [("--depth", "truth.npy"), ("--intrinsics", "1,1,0,0"), ("--fov", "50")]
-)
-def test_options_of_a_pair_exclude_a_problem_file(option, tmp_path, capsys):
-    assert main(["solve", "orbit", "--out", str(tmp_path / "out"), *option]) == 2
-    error = capsys.readouterr().err
-    assert option[0] in error
-    assert not (tmp_path / "out").exists()
 
 
 def foreign(folder: Path) -> list[str]:
@@ -122,13 +112,10 @@ def test_a_picture_of_12_bits_names_its_key(tmp_path, capsys):
 def test_streams_that_are_closed_or_full(words, code):
     if "/dev/full" in words and not Path("/dev/full").exists():
         pytest.skip("there is no /dev/full")
-    command = f'"$0" -m soup_nlp {words}'
-    surroundings = os.environ | {"MPLBACKEND": "garbage"}
-    done = subprocess.run(
-        ["sh", "-c", command, sys.executable], env=surroundings, capture_output=True, text=True
-    )
+    shell = ["sh", "-c", f'"$0" -m soup_nlp {words}', sys.executable]
+    done = subprocess.run(shell, capture_output=True, text=True)
     assert done.returncode == code
-    assert ("the system refuses a file" in done.stderr) == ("/dev/full" in words)
+    assert ("the system refuses a file" in done.stderr) == (code == 2)
     assert done.stderr.startswith("error: ") == (code == 2)
     assert "Traceback" not in done.stderr
 
