@@ -75,18 +75,17 @@ def orbit(tmp_path_factory):
     return folder
 
 
-def problem(folder, **flow):
-    source = {"kind": "files", "ref": "a.png", "next": "b.png", "fov": 60}
-    return make_problem({"input": source, "flow": flow, "base": str(folder)})
+def load_flow(folder, source="forward.flo", **besides):
+    images = {"kind": "files", "ref": "a.png", "next": "b.png", "fov": 60}
+    flow = {"source": source, **besides}
+    problem = make_problem({"input": images, "flow": flow, "base": str(folder)})
+    assert {folder / name for name in besides.values()} <= set(problem.input_paths())
+    return problem.flow.load(problem.load_pair(), problem.path)
 
 
 def test_a_backward_flow_or_a_map_is_the_confidence(orbit):
-    pair = problem(orbit).load_pair()
-
     def confidence(**besides):
-        chosen = problem(orbit, source="forward.flo", **besides)
-        assert set(besides.values()) <= {p.name for p in chosen.input_paths()}
-        return chosen.flow.load(pair, chosen.path).confidence
+        return load_flow(orbit, **besides).confidence
 
     assert (confidence() == 1).all()
     checked = confidence(backward="backward.flo")
@@ -100,24 +99,16 @@ def test_a_backward_flow_or_a_map_is_the_confidence(orbit):
 
 
 def test_confidence_that_does_not_fit_is_refused(orbit, tmp_path):
-    pair = problem(orbit).load_pair()
-
-    def load(**flow):
-        chosen = problem(orbit, **flow)
-        return chosen.flow.load(pair, chosen.path)
-
     with pytest.raises(ConfigError, match="file of a flow only"):
-        load(source="dis", backward="backward.flo")
-    np.save(tmp_path / "small.npy", np.ones((3, 3)))
-    np.save(tmp_path / "large.npy", np.full(SIZE[::-1], 2.0))
-    np.save(tmp_path / "none.npy", np.zeros(SIZE[::-1]))
-    for name, words in (
-        ("small", "differ in size"),
-        ("large", "out of range"),
-        ("none", "0 everywhere"),
+        load_flow(orbit, "dis", backward="backward.flo")
+    for values, words in (
+        (np.ones((3, 3)), "differ in size"),
+        (np.full(SIZE[::-1], 2.0), "out of range"),
+        (np.zeros(SIZE[::-1]), "0 everywhere"),
     ):
+        np.save(tmp_path / "map.npy", values)
         with pytest.raises(DataError, match=words):
-            load(source="forward.flo", confidence=str(tmp_path / f"{name}.npy"))
+            load_flow(orbit, confidence=str(tmp_path / "map.npy"))
 
 
 def test_two_pictures_are_enough(orbit, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """Problem files and their errors; help that is quick, problems by name, version, completion."""
 
+import os
 import re
 import subprocess
 import sys
@@ -10,12 +11,7 @@ import yaml
 
 import soup_nlp
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import (
-    dump_problem,
-    load_problem,
-    make_problem,
-    shipped_problems,
-)
+from soup_nlp.config.problem import dump_problem, load_problem, make_problem, shipped_problems
 from soup_nlp.errors import ConfigError
 
 PROBLEMS = sorted((Path(__file__).resolve().parents[2] / "problems").glob("*.yaml"))
@@ -160,10 +156,6 @@ ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "scipy", "cv2", "casadi", "matplotlib", "skimage")
 
 
-def text(name):
-    return (ROOT / name).read_text(encoding="utf-8")
-
-
 HELP = """from soup_nlp.cli.main import main
 for words in (['--help'], ['--version']): main(words)"""
 ON_USE = ("matplotlib", "trimesh", "pandas", "skimage.segmentation", "scipy.stats")
@@ -183,11 +175,10 @@ def test_libraries_are_imported_on_use(code, absent):
 
 
 def test_a_version_has_its_changelog_and_citation():
-    released = re.search(r"^## \[(\d.*?)\] - \d{4}-\d\d-\d\d$", text("CHANGELOG.md"), re.MULTILINE)
-    cited = re.search(r"^version: (.*)$", text("CITATION.cff"), re.MULTILINE)
-    assert released
-    assert cited
-    assert released[1] == cited[1] == soup_nlp.__version__
+    changes, citation = ((ROOT / name).read_text() for name in ("CHANGELOG.md", "CITATION.cff"))
+    released = re.findall(r"^## \[(\d.*?)\] - \d{4}-\d\d-\d\d$", changes, re.MULTILINE)[0]
+    (cited,) = re.findall(r"^version: (.*)$", citation, re.MULTILINE)
+    assert released == cited == soup_nlp.__version__
 
 
 def test_public_names_are_there_after_any_import():
@@ -213,29 +204,21 @@ def test_problems_are_found_by_name_anywhere(tmp_path, monkeypatch, capsys):
     assert load_problem("street").input.kind == "motorcycle"
 
 
-COMPLETED = {
-    "so": "solve",
-    "solve moto": "motorcycle",
-    "convert out --to ply,col": "ply,colmap",
-    "show street --preset pa": "paper",
-}
-
-
-COMPLETE = f"""import os, sys
-sys.argv = ["soup-nlp"]
-from soup_nlp.cli.main import main
-for line in {list(COMPLETED)}:
-    words = dict(COMP_WORDS="soup-nlp " + line, COMP_CWORD=str(len(line.split())))
-    os.environ.update(words, _SOUP_NLP_COMPLETE="complete_bash")
-    try:
-        main()
-    except SystemExit:
-        pass
-"""
-
-
 @pytest.mark.slow
-def test_completion_knows_commands_problems_and_formats():
-    run = [sys.executable, "-c", COMPLETE]
-    done = subprocess.run(run, capture_output=True, text=True, check=False)
-    assert done.stdout.split() == list(COMPLETED.values())
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("so", "solve"),
+        ("solve moto", "motorcycle"),
+        ("convert out --to ply,col", "ply,colmap"),
+        ("show street --preset pa", "paper"),
+    ],
+)
+def test_completion_knows_commands_problems_and_formats(line, word):
+    code = "import sys; sys.argv = ['soup-nlp']; from soup_nlp.cli.main import main; main()"
+    words = {"COMP_WORDS": f"soup-nlp {line}", "COMP_CWORD": str(len(line.split()))}
+    surroundings = os.environ | words | {"_SOUP_NLP_COMPLETE": "complete_bash"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=surroundings, capture_output=True, text=True
+    )
+    assert done.stdout.split() == [word]

@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -210,43 +211,26 @@ class Record:
     b: tuple[int, ...]
 
 
+STORED = [
+    (np.float32(0.5), 0.5),
+    (np.int64(2**63 - 1), 2**63 - 1),
+    (np.bool_(True), True),
+    (float("nan"), None),
+    (np.float64(-np.inf), None),
+    (np.array([[1.0, np.nan]]), [[1.0, None]]),
+    (np.array(1.5), 1.5),
+    (Record(np.float64(2), (1, 2)), {"a": 2.0, "b": [1, 2]}),
+    (Path("a/b"), "a/b"),
+    ({2, 1}, [1, 2]),
+    ("ä", "ä"),
+    ({3: None}, {"3": None}),
+]
+
+
 def test_json(tmp_path):
-    path = tmp_path / "a.json"
-    obj = {
-        "f": np.float32(0.5),
-        "i": np.int64(2**63 - 1),
-        "b": np.bool_(True),
-        "nan": float("nan"),
-        "inf": np.float64(-np.inf),
-        "array": np.array([[1.0, np.nan]]),
-        "number": np.array(1.5),
-        "record": Record(np.float64(2), (1, 2)),
-        "path": tmp_path,
-        "set": {2, 1},
-        "text": "ä",
-        3: None,
-    }
-    write_json(path, obj)
-
-    def refuse(text):
-        raise AssertionError(text)
-
-    back = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
-    assert back == {
-        "f": 0.5,
-        "i": 2**63 - 1,
-        "b": True,
-        "nan": None,
-        "inf": None,
-        "array": [[1.0, None]],
-        "number": 1.5,
-        "record": {"a": 2.0, "b": [1, 2]},
-        "path": str(tmp_path),
-        "set": [1, 2],
-        "text": "ä",
-        "3": None,
-    }
-    assert read_json(path, "file", dict[str, Any]) == back
+    write_json(tmp_path / "a.json", {"all": [value for value, _ in STORED]})
+    back = read_json(tmp_path / "a.json", "file", dict[str, Any])
+    assert back == {"all": [value for _, value in STORED]}
 
 
 @pytest.mark.parametrize(
