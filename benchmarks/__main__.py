@@ -32,8 +32,8 @@ from soup_nlp.errors import DataError
 from soup_nlp.export.compare import compare as run_solvers
 from soup_nlp.export.compare import page as solver_page
 from soup_nlp.export.verify import Limits
+from soup_nlp.storage.each import read_rows
 from soup_nlp.storage.files import write_text
-from soup_nlp.storage.rows import read_rows
 
 app = typer.Typer(
     no_args_is_help=True, pretty_exceptions_enable=False, help="Accuracy and speed, measured."

@@ -23,8 +23,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from soup_nlp import Problem, make_problem
-from soup_nlp.storage.each import Row
-from soup_nlp.storage.rows import measure_all, reason
+from soup_nlp.storage.each import Row, measure_all, reason
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

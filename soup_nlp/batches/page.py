@@ -8,7 +8,7 @@ from urllib.parse import quote
 import numpy as np
 
 from soup_nlp.report.result import PAGE
-from soup_nlp.storage.rows import failed, reason
+from soup_nlp.storage.each import failed, reason
 
 HEADS = ("", "pair", "MRE", "constant", "drawn", "seconds", "MB", "exit", "reason")
 DRAWS = 2000

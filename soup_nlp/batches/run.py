@@ -29,10 +29,9 @@ from soup_nlp.report.pairs import (
     places,
     solve_into,
 )
-from soup_nlp.storage.each import Row, each, failure
+from soup_nlp.storage.each import Row, Say, append_row, each, failed, failure, reason
 from soup_nlp.storage.files import as_path, write_text
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.rows import Say, append_row, failed, reason
 
 FILES = ("table.csv", "index.html")
 COLUMNS = (

@@ -18,9 +18,9 @@ from soup_nlp.config.problem import shipped_problems
 from soup_nlp.config.trees import PRESETS
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, StoppedError, printable
+from soup_nlp.storage.each import Row, Say, failed, reason
 from soup_nlp.storage.files import as_path
 from soup_nlp.storage.progress import Progress
-from soup_nlp.storage.rows import Row, Say, failed, reason
 
 
 def option(text: str, *names: str, panel: str | None = None, **rules: Any) -> Any:

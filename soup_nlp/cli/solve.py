@@ -28,10 +28,10 @@ from soup_nlp.sequence.folder import SINGLE
 from soup_nlp.sequence.frames import IMAGES, VIDEOS
 from soup_nlp.sequence.score import chain_exit_code
 from soup_nlp.sequence.solve import named, solve_chain
+from soup_nlp.storage.each import Row
 from soup_nlp.storage.files import as_path, is_file, is_folder
 from soup_nlp.storage.folders import default_folder
 from soup_nlp.storage.progress import interruptible
-from soup_nlp.storage.rows import Row
 from soup_nlp.storage.system import scratch
 
 SOURCE = "Two images, or a problem file or name (`soup-nlp list`)."

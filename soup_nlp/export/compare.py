@@ -20,8 +20,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.pipeline.record import Case
-from soup_nlp.storage.each import Row, cpu_seconds, peak_bytes
-from soup_nlp.storage.rows import measure_all, reason
+from soup_nlp.storage.each import Row, cpu_seconds, measure_all, peak_bytes, reason
 from soup_nlp.storage.system import scratch
 from soup_nlp.storage.versions import versions
 

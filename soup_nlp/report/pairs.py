@@ -13,10 +13,9 @@ from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.pipeline.case import solve_bytes
 from soup_nlp.report.folder import run
 from soup_nlp.report.verdict import exit_code
-from soup_nlp.storage.each import Row
+from soup_nlp.storage.each import Row, failed, read_rows
 from soup_nlp.storage.files import fits, is_file
 from soup_nlp.storage.folders import read_sums
-from soup_nlp.storage.rows import failed, read_rows
 from soup_nlp.storage.versions import code_version
 
 PAIRS = "pairs"

@@ -22,9 +22,9 @@ from soup_nlp.report.result import load as load_pair
 from soup_nlp.sequence.frames import pair_name
 from soup_nlp.sequence.links import make_chain, read_pair
 from soup_nlp.sequence.score import chain_lines, score
+from soup_nlp.storage.each import failed, read_rows
 from soup_nlp.storage.files import as_path, is_file, read_json, write_json, write_text
 from soup_nlp.storage.folders import staged
-from soup_nlp.storage.rows import failed, read_rows
 
 CHAIN = "chain.json"
 """File that makes a folder that of a chain."""

@@ -45,10 +45,9 @@ from soup_nlp.sequence.frames import (
     video_frames,
 )
 from soup_nlp.sequence.links import make_chain
-from soup_nlp.storage.each import Row, each
+from soup_nlp.storage.each import Row, Say, append_row, each, failed
 from soup_nlp.storage.files import as_path, is_file, is_folder
 from soup_nlp.storage.folders import claim, staged
-from soup_nlp.storage.rows import Say, append_row, failed
 
 SCENE = "scene:"
 """Prefix of the name of a rendered scene."""

@@ -22,8 +22,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
-from soup_nlp.storage.each import each
-from soup_nlp.storage.rows import read_rows
+from soup_nlp.storage.each import each, read_rows
 
 TINY = [
     "segmentation.superpixels=12",

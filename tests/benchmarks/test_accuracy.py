@@ -10,8 +10,7 @@ from benchmarks.scores import METHODS, measure_pair, sigma_scores
 from benchmarks.suites import SUITES
 from benchmarks.table import Cell, Item, frame_of
 from soup_nlp.errors import ConfigError
-from soup_nlp.storage.each import Row, attempt
-from soup_nlp.storage.rows import read_rows
+from soup_nlp.storage.each import Row, attempt, read_rows
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ from benchmarks.chain import chain_page, measure_chain, sequences
 from benchmarks.sigma import fitted
 from benchmarks.table import Cell, frame_of
 from soup_nlp.evaluation.confidence import ADDED, FACTORS
-from soup_nlp.storage.rows import append_row
+from soup_nlp.storage.each import append_row
 
 pytestmark = pytest.mark.slow
 

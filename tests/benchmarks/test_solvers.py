@@ -10,7 +10,7 @@ from benchmarks.__main__ import main
 from benchmarks.family.instances import STANDARD, VERSION, select
 from benchmarks.family.write import write_family
 from benchmarks.solvers import cost_table, frame_of_runs, profile
-from soup_nlp.storage.rows import read_rows
+from soup_nlp.storage.each import read_rows
 
 pytestmark = pytest.mark.slow
 

@@ -5,7 +5,7 @@ from helpers_files import sets
 
 from benchmarks.__main__ import main
 from benchmarks.speed import speed_cells
-from soup_nlp.storage.rows import read_rows
+from soup_nlp.storage.each import read_rows
 
 pytestmark = pytest.mark.slow
 

@@ -20,8 +20,7 @@ from soup_nlp.export.compare import compare, limit_process, page, verified
 from soup_nlp.export.solvers import Answer, Task, available, executable, find_solver
 from soup_nlp.export.verify import Limits
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.storage.each import each
-from soup_nlp.storage.rows import read_rows
+from soup_nlp.storage.each import each, read_rows
 
 LABEL = {
     "problem": "tiny",

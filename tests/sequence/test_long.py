@@ -13,9 +13,9 @@ from soup_nlp.report.chain import NEAR, Lazy
 from soup_nlp.report.result import Result
 from soup_nlp.sequence.folder import write_chain
 from soup_nlp.sequence.links import make_chain
+from soup_nlp.storage.each import append_row
 from soup_nlp.storage.files import write_text
 from soup_nlp.storage.folders import staged
-from soup_nlp.storage.rows import append_row
 
 
 def test_items_are_made_when_they_are_needed_and_few_stay():

@@ -1,4 +1,4 @@
-"""Many jobs: in this process, in worker processes, on a cluster of this machine."""
+"""Many jobs, in this process and in worker processes; their rows are measured once."""
 
 import json
 import os
@@ -12,8 +12,16 @@ from functools import partial
 import numpy as np
 import pytest
 
-from soup_nlp.errors import ConfigError, optional
-from soup_nlp.storage.each import ONE_THREAD, attempt, each
+from soup_nlp.errors import ConfigError, DataError, optional
+from soup_nlp.storage.each import (
+    ONE_THREAD,
+    append_row,
+    attempt,
+    each,
+    measure_all,
+    read_rows,
+)
+from soup_nlp.storage.versions import code_version
 
 
 def job(number: int) -> dict:
@@ -159,3 +167,57 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
     words = [sys.executable, "-c", code]
     faults = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     assert int(faults) < 2000
+
+
+# --- rows that are kept ---------------------------------------------------------------------------
+
+
+def test_rows_are_kept_and_failed_ones_measured_again(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    seen: list[str] = []
+
+    def counted(scene):
+        seen.append(scene)
+        return {"error": "no" if scene == "sheet" else None, "number": len(seen)}
+
+    def jobs(seed=0):
+        scenes = ("orbit", "street", "sheet", "room")
+        return [({"key": scene, "seed": seed}, partial(counted, scene)) for scene in scenes]
+
+    rows = measure_all(jobs()[:2], path)
+    assert [r["key"] for r in rows] == ["orbit", "street"]
+    said: list[tuple[int, int]] = []
+    tables: list[int] = []
+    measure_all(
+        jobs(),
+        path,
+        say=lambda done, total, row: said.append((done, total)),
+        after=lambda rows: tables.append(len(rows)),
+    )
+    assert seen == ["orbit", "street", "sheet", "room"]
+    assert said == [(3, 4), (4, 4)]
+    assert tables == [3, 4]
+    measure_all(jobs(), path)
+    assert seen[4:] == ["sheet"]
+    # another name is another row
+    measure_all(jobs(1)[:1], path)
+    assert seen[5:] == ["orbit"]
+    append_row(path, read_rows(path)[-1] | {"number": 7})
+    # of several rows of a name the last one counts
+    assert [row["number"] for row in measure_all(jobs(1)[:1], path)] == [7]
+
+
+def test_truncated_lines_and_rows_of_other_code_are_ignored(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    jobs = [({"key": key}, dict) for key in ("orbit", "street")]
+    measure_all(jobs, path)
+    lines = path.read_text().splitlines()
+    old = {**json.loads(lines[0]), "code": "older"}
+    path.write_text(json.dumps(old) + "\n" + lines[1][:40])
+    assert len(read_rows(path)) == 1
+    rows = measure_all(jobs, path)
+    assert [r["code"] for r in rows] == [code_version()] * 2
+    # the new rows were not appended to the truncated line
+    assert len(read_rows(path)) == 3
+    with pytest.raises(DataError, match="cannot be written"):
+        append_row(tmp_path / "rows.jsonl" / "x.jsonl", {})

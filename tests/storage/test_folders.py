@@ -240,7 +240,7 @@ def test_a_list_owns_nothing_outside_its_folder(tmp_path):
 def test_files_of_the_user_are_refused_before_anything_is_computed(
     command, name, tmp_path, monkeypatch, capsys
 ):
-    for begin in ("data.pair.Pair.__init__", "storage.rows.each"):
+    for begin in ("data.pair.Pair.__init__", "storage.each.each"):
         monkeypatch.setattr(f"soup_nlp.{begin}", None)
     (tmp_path / name).write_text("mine")
     assert main([*command.split(), "-o", str(tmp_path)]) == 2
