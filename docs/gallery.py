@@ -70,7 +70,7 @@ def with_prior(scene: str) -> list[Picture]:
     true = pair.truth.depth_ref
     given = warped(true, 0.2)
     near, far = depth_range(true)
-    found = [Picture("image", scene, pair.image_ref)]
+    found = [Picture(scene, pair.image_ref)]
     for title, depth in (
         ("true depth", true),
         ("depth prior, wrong by 20 %", given),
@@ -80,7 +80,7 @@ def with_prior(scene: str) -> list[Picture]:
         z = depth.reconstruction.depth_ref if isinstance(depth, soup_nlp.Run) else depth
         score = depth_metrics(z, true)
         said = "" if z is true else f", MRE {score.mre:.3f}"
-        found.append(Picture("depth", title + said, colourise_depth(z * score.scale, near, far)))
+        found.append(Picture(title + said, colourise_depth(z * score.scale, near, far)))
     return found
 
 

@@ -31,16 +31,12 @@ if TYPE_CHECKING:
     from soup_nlp.report.result import Result
 
 UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
-"""Unit of lengths in files."""
+AXES = "x right, y down, z ahead"
+STILL = RigidMotion(np.eye(3), np.zeros(3))
 SHOWN_FRAMES = 12
 """Largest number of frames of a chain that a notebook shows."""
-AXES = "x right, y down, z ahead"
-"""Axes of a camera, in words."""
-STILL = RigidMotion(np.eye(3), np.zeros(3))
-"""The identity."""
 NEAR = 5
-"""Number of pairs of a chain that are in memory at once: clouds compare a frame with two on either
-side."""
+"""Number of pairs in memory at once: clouds compare a frame with two on either side."""
 SAMPLES = 1_000_000
 """Largest number of depths of a chain from which the range of its colours is found."""
 
@@ -63,12 +59,9 @@ class Lazy(Sequence[Item]):
 
 
 class Brief(NamedTuple):
-    """What a chain keeps of every pair; its images and maps are read again when they are needed.
+    """What a chain keeps of a pair: components, some depths of its reference frame, `certainty`.
 
-    Attributes:
-        parts: Its components.
-        depths: Some depths of its reference frame.
-        certainty: Shares of `report.summary.certainty`.
+    Images and maps are read again when they are needed.
     """
 
     parts: tuple[Component, ...]
@@ -86,19 +79,16 @@ class Brief(NamedTuple):
     def scaled(self, factor: float) -> Brief:
         """The same in another unit, of which `factor` are one of now."""
         parts = tuple(part.scaled(factor) for part in self.parts)
-        return self._replace(parts=parts, depths=factor * self.depths)
+        return Brief(parts, factor * self.depths, self.certainty)
 
 
 @dataclass(frozen=True)
 class Link:
-    """Ratio of the scales of two pairs, measured in a common frame.
+    """Ratio of the scales of the pairs `first` and `second`, measured in a common frame.
 
     Attributes:
-        first: Index of the pair.
-        second: Index of the other pair.
-        log_ratio: Logarithm of the second's scale over the first's, the median over pixels.
+        log_ratio: Logarithm of the second's scale over the first's, the median over `pixels`.
         spread: Robust standard deviation of the same over pixels (1.4826 MAD).
-        pixels: Number of pixels.
         bridge: Whether a pair without parallax lies between the two.
         flagged: Whether it is doubtful: a pair has no parallax, or few pixels are shared.
     """
@@ -147,11 +137,9 @@ class Frame:
     flow: NDArray[np.floating] | None
     unit: str
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         h, w = self.depth.shape
         return f"Frame({self.name}, {w}x{h}, {self.drawn.mean():.0%} drawn)"
-
-    __repr__ = __str__
 
     @property
     def points(self) -> Float:
@@ -174,16 +162,16 @@ class Frame:
         near, far = depth_range(self.depth)
         sigma = colourise_shares(self.sigma, 0.3, "viridis")
         panels = [
-            Picture("image", "image", self.image),
+            Picture("image", self.image),
             self.picture(near, far, "depth, pale = drawn"),
-            Picture("sigma", "expected depth error (1 sigma), bright = 30 % and more", sigma),
+            Picture("expected depth error (1 sigma), bright = 30 % and more", sigma),
         ]
         return shown(str(self), strip(panels, ""))
 
     def picture(self, near: float, far: float, title: str) -> Picture:
         """The depth in colours from `near` to `far`, pale where it is drawn."""
         image = colourise_depth(self.depth, near, far, self.drawn)
-        return Picture("depth", title, image, depth_legend(near, far))
+        return Picture(title, image, depth_legend(near, far))
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,16 +210,13 @@ class Chain:
     def __len__(self) -> int:
         return len(self.pairs) + 1
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         low, high = self.scales.min(), self.scales.max()
         flagged = sum(k.flagged for k in self.links)
-        drawn = self.certainty["drawn"]
         return (
             f"Chain({len(self)} frames, scales {low:.3g}..{high:.3g}, {flagged} flagged links,"
-            f" {drawn:.0%} drawn)"
+            f" {self.certainty['drawn']:.0%} drawn)"
         )
-
-    __repr__ = __str__
 
     def _repr_html_(self) -> str:
         near, far = depth_range(self.depths)
@@ -283,15 +268,10 @@ class Chain:
         return {k: float(np.mean(values)) if values else np.nan for k, values in known.items()}
 
     def __getitem__(self, number: int) -> Frame:
-        """A frame by its number.
-
-        Raises:
-            FrameError: there is no such frame.
-        """
+        """A frame by its number; FrameError if there is none."""
         if not (isinstance(number, int | np.integer) and 0 <= number < len(self)):
-            raise FrameError(
-                "there is no such frame", found=number, expected=f"0 to {len(self) - 1}"
-            )
+            expected = f"0 to {len(self) - 1}"
+            raise FrameError("there is no such frame", found=number, expected=expected)
         # the last frame is the next one of the last pair
         last = int(number == len(self.pairs))
         pair, tracks = self.pairs[number - last], self.tracks[number - last]

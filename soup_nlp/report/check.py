@@ -42,14 +42,9 @@ LEFT = (
 class Claim:
     """One claim of a result folder.
 
-    Attributes:
-        name: Subject of the claim.
-        claimed: Claimed value; 1 for an agreement.
-        found: Recomputed value; 1 or 0 for an agreement.
-        tolerance: Largest absolute difference of the two.
-        most: Largest value that is allowed, the limit of a constraint.
-        note: Explanation.
-        how: RECOMPUTED or WRITTEN.
+    `claimed` and `found`, the recomputed value, differ by `tolerance` at most, and `found` is at
+    most `most`, the limit of a constraint. Of an agreement they are 1, or 0 where it fails. `how`
+    is RECOMPUTED or WRITTEN.
     """
 
     name: str
@@ -102,7 +97,8 @@ def check_folder(folder: str | Path) -> CheckReport:
     """
     stored = Stored.read(folder)
     try:
-        found = [claim for check in CHECKS for claim in check(stored)]
+        checks = (_energies, _constraints, _depths, _scores)
+        found = [claim for check in checks for claim in check(stored)]
         return CheckReport((*found, *written(stored.folder, {"summary.json", "result.h5"})))
     except MISFITS as error:
         lacks = isinstance(error, KeyError)
@@ -111,7 +107,7 @@ def check_folder(folder: str | Path) -> CheckReport:
 
 
 def _number(value: Any) -> float:
-    """A claim as a number; null in JSON stands for a number that is not finite."""
+    """A claim as a number; null in JSON stands for one that is not finite."""
     return float("nan") if value is None else float(value)
 
 
@@ -221,7 +217,3 @@ def written(folder: Path, needed: Set[str]) -> Iterator[Claim]:
         notes[f"{name} as written"] = note
     for name, note in notes.items():
         yield Claim(name, 1.0, float(not note), note=note, how=WRITTEN)
-
-
-CHECKS = (_energies, _constraints, _depths, _scores)
-"""The table of what is recomputed, as the first line of each function says."""

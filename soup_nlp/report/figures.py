@@ -24,20 +24,16 @@ from soup_nlp.storage.files import PathLike, write_bytes
 
 UNKNOWN = 150
 """Grey level of unknown values."""
-
 VIVID = (
     *((255, 127, 14), (44, 160, 44), (214, 39, 40), (148, 103, 189), (140, 86, 75)),
     *((227, 119, 194), (188, 189, 34), (23, 190, 207), (31, 119, 180)),
 )
 """Colours of tab10 without its grey, which means unknown."""
-
 PALE = 0.35
 """Share of its colour that drawn depth keeps; the rest is white."""
 LEAST_RANGE = 1.1
-"""Least ratio of the two ends of a colour scale of depth.
-
-Bending papers have a relief of 7 to 27 %, drawn depth mostly one of 0 to 5 %.
-"""
+"""Least ratio of the two ends of a colour scale of depth: bending papers have a relief of 7 to
+27 %, drawn depth mostly one of 0 to 5 %."""
 
 
 def depth_range(depth: AnyFloat) -> tuple[float, float]:
@@ -50,11 +46,11 @@ def depth_range(depth: AnyFloat) -> tuple[float, float]:
     z = z[np.isfinite(z) & (z > 0)]
     if z.size == 0:
         return 1.0, 2.0
-    near, far = (float(x) for x in np.percentile(z, (2.0, 98.0)))
+    near, far = np.percentile(z, (2.0, 98.0))
     if far < near * LEAST_RANGE:
         middle, half = np.sqrt(near * far), np.sqrt(LEAST_RANGE)
-        near, far = float(middle / half), float(middle * half)
-    return near, far
+        near, far = middle / half, middle * half
+    return float(near), float(far)
 
 
 def colourise_depth(depth: AnyFloat, near: float, far: float, drawn: Mask | bool = False) -> Image:
@@ -72,12 +68,10 @@ def colourise_depth(depth: AnyFloat, near: float, far: float, drawn: Mask | bool
 
 def component_colours(count: int) -> Image:
     """(count, 3) colours of components: slate for the first, vivid colours for the others."""
-    vivid = np.array(VIVID, float)
-    turns = np.arange(max(count - 1, 0))
+    vivid, turns = np.array(VIVID, float), np.arange(count)
     faded = 0.75 ** (turns // len(vivid))[:, None]
-    return np.vstack([[[126, 150, 190]], vivid[turns % len(vivid)] * faded]).astype(np.uint8)[
-        :count
-    ]
+    colours = np.vstack([[[126, 150, 190]], vivid[turns % len(vivid)] * faded])
+    return colours[:count].astype(np.uint8)
 
 
 def colourise_shares(values: AnyFloat, limit: float, name: str) -> Image:
@@ -87,7 +81,7 @@ def colourise_shares(values: AnyFloat, limit: float, name: str) -> Image:
 
 
 def _paint(level: NDArray[np.float64], known: Mask, name: str) -> Image:
-    """(H, W, 3) colours of levels (H, W) in [0, 1] by a map of OpenCV, grey where not known."""
+    """(H, W, 3) colours of levels (H, W) in [0, 1]."""
     steps = (level * 255).round().astype(np.uint8)
     out = cv2.applyColorMap(steps, getattr(cv2, f"COLORMAP_{name.upper()}"))[..., ::-1]
     return np.where(known[..., None], out, np.uint8(UNKNOWN))
@@ -162,16 +156,8 @@ class Legend:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of a result.
+    """A picture (H, W, 3) uint8 RGB of a result; `legend` is None for photographs."""
 
-    Attributes:
-        name: Stem of its file.
-        title: Title.
-        image: (H, W, 3) uint8 RGB.
-        legend: Meaning of the colours; None for photographs.
-    """
-
-    name: str
     title: str
     image: Image
     legend: Legend | None = None
@@ -204,7 +190,6 @@ def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: 
 
 
 def _height(picture: Picture, width: int) -> int:
-    """Height in pixels of a picture that is drawn with some width."""
     return max(1, round(width * picture.image.shape[0] / picture.image.shape[1]))
 
 
@@ -252,7 +237,6 @@ def _write(
 
 
 def _place(sheet: Pil.Image, image: Image, left: int, top: int, width: int, height: int) -> None:
-    """Draw an image in a rectangle."""
     # INTER_AREA keeps enlarged pixels rectangles of one colour
     scaled = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     sheet.paste(Pil.fromarray(scaled), (left, top))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from soup_nlp.arrays import AnyFloat, Image, Mask
+from soup_nlp.arrays import AnyFloat, Image
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import (
     Legend,
@@ -43,47 +43,40 @@ def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
     """
     result = chain.pairs[k]
     before, after = result.images
+    cells = draw_superpixels(before, result.labels)
     flow, flow_confidence = _flow(result)
-    drawn = [
-        Picture("image_ref", "reference frame", before),
-        Picture("image_next", "next frame", after),
-        Picture(
-            "superpixels",
-            f"{len(result.bends)} superpixels",
-            draw_superpixels(before, result.labels),
-        ),
-        _components(chain, k),
-        flow,
-        *_depths(chain, k),
-    ]
+    drawn = {
+        "image_ref": Picture("reference frame", before),
+        "image_next": Picture("next frame", after),
+        "superpixels": Picture(f"{len(result.bends)} superpixels", cells),
+        "components": _components(chain, k),
+        "flow": flow,
+        **_depths(chain, k),
+    }
     error = relative_error(result, chain.metre)
     if error is not None:
         title = "depth error relative to the truth; grey = no truth"
-        drawn.append(_shares("error", title, _enlarged(error), "inferno", ERROR_TICKS))
+        drawn["error"] = _shares(title, _enlarged(error), "inferno", ERROR_TICKS)
     title = "expected depth error (1 sigma)"
-    drawn.append(_shares("confidence", title, result.sigma, "viridis", SIGMA_TICKS))
-    drawn += [_normals(result), flow_confidence]
-    return {picture.name: picture for picture in drawn}
+    drawn["confidence"] = _shares(title, result.sigma, "viridis", SIGMA_TICKS)
+    return {**drawn, "normals": _normals(result), "flow_confidence": flow_confidence}
 
 
 def _components(chain: Chain, k: int) -> Picture:
     """The image in the colours of the components."""
     result, track = chain.pairs[k], chain.tracks[k]
-    part = result.components.of_pixel
-    count = len(track)
+    part, count = result.components.of_pixel, len(track)
     colours = component_colours(max(track) + 1)[track]
     pixels = np.bincount(part.ravel(), minlength=count) / part.size
     texts = [f"{number}: {share:.1%}" for number, share in zip(track, pixels, strict=True)][:6]
     kind = "component" if result.bends.any() else "rigid component"
     word = f"one {kind}" if count == 1 else f"{count} {kind}s, share of the image"
     grey = result.images[0].astype(float).mean(axis=2, keepdims=True)
-    shaded = colours[part] * (0.6 + 0.4 * grey / 255)
-    return Picture(
-        "components", word, shaded.astype(np.uint8), Legend(colours[None, :6], tuple(texts))
-    )
+    shaded = (colours[part] * (0.6 + 0.4 * grey / 255)).astype(np.uint8)
+    return Picture(word, shaded, Legend(colours[None, :6], tuple(texts)))
 
 
-def _flow(result: Result) -> list[Picture]:
+def _flow(result: Result) -> tuple[Picture, Picture]:
     """Flow and its confidence."""
     sure = np.clip(result.flow_confidence, 0, 1).astype(float)
     used = np.where((sure > 0)[..., None], result.flow.astype(float), np.nan)
@@ -96,34 +89,30 @@ def _flow(result: Result) -> list[Picture]:
     hues = colourise_flow(np.stack([np.cos(turns), np.sin(turns)], axis=1)[None], 1.0)
     ways = Legend(hues, ("right", "down", "left", "up", "right"))
     ends = Legend(ramp, ("0", "0.5", "1"))
-    return [
-        Picture("flow", title, colourise_flow(used, limit), ways),
-        Picture("flow_confidence", f"flow confidence; black = unusable ({share})", grey, ends),
-    ]
+    return (
+        Picture(title, colourise_flow(used, limit), ways),
+        Picture(f"flow confidence; black = unusable ({share})", grey, ends),
+    )
 
 
-def _depths(chain: Chain, k: int) -> list[Picture]:
+def _depths(chain: Chain, k: int) -> dict[str, Picture]:
     """Depths of both frames and of the truth, with one colour scale."""
-    result, scores = chain.pairs[k], chain.pairs[k].summary.get("metrics", {})
-    truth, (near, far) = result.true_depth, chain.depth_range
-    bar, out = depth_legend(near, far, f" {chain.length}"), []
-
-    def add(name: str, title: str, z: AnyFloat, scored: str, drawn: Mask | None = None) -> None:
-        mre = scores.get(scored, {}).get("mre")
+    result, truth, (near, far) = chain.pairs[k], chain.pairs[k].true_depth, chain.depth_range
+    scores, metre, out = result.summary.get("metrics", {}), chain.metre or 1.0, {}
+    bar, seen = depth_legend(near, far, f" {chain.length}"), result.in_next(result.drawn, False)
+    for name, frame, z, drawn, scored in (
+        ("depth_ref", "reference", result.depths[0], result.drawn, "solution"),
+        ("depth_next", "next", result.depths[1], seen, "solution_next"),
+    ):
+        mre, title = scores.get(scored, {}).get("mre"), f"depth of the {frame} frame"
         title += "" if mre is None else f", MRE {mre:.3f}"
-        title += "; grey = unseen" * (name == "depth_next")
-        if drawn is not None and drawn.mean() >= LEAST:
-            title += "; pale = drawn" + f" ({drawn.mean():.0%})" * (name == "depth_ref")
-        colours = colourise_depth(z, near, far, False if drawn is None else drawn)
-        out.append(Picture(name, title, colours, bar))
-
-    metre, drawn = chain.metre or 1.0, result.drawn
-    add("depth_ref", "depth of the reference frame", metre * result.depths[0], "solution", drawn)
-    seen = result.in_next(drawn, False)
-    add("depth_next", "depth of the next frame", metre * result.depths[1], "solution_next", seen)
+        title += "; grey = unseen" * (frame == "next")
+        if drawn.mean() >= LEAST:
+            title += "; pale = drawn" + f" ({drawn.mean():.0%})" * (frame == "reference")
+        out[name] = Picture(title, colourise_depth(metre * z, near, far, drawn), bar)
     if truth is not None:
         true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)
-        out.append(Picture("depth_true", "true depth; grey = no truth", true, bar))
+        out["depth_true"] = Picture("true depth; grey = no truth", true, bar)
     return out
 
 
@@ -147,14 +136,12 @@ def relative_error(result: Result, scale: float | None) -> AnyFloat | None:
     return error
 
 
-def _shares(
-    name: str, title: str, values: AnyFloat, colours: str, ticks: Sequence[float]
-) -> Picture:
+def _shares(title: str, values: AnyFloat, colours: str, ticks: Sequence[float]) -> Picture:
     """Picture of shares (H, W) in a colour map of OpenCV that ends at the last tick."""
     limit, texts = ticks[-1], [f"{100 * x:.0f} %" for x in ticks]
     texts[-1] = f"\u2265 {texts[-1]}"
     bar = Legend(colourise_shares(np.linspace(0, limit, 128)[None], limit, colours), tuple(texts))
-    return Picture(name, title, colourise_shares(values, limit, colours), bar)
+    return Picture(title, colourise_shares(values, limit, colours), bar)
 
 
 def _normals(result: Result) -> Picture:
@@ -162,7 +149,7 @@ def _normals(result: Result) -> Picture:
     entries = {"camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
                "up": (0, -1, 0), "down": (0, 1, 0)}  # fmt: skip
     row = colourise_normals(np.array([list(entries.values())], float))
-    return Picture("normals", "surface normals", colourise_normals(n), Legend(row, tuple(entries)))
+    return Picture("surface normals", colourise_normals(n), Legend(row, tuple(entries)))
 
 
 def overview(drawn: Mapping[str, Picture], title: str) -> Image:

@@ -67,7 +67,7 @@ def test_text_leaves_no_file_broken(tmp_path: Path, capsys: pytest.CaptureFixtur
     shown = page(replace(Chain.of(small_result()), summary=hostile_summary()))
     assert "<img src" not in shown
     assert "&lt;img src" in shown
-    assert strip([Picture("depth", HOSTILE, IMAGE)], HOSTILE).size
+    assert strip([Picture(HOSTILE, IMAGE)], HOSTILE).size
     with warnings.catch_warnings():
         print_warning(HOSTILE.replace("\ud800", ""), DataWarning)
     said = capsys.readouterr().err
