@@ -23,8 +23,7 @@ from soup_nlp.report.figures import colourise_depth, depth_range, strip
 from soup_nlp.report.findings import certainty_lines, found_words, hints
 from soup_nlp.report.pictures import Picture, pictures
 from soup_nlp.report.result import result_of
-from soup_nlp.report.summary import certainty, summary
-from soup_nlp.report.verdict import sectioned
+from soup_nlp.report.verdict import certainty, sectioned, summary
 
 PAGE = Path(__file__).with_name("gallery.md")
 RESULTS = PAGE.parents[1] / "results"

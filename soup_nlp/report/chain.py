@@ -262,7 +262,7 @@ class Chain:
 
     @cached_property
     def certainty(self) -> dict[str, float]:
-        """Means over the pairs of the shares in `report.summary.certainty`."""
+        """Means over the pairs of the shares in `report.verdict.certainty`."""
         rows = [brief.certainty for brief in self.briefs]
         known = {k: [v for row in rows if (v := row.get(k)) is not None] for k in rows[0]}
         return {k: float(np.mean(values)) if values else np.nan for k, values in known.items()}

@@ -24,14 +24,10 @@ from soup_nlp.report.layout import rows_in_file
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import overview, pictures
 from soup_nlp.report.result import PAGE, result_of
-from soup_nlp.report.summary import summary
-from soup_nlp.report.verdict import facts
+from soup_nlp.report.verdict import facts, summary
 from soup_nlp.storage.files import as_path, write_json, write_text
 from soup_nlp.storage.folders import claim, staged
 from soup_nlp.storage.store import write_h5
-
-FULL = ("depth_ref_full.png", "depth_next_full.png")
-"""Files of the depth at the size of the images, for a pair that was solved at a smaller size."""
 
 FILES = (
     *("config.yaml", "result.h5", "summary.json", "log.txt", "ipopt.log"),
@@ -39,14 +35,15 @@ FILES = (
     *("trajectory.tum", "points_ref.ply", "points_next.ply"),
 )
 """Files of a result folder."""
-
+FULL = ("depth_ref_full.png", "depth_next_full.png")
+"""Further ones of a pair that was solved at a smaller size than that of its images."""
 FAILED = "failed.log"
 """Log of a solve that failed; the next result removes it."""
 
 
 def prepare_folder(
     folder: str | Path,
-    inputs: Iterable[Path] | None = None,
+    inputs: Iterable[Path] = (),
     overwrite: bool = False,
     subject: str = "",
 ) -> Path:
@@ -58,7 +55,7 @@ def prepare_folder(
     folder = as_path(folder, "output folder")
     # realpath, unlike resolve, accepts a link to itself
     here = Path(os.path.realpath(folder))
-    for source in inputs or ():
+    for source in inputs:
         if here in (source, source.parent):
             raise DataError(
                 "an input lies in the output folder",
@@ -90,8 +87,7 @@ def write_folder(
         formats: Further formats, see `formats.FORMATS`.
         overwrite: Overwrite files that the program did not make.
 
-    Returns:
-        Names of the files.
+    Returns names of the files.
     """
     config = dump_problem(run.problem)
     with staged(folder, True, overwrite, run.problem.subject) as new:
@@ -150,12 +146,8 @@ class WritableRun(Run):
             formats: Further files for other programs: "glb", "colmap", "npy", "pfm", "rrd" ...
             overwrite: Overwrite files that the program did not make.
 
-        Returns:
-            Names of the files.
-
-        Raises:
-            ConfigError: a format is not known.
-            DataError: the folder cannot be written, or holds what is not to be overwritten.
+        Returns names of the files. An unknown format is a ConfigError, a folder that cannot be
+        written, or holds what is not to be overwritten, a DataError.
         """
         none = formats is None or (isinstance(formats, list | tuple) and not formats)
         names = [] if none else check_formats(formats)

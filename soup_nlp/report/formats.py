@@ -14,20 +14,15 @@ from soup_nlp.report.models import write_colmap, write_fused, write_glb, write_p
 from soup_nlp.storage.files import write_bytes, write_json, write_text
 
 OfFrame: TypeAlias = Callable[[Path, Frame], object]
-"""Writes the file of a frame."""
 OfChain: TypeAlias = Callable[[Path, Chain], object]
-"""Writes one file or folder of a chain."""
 
 
 class Format(NamedTuple):
-    """Writers of the files of a format, by name.
+    """Description of a format, and writers of its files and folders by name.
 
-    Attributes:
-        text: Description.
-        frames: Of each frame: points.ply is points_ref.ply of a pair, points/0000.ply of a chain.
-        pairs: The same, without the last frame.
-        whole: Once.
-        chain: Once, of more than one pair.
+    Those of `frames` are written for each frame: points.ply is points_ref.ply of a pair, and
+    points/0000.ply of a chain; those of `pairs` for each but the last. Those of `whole` are written
+    once, and those of `chain` once if there is more than one pair.
     """
 
     text: str
@@ -43,15 +38,15 @@ def write_formats(folder: Path, chain: Chain, names: Sequence[str]) -> list[str]
     Returns the names of the files and folders that were written.
     """
     chosen, files = [FORMATS[name] for name in check_formats(names)], list[str]()
-    for k, frame in enumerate(chain):
+    for frame in chain:
         for one in chosen:
-            pairs = one.pairs if k < len(chain.pairs) else {}
+            # the last frame has no flow
+            pairs = {} if frame.flow is None else one.pairs
             for file, write in {**one.frames, **pairs}.items():
                 stem, suffix = file.split(".")
-                name = f"{stem}{'_' if chain.single else '/'}{frame.name}.{suffix}"
-                (folder / name).parent.mkdir(exist_ok=True)
-                write(folder / name, frame)
-                files.append(name)
+                files.append(f"{stem}{'_' if chain.single else '/'}{frame.name}.{suffix}")
+                (folder / files[-1]).parent.mkdir(exist_ok=True)
+                write(folder / files[-1], frame)
     for one in chosen:
         for file, write_all in {**one.whole, **({} if chain.single else one.chain)}.items():
             write_all(folder / file, chain)
@@ -78,32 +73,31 @@ def check_formats(names: Sequence[str]) -> list[str]:
 
 
 def _write_pfm(path: Path, frame: Frame) -> None:
-    """Write a depth map as portable float map, little endian, rows upwards; inf where unknown."""
+    """Portable float map, little endian, rows upwards; inf where unknown."""
     z = np.where(np.isfinite(frame.depth) & (frame.depth > 0), frame.depth, np.inf).astype("<f4")
     header = f"Pf\n{z.shape[1]} {z.shape[0]}\n-1\n"
     write_bytes(path, header.encode("ascii") + z[::-1].tobytes())
 
 
 def _write_flo(path: Path, frame: Frame) -> None:
-    """Write the flow to the next frame as Middlebury .flo; 1e10 where unknown."""
+    """Middlebury .flo; 1e10 where unknown."""
     assert frame.flow is not None
     uv = np.nan_to_num(frame.flow, nan=1e10).astype("<f4")
     write_bytes(path, b"PIEH" + struct.pack("<ii", uv.shape[1], uv.shape[0]) + uv.tobytes())
 
 
 def _write_labels(path: Path, frame: Frame) -> None:
-    """Write the components as grey PNG, of 8 bits where they suffice; unknown is 0."""
+    """8 bits where they suffice; unknown is 0."""
     labels = np.maximum(frame.components, 0)
     encode_png(path, labels.astype(np.uint8 if labels.max() < 256 else np.uint16))
 
 
 def _write_moving(path: Path, frame: Frame) -> None:
-    """Write what moves by itself as grey PNG, 255 where it does."""
     encode_png(path, np.where(frame.components > 0, 255, 0).astype(np.uint8))
 
 
 def _write_cameras(path: Path, chain: Chain) -> None:
-    """Write the intrinsics of all frames, 3 x 3; of one alone where they have the same."""
+    """Intrinsics of all frames, 3 x 3; of one alone where they have the same."""
     cameras = [np.array(frame.K) for frame in chain]
     same = all(np.array_equal(cameras[0], K) for K in cameras)
     rows = np.concatenate(cameras[:1] if same else cameras)
@@ -111,13 +105,13 @@ def _write_cameras(path: Path, chain: Chain) -> None:
 
 
 def _write_kitti(path: Path, chain: Chain) -> None:
-    """Write world_from_camera of every frame, the first 3 rows in one line (KITTI odometry)."""
+    """world_from_camera of every frame, the first 3 rows in one line (KITTI odometry)."""
     rows = (" ".join(f"{x:.9g}" for x in p.matrix[:3].ravel()) for p in chain.world_from_camera)
     write_text(path, "\n".join(rows) + "\n")
 
 
 def _write_tum(path: Path, chain: Chain) -> None:
-    """Write world_from_camera of every frame in the format of the TUM benchmark."""
+    """world_from_camera of every frame in the format of the TUM benchmark."""
     lines = [
         "# timestamp tx ty tz qx qy qz qw: position and orientation of the camera in the first"
         " frame's camera coordinates",
@@ -129,7 +123,7 @@ def _write_tum(path: Path, chain: Chain) -> None:
 
 
 def _write_transforms(folder: Path, chain: Chain) -> None:
-    """Write images, masks and transforms.json, as NeRF programs read them.
+    """Images, masks and transforms.json, as NeRF programs read them.
 
     Poses are world_from_camera with y up, looking along -z; pixel (0, 0) has its centre at 0.5.
     """
@@ -151,28 +145,23 @@ def _write_transforms(folder: Path, chain: Chain) -> None:
 
 
 def _write_recording(path: Path, chain: Chain) -> None:
-    """Write images, depth, cameras, points and components of all frames, on a timeline `frame`.
-
-    The world is the first camera (x right, y down, z ahead); the static scene does not move.
-    """
+    """Images, depth, cameras, points and components of all frames, on a timeline `frame`."""
     rr = optional("rerun", "rerun")
     out = rr.RecordingStream("soup_nlp")
     out.save(path)
     out.log("world", rr.ViewCoordinates.RDF, static=True)
     for number, frame in enumerate(chain):
         out.set_time("frame", sequence=number)
-        pose, size = frame.pose, frame.depth.shape[::-1]
-        out.log("world/camera", rr.Transform3D(translation=pose.t, mat3x3=pose.R))
-        camera = rr.Pinhole(image_from_camera=frame.K, resolution=size)
+        out.log("world/camera", rr.Transform3D(translation=frame.pose.t, mat3x3=frame.pose.R))
+        camera = rr.Pinhole(image_from_camera=frame.K, resolution=frame.depth.shape[::-1])
         out.log("world/camera/image", camera)
         out.log("world/camera/image/rgb", rr.Image(frame.image).compress(jpeg_quality=92))
         depth = rr.DepthImage(np.nan_to_num(frame.depth).astype(np.float32), meter=1.0)
         out.log("world/camera/image/depth", depth)
         for track in np.unique(frame.components[frame.sure]).tolist():
             chosen = frame.sure & (frame.components == track)
-            name = f"component_{track}" if track else "background"
             places = rr.Points3D(frame.points[chosen], colors=frame.image[chosen])
-            out.log(f"world/{name}", places)
+            out.log(f"world/{f'component_{track}' if track else 'background'}", places)
     out.flush()
     out.disconnect()
 

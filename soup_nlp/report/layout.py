@@ -1,17 +1,19 @@
-"""result.h5: one table of its arrays, from which it is written, read and checked."""
+"""Layout of a stored result: one table of the arrays of result.h5, from which it is written, read
+and checked, and the entries of summary.json that are read back."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, NotRequired, Self
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
+from soup_nlp.evaluation.metrics import DepthMetrics
 from soup_nlp.evaluation.scoring import DEPTHS
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.summary import Summary
 from soup_nlp.storage.files import as_path, read_json
 from soup_nlp.storage.store import ReadTree, Row, parse_table, read_h5, require, row_of
 
@@ -239,6 +241,51 @@ def require_layout(tree: ReadTree) -> None:
             index.size and not 0 <= index.min() <= index.max() <= last
         ):
             raise _wrong(path, "other values", f"whole numbers from 0 to {last}")
+
+
+Number = float | None
+"""A number in JSON, where null stands for one that is not finite."""
+_OTHERS = {"scale_rule": str, "n_pixels": int}
+Scores: Any = TypedDict(  # type: ignore[misc]
+    "Scores",
+    {f.name: _OTHERS.get(f.name, Number) for f in fields(DepthMetrics)}
+    | {"skill": NotRequired[Number]},
+)
+"""Scores of a depth map, a `DepthMetrics`, and its skill."""
+
+
+class Shares(TypedDict):
+    """Shares of the image, see `verdict.certainty`."""
+
+    measured: float
+    inferred: float
+    drawn: float
+    median_sigma: Number
+
+
+class Sizes(TypedDict):
+    """Sizes of the problem."""
+
+    superpixels: int
+
+
+class Summary(TypedDict):
+    """Entries of summary.json that are read back."""
+
+    name: str
+    status: str
+    converged: bool
+    delivered: str
+    energy: dict[Literal["start", "nlp", "solution"], dict[str, Number]]
+    residuals: dict[str, Number]
+    nlp_residuals: dict[str, Number]
+    answer_residuals: dict[str, Number]
+    metrics: dict[str, Scores]
+    truth_unit: str | None
+    seconds: dict[str, float]
+    sizes: Sizes
+    certainty: Shares
+    verdict: list[str]
 
 
 @dataclass(frozen=True)

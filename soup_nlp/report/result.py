@@ -33,7 +33,6 @@ from soup_nlp.storage.files import plain
 from soup_nlp.storage.store import ReadTree, require
 
 PAGE = "report.html"
-"""Name of the page in a result folder."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +57,9 @@ class Result:
     kind: Image
     min_confidence: float = MIN_CONFIDENCE
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         h, w = self.images[0].shape[:2]
         return f"Result({self.name}, {w}x{h}, {self.reconstruction}, {self.components})"
-
-    __repr__ = __str__
 
     def plot(self) -> Picture:
         """The overview as a picture: notebooks show it, `.save` writes it."""
@@ -145,11 +142,6 @@ class Result:
         """(H, W) True where nothing tells the depth of the reference frame."""
         return np.asarray(self.kind == KINDS.index("drawn"))
 
-    @property
-    def confidence(self) -> Float:
-        """(H, W) confidence of the depth from 0 (unknown) to 1 (certain)."""
-        return np.maximum(1.0 - self.sigma / NO_CONFIDENCE, 0.0)
-
     def in_next(self, values: NDArray[Any], unknown: float) -> NDArray[Any]:
         """(H', W') values of the reference frame where the next frame shows their points."""
         source = self.reconstruction.source_next
@@ -220,7 +212,8 @@ class Result:
     @cached_property
     def sure(self) -> Mask:
         """(H, W) pixels of clouds: visible in both frames, confident, not at a depth jump."""
-        known = self.confidence >= self.min_confidence
+        confidence = np.maximum(1.0 - self.sigma / NO_CONFIDENCE, 0.0)
+        known = confidence >= self.min_confidence
         return known & ~hidden(self.reconstruction) & ~at_jumps(*self.surface)
 
     @property
@@ -230,7 +223,7 @@ class Result:
 
 
 def result_of(run: Run, summary: Mapping[str, Any]) -> Result:
-    """The result of a run; `summary` has the contents of summary.json."""
+    """The result of a run; `summary` are the contents of summary.json."""
     return Result(
         tree=result_tree(run),
         summary=plain(summary),

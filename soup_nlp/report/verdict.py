@@ -1,17 +1,20 @@
-"""The printed verdict: findings, accuracy, energies, what concerns the solver, files."""
+"""What a run found and how sure that is: the printed verdict, and summary.json."""
 
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from soup_nlp.evaluation.metrics import DepthMetrics, skill
+from soup_nlp.evaluation.confidence import KINDS
+from soup_nlp.evaluation.metrics import DepthMetrics, component_overlaps, skill
 from soup_nlp.evaluation.scoring import SURE
+from soup_nlp.geometry.constraints import constraints
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.findings import certainty_lines, drawn_line, flow_words, found_words, hints
 from soup_nlp.report.result import PAGE
-from soup_nlp.report.summary import certainty
+from soup_nlp.storage.versions import versions
 
 STATUS = {
     "Solve_Succeeded": "converged to the tolerance",
@@ -40,6 +43,11 @@ TITLES = {
 RULES = {"none": "no scale", "affine": "one scale and shift each, of least squares"}
 """Words for rules of the scale of scores."""
 PAD = " " * 12
+ROUND = (
+    *("energy", "mrf_energy", "bound", "gap", "taken", "moved", "iterations", "status"),
+    *("seconds", "proposed", "accepted"),
+)
+"""Entries of a round of the refinement in summary.json."""
 
 
 def verdict(
@@ -52,11 +60,14 @@ def verdict(
     """Facts, files, next command and exit code; see `facts`."""
     # the commands can be pasted into a shell
     quoted = shlex.quote(str(folder))
-    look = [f"look        soup-nlp view {quoted}"] if PAGE in files else []
-    lines = [f"files       {folder}/: {', '.join(files)}", *look]
-    lines.append(f"next        soup-nlp check {quoted}")
     code, why = exit_code(run, limit)
-    return "\n".join([facts(run, limit, details), *lines, f"exit code   {code}: {why}"])
+    ends = {
+        "files": [f"{folder}/: {', '.join(files)}"],
+        "look": [f"soup-nlp view {quoted}"] if PAGE in files else [],
+        "next": [f"soup-nlp check {quoted}"],
+        "exit code": [f"{code}: {why}"],
+    }
+    return f"{facts(run, limit, details)}\n{sectioned(ends)}"
 
 
 def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
@@ -68,7 +79,7 @@ def exit_code(run: Run, mre_at_most: float | None) -> tuple[int, str]:
         return 1, f"the NLP did not converge ({run.solution.status}); the best iterate is written"
     if not run.good:
         return 1, drawn_line(certainty(run))
-    if mre_at_most is not None and missed(run):
+    if missed(run, mre_at_most):
         return 1, f"the MRE is above the expected {mre_at_most:g}"
     return 0, "solved, and at most half of the image is drawn"
 
@@ -81,17 +92,17 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
     """
     whole = {k: v for k, v in run.seconds.items() if not k.startswith("nlp_")}
     inner = {k[4:]: v for k, v in run.seconds.items() if k.startswith("nlp_")}
-    status = run.solution.status
+    status, expected = run.solution.status, list[str]()
     words = STATUS.get(status, f"not converged: {status}, best iterate kept")
+    if limit is not None and "solution" in run.metrics:
+        expected = [f"MRE at most {limit:g}: {'missed' if missed(run, limit) else 'met'}"]
     sections = {
         "status": [f"{words} ({status})"],
         "found": found_words(run),
         "certainty": certainty_lines(certainty(run)),
         "try": hints(run),
         "accuracy": accuracy(run.metrics),
-        "expected": [f"MRE at most {limit:g}: {'missed' if missed(run) else 'met'}"]
-        if limit is not None and "solution" in run.metrics
-        else [],
+        "expected": expected,
         **(_details(run) if details else {}),
         "seconds": [
             f"{sum(whole.values()):.1f}: {_numbers(whole, '.1f')}",
@@ -167,10 +178,90 @@ def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
     return lines
 
 
-def missed(run: Run) -> bool:
-    """Whether the MRE is larger than the problem file expects."""
-    limit = run.problem.expected.mre_at_most
-    # NaN misses every limit
-    return (
-        limit is not None and "solution" in run.metrics and not run.metrics["solution"].mre <= limit
-    )
+def missed(run: Run, limit: float | None) -> bool:
+    """Whether the MRE, if there is one, is larger than a limit; NaN misses every one."""
+    score = run.metrics.get("solution")
+    return limit is not None and score is not None and not score.mre <= limit
+
+
+def summary(run: Run) -> dict[str, Any]:
+    """Contents of summary.json; the keys are stable."""
+    s, r, full, truth = run.solution, run.refined, run.full, run.pair.truth
+    constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
+    facing = run.problem.formulation.min_facing
+    components: dict[str, Any] = {"count": len(run.components)}
+    if truth is not None and truth.components is not None:
+        overlaps = component_overlaps(run.components.of_pixel, truth.components)
+        components["truth"] = {
+            str(k): {"component": c, "iou": iou} for k, (c, iou) in overlaps.items()
+        }
+    return {
+        "name": run.problem.name,
+        "problem_hash": run.problem.digest(),
+        "status": s.status,
+        "converged": s.converged,
+        "delivered": run.delivered,
+        "energy_by_stage": dict(s.ends)
+        | ({} if r is None else {"refinement": run.energy["total"]}),
+        "energy": {"start": s.energy_start, "nlp": s.energy, "solution": run.energy},
+        "residuals": run.residuals,
+        "nlp_residuals": constraints(s.soup, run.data.rim_ray, facing).largest,
+        "answer_residuals": constraints(run.answer, run.data.rim_ray, facing).largest,
+        "refinement": None
+        if r is None
+        else {
+            "status": r.status,
+            "seconds": r.seconds,
+            "contradicted": r.contradicted,
+            "start": r.energy_start,
+            "begin": r.energy_begin,
+            "end": r.energy,
+            "rounds": [{key: getattr(one, key) for key in ROUND} for one in r.rounds],
+        },
+        "metrics": {
+            # the constant depth is scored on the reference frame only
+            k: vars(m) | ({} if k == "solution_next" else {"skill": skill(m.mre, constant)})
+            for k, m in run.metrics.items()
+        },
+        "truth_unit": None if truth is None else truth.unit,
+        "components": components,
+        "expected": run.problem.expected.model_dump(),
+        "seconds": run.seconds,
+        "iterations": {stage.name: stage.iterations for stage in s.stages},
+        "sizes": {
+            "superpixels": len(run.segmentation),
+            "knn_edges": len(run.segmentation.edges),
+            "neighbour_pairs": len(run.segmentation.pairs),
+            "width": run.pair.size[1],
+            "height": run.pair.size[0],
+            **s.nlp,
+        },
+        "full_size": None
+        if full is None
+        else {
+            "width": full.depth_ref.shape[1],
+            "height": full.depth_ref.shape[0],
+            "metrics": full.metrics and vars(full.metrics),
+        },
+        "start": {
+            "motions": len(run.start.motions),
+            "borrowed": int(run.start.borrowed.sum()),
+            "median_error_px": float(np.median(run.start.error)),
+        },
+        "certainty": certainty(run),
+        "evidence": run.confidence.evidence.rows(),
+        **({} if run.given is None else {"depth_prior": run.given.as_dict()}),
+        "flow": str(run.pair.flow),
+        "versions": versions(),
+        "seed": run.problem.seed,
+        "focal_sigma": run.pair.focal_sigma,
+        "camera_error": run.confidence.evidence.camera,
+    }
+
+
+def certainty(run: Run) -> dict[str, float]:
+    """Shares of the image by `KINDS` of its depth, and "median_sigma" of what is measured."""
+    sure = run.confidence
+    sigma = sure.sigma[sure.kind == KINDS.index("measured")]
+    middle = float(np.median(sigma)) if sigma.size else float("nan")
+    return {**{kind: sure.share(kind) for kind in KINDS}, "median_sigma": middle}

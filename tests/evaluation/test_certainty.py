@@ -9,7 +9,7 @@ import pytest
 from soup_nlp.evaluation.confidence import FACTORS, KINDS, confidence, kinds
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.report.findings import ORIGINS
-from soup_nlp.report.summary import certainty
+from soup_nlp.report.verdict import certainty
 from soup_nlp.start.regions import SCENE, TIES
 
 

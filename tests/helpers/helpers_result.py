@@ -18,7 +18,7 @@ BOARD = RigidMotion(exp([0.0, 0.0, 0.05]), np.array([-0.1, 0.0, -0.1]))
 """next_from_ref."""
 WALL_Z, BOARD_Z = 4.0, 2.0
 CERTAINTY = {"measured": 1.0, "inferred": 0.0, "drawn": 0.0, "median_sigma": 0.07}
-"""The shares of `report.summary.certainty`."""
+"""The shares of `report.verdict.certainty`."""
 START = {"bends": np.zeros(12), "borrowed": np.zeros(12), "parallax": np.full(12, 5.0)}
 START |= {"tie": np.where(np.isin(np.arange(12), (5, 6)), 1, 0)}
 

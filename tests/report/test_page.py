@@ -21,7 +21,7 @@ from soup_nlp.report.folder import write_folder
 from soup_nlp.report.page import MODES, make_pair, page
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import result_of
-from soup_nlp.report.summary import summary
+from soup_nlp.report.verdict import summary
 
 
 @pytest.fixture(scope="module")

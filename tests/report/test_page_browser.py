@@ -11,7 +11,7 @@ from helpers_chromium import Chromium, find_chromium
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.page import MODES, page
 from soup_nlp.report.result import result_of
-from soup_nlp.report.summary import summary
+from soup_nlp.report.verdict import summary
 
 CHROMIUM = find_chromium()
 pytestmark = [

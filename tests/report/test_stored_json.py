@@ -16,9 +16,9 @@ from soup_nlp.errors import DataError, SoupError
 from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.report.layout import Summary
 from soup_nlp.report.page import page
 from soup_nlp.report.result import load
-from soup_nlp.report.summary import Summary
 from soup_nlp.sequence.folder import Contents, renew_page, write_chain
 from soup_nlp.sequence.links import make_chain
 from soup_nlp.storage.files import read_json

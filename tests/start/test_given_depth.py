@@ -21,7 +21,7 @@ from soup_nlp.model.reweighting import Known, weighted
 from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run
-from soup_nlp.report.summary import summary
+from soup_nlp.report.verdict import summary
 from soup_nlp.start import prior_evidence
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
 from soup_nlp.start.prior_evidence import EXPLAINED, LEAST_MARGIN, edge_margin, judged
