@@ -153,6 +153,11 @@ class Frame:
         turned = -self.planes @ self.pose.R.T
         return np.asarray((turned / np.linalg.norm(turned, axis=1, keepdims=True))[self.labels])
 
+    @property
+    def static(self) -> Mask:
+        """(H, W) sure pixels of the static scene."""
+        return self.sure & (self.components == 0)
+
     @cached_property
     def surface(self) -> tuple[Mask, Mask]:
         """Continuity to the right and downwards, see `geometry.surface.joined`."""

@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -111,7 +111,7 @@ def fuse(chain: Chain, most: int = MOST_POINTS) -> Cloud:
     clouds = []
     for k, frame in enumerate(frames):
         chosen = np.zeros_like(frame.sure)
-        chosen[::step, ::step] = _static(frame)[::step, ::step]
+        chosen[::step, ::step] = frame.static[::step, ::step]
         cloud = np.empty(int(chosen.sum()), POINT)
         cloud["points"], cloud["colours"] = frame.points[chosen], frame.image[chosen]
         cloud["sigma"], cloud["frame"] = frame.sigma[chosen], k
@@ -130,12 +130,7 @@ def fuse(chain: Chain, most: int = MOST_POINTS) -> Cloud:
     return cloud[first][:: max(1, -(-len(first) // most))]
 
 
-def _static(frame: Frame) -> Mask:
-    """(H, W) sure pixels of the static scene."""
-    return frame.sure & (frame.components == 0)
-
-
-def projected(frame: Frame, points: Float) -> tuple[Mask, Int, Int, Float]:
+def _projected(frame: Frame, points: Float) -> tuple[Mask, Int, Int, Float]:
     """Points (M, 3) of the world in a frame: mask of those in the image, rows, columns, depths."""
     local = frame.pose.inverse(points)
     height, width = frame.depth.shape
@@ -149,10 +144,10 @@ def projected(frame: Frame, points: Float) -> tuple[Mask, Int, Int, Float]:
 
 def _contradicts(cloud: Cloud, frame: Frame) -> Mask:
     """(M,) points in front of the static surface of a frame that is more certain there."""
-    inside, v, u, z = projected(frame, cloud["points"])
+    inside, v, u, z = _projected(frame, cloud["points"])
     with np.errstate(invalid="ignore"):
         inside &= (z < IN_FRONT * frame.depth[v, u]) & (frame.sigma[v, u] <= cloud["sigma"])
-    return inside & _static(frame)[v, u]
+    return inside & frame.static[v, u]
 
 
 # --- meshes ---------------------------------------------------------------------------------------
@@ -244,54 +239,39 @@ def write_colmap(folder: Path, chain: Chain) -> None:
     write_views(folder, chain)
     model, cloud = folder / "sparse" / "0", fuse(chain, POINTS)
     model.mkdir(parents=True, exist_ok=True)
-    seen = [_seen(cloud, frame) for frame in chain]
-    write_text(model / "cameras.txt", _cameras(chain))
-    write_text(model / "images.txt", _images(chain, seen))
-    tracks: list[list[str]] = [[] for _ in cloud]
-    for i, (points, _) in enumerate(seen, 1):
-        for k, point in enumerate(points):
-            tracks[point].append(f"{i} {k}")
-    rows = [
-        f"{i} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} 0 {' '.join(track)}"
-        for i, ((x, y, z), (r, g, b), track) in enumerate(
-            zip(cloud["points"], cloud["colours"], tracks), 1
-        )
+    cameras = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] as fx, fy, cx, cy"]
+    images = [
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (cam_from_world)",
+        "# POINTS2D[] as (X, Y, POINT3D_ID)",
     ]
-    head = [
+    points = [
         printable(f"# {chain.name}; unit: {chain.unit}"),
         "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
     ]
-    write_text(model / "points3D.txt", "\n".join([*head, *rows]) + "\n")
+    tracks: list[list[str]] = [[] for _ in cloud]
+    for i, frame in enumerate(chain, 1):
+        K, (height, width), pose = frame.K, frame.depth.shape, frame.pose.inverse
+        # the first pixel's centre is (0.5, 0.5) in COLMAP, (0, 0) here
+        lens = " ".join(f"{x:.17g}" for x in (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
+        cameras.append(f"{i} PINHOLE {width} {height} {lens}")
+        x, y, z, w = pose.quaternion
+        place = " ".join(f"{a:.17g}" for a in (w, x, y, z, *pose.t))
+        seen, uv = _seen(cloud, frame)
+        shown = (f"{u:.6g} {v:.6g} {point + 1}" for point, (u, v) in zip(seen, uv + 0.5))
+        images += [f"{i} {place} {i} {frame.name}.png", " ".join(shown)]
+        for k, point in enumerate(seen):
+            tracks[point].append(f"{i} {k}")
+    for i, (point, track) in enumerate(zip(cloud, tracks, strict=True), 1):
+        (x, y, z), (r, g, b) = point["points"], point["colours"]
+        points.append(f"{i} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} 0 {' '.join(track)}")
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
+        write_text(model / f"{name}.txt", "\n".join(lines) + "\n")
 
 
 def _seen(cloud: Cloud, frame: Frame) -> tuple[Int, Float]:
     """Indices of the points that a frame shows, and their pixels (M, 2)."""
-    inside, v, u, z = projected(frame, cloud["points"])
+    inside, v, u, z = _projected(frame, cloud["points"])
     with np.errstate(invalid="ignore", divide="ignore"):
         near = np.abs(np.log(z / frame.depth[v, u])) < VISIBLE
     at = np.flatnonzero(inside & near)
     return at, project(frame.K, frame.pose.inverse(cloud["points"][at]))
-
-
-def _cameras(frames: Iterable[Frame]) -> str:
-    """PINHOLE cameras; the first pixel's centre is (0.5, 0.5) in COLMAP, (0, 0) here."""
-    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] as fx, fy, cx, cy"]
-    for i, frame in enumerate(frames, 1):
-        K, (height, width) = frame.K, frame.depth.shape
-        numbers = " ".join(f"{x:.17g}" for x in (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
-        lines.append(f"{i} PINHOLE {width} {height} {numbers}")
-    return "\n".join(lines) + "\n"
-
-
-def _images(frames: Iterable[Frame], seen: Sequence[tuple[Int, Float]]) -> str:
-    lines = [
-        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (cam_from_world)",
-        "# POINTS2D[] as (X, Y, POINT3D_ID)",
-    ]
-    for i, (frame, (points, uv)) in enumerate(zip(frames, seen, strict=True), 1):
-        pose = frame.pose.inverse
-        x, y, z, w = pose.quaternion
-        numbers = " ".join(f"{a:.17g}" for a in (w, x, y, z, *pose.t))
-        lines.append(f"{i} {numbers} {i} {frame.name}.png")
-        lines.append(" ".join(f"{u:.6g} {v:.6g} {k + 1}" for k, (u, v) in zip(points, uv + 0.5)))
-    return "\n".join(lines) + "\n"
