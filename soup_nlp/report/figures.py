@@ -11,6 +11,7 @@ from functools import lru_cache
 from html import escape
 from importlib.resources import files
 from io import BytesIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -242,11 +243,16 @@ def _place(sheet: Pil.Image, image: Image, left: int, top: int, width: int, heig
     sheet.paste(Pil.fromarray(scaled), (left, top))
 
 
+def data_url(image: Image, kind: str, **options: Any) -> str:
+    """An image as an address that holds it, encoded by Pillow with some options."""
+    data = BytesIO()
+    Pil.fromarray(image).save(data, kind, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(data.getvalue()).decode()}"
+
+
 def shown(text: str, image: Image) -> str:
     """A text and a picture in HTML, for notebooks."""
-    data = BytesIO()
-    Pil.fromarray(image).save(data, format="png")
-    source = f"data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}"
+    source = data_url(image, "png")
     return f'<pre>{escape(text)}</pre><img alt="overview" style="max-width:100%" src="{source}">'
 
 

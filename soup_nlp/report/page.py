@@ -7,20 +7,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 from html import escape
 from importlib.resources import files
-from io import BytesIO
 from string import Template
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL.Image import fromarray
 
 from soup_nlp.arrays import Float
 from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, whole_cells
 from soup_nlp.report.chain import STILL, Chain
-from soup_nlp.report.figures import Legend, Picture, component_colours
+from soup_nlp.report.figures import Legend, Picture, component_colours, data_url
 from soup_nlp.report.findings import ORIGINS, SAID, drawn_line
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import Result
@@ -40,8 +38,7 @@ MODES = {
 }
 """Labels of the buttons that colour the 3D view, by name of the picture."""
 LEAST_PATH = 3
-"""Smallest number of frames of a path of a chain that is shown; shorter ones are mostly no
-objects."""
+"""Smallest number of frames of a shown path of a chain; shorter ones are mostly no objects."""
 SIDE, MANY = 1600, 4
 """Larger side of a picture, pixels; number of pairs above which pictures are smaller."""
 MOST_PAIRS = 100
@@ -102,10 +99,9 @@ def _figure(picture: Picture, pairs: int) -> dict[str, str]:
     if side > most:
         size = [round(x * most / side) for x in image.shape[1::-1]]
         image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    data, exact = BytesIO(), picture.legend is not None and pairs == 1
+    exact = picture.legend is not None and pairs == 1
     # the least effort takes a fifth of the time; files are half as large again
-    fromarray(image).save(data, "webp", lossless=exact, method=0, quality=50 if exact else 90)
-    source = f"data:image/webp;base64,{base64.b64encode(data.getvalue()).decode('ascii')}"
+    source = data_url(image, "webp", lossless=exact, method=0, quality=50 if exact else 90)
     return {"title": picture.title, "legend": _legend(picture.legend), "source": source}
 
 
@@ -140,15 +136,14 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
     at = np.linspace(0, len(chain.pairs) - 1, count).astype(int).tolist()
     pairs = []
     for k in at:
-        shown = (drawn or pictures(chain, k)).items()
-        packed = {
-            name: _packed(value) if isinstance(value, np.ndarray) else value
-            for name, value in make_pair(chain, k, min(PIXELS[0], PIXELS[1] / count)).items()
-        }
-        pairs.append({**packed, "pictures": {name: _figure(one, count) for name, one in shown}})
+        pair = make_pair(chain, k, min(PIXELS[0], PIXELS[1] / count))
+        shown = {n: _figure(one, count) for n, one in (drawn or pictures(chain, k)).items()}
+        pair = {n: _packed(x) if isinstance(x, np.ndarray) else x for n, x in pair.items()}
+        pairs.append({**pair, "pictures": shown})
     z = metre * chain.depths
-    z = z[np.isfinite(z)]
-    far, deepest = _far(z)
+    z = z[np.isfinite(z)] if np.isfinite(z).any() else np.ones(1)
+    # sky and horizon may be orders of magnitude behind the rest; a wall at one depth is shown
+    far = 1.001 * min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70)))
     still = chain.single and chain.pairs[0].bending
     poses = [STILL] * len(chain) if still else chain.world_from_camera
     cameras = [replace(pose, t=metre * pose.t).matrix for pose in poses]
@@ -160,9 +155,9 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "modes": [[n, word] for n, word in MODES.items() if n in pairs[0]["pictures"]],
         "cameras": [cameras[k : k + 2] for k in at],
         "paths": _paths(chain, metre),
-        "middle": float(np.median(z)) if z.size else 1.0,
+        "middle": float(np.median(z)),
         "far": far,
-        "deepest": deepest,
+        "deepest": float(z.max()),
         "unit": chain.length,
         "origins": [ORIGINS[name] for name in TIES],
         "kinds": [*SAID.values()],
@@ -236,15 +231,6 @@ def _single(values: Float) -> NDArray[np.float32]:
     """Numbers in single precision; those of a diverged solve are limited to its range."""
     limits = np.finfo(np.float32)
     return np.clip(values, limits.min, limits.max).astype(np.float32)
-
-
-def _far(z: Float) -> tuple[float, float]:
-    """Depth at which the view ends at first, and largest depth."""
-    if not z.size:
-        return 1.0, 1.0
-    # sky and horizon may be orders of magnitude behind the rest; a wall at one depth is shown
-    far = 1.001 * min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70)))
-    return far, float(z.max())
 
 
 def _pivots(result: Result, scale: float) -> Float:
