@@ -25,7 +25,6 @@ from soup_nlp.report.pairs import (
     fitting,
     head,
     kept_rows,
-    needed_bytes,
     places,
     solve_into,
 )
@@ -97,19 +96,16 @@ def batch(
     problems = problems_of(pairs, overrides)
     claim(folder, [*FILES, *places(problems)], overwrite, journal=ROWS)
     rows: dict[str, Row] = {}
-    heads, needs = dict[str, Row](), 0.0
+    heads: dict[str, Row] = {}
     for name, problem in problems.items():
         try:
             heads[name] = head(problem)
-            # the estimate reads both images
-            needs = max(needs, needed_bytes(problem) if workers > 1 else 0.0)
         except SoupError as error:
             rows[name] = {"key": name, "pair": name, "seed": problem.seed}
             rows[name] |= failure(f"{type(error).__name__}: {error}")
     left = [name for name in problems if name not in rows]
-    workers = fitting(workers, needs)
+    workers = fitting(workers, [problems[name] for name in left])
     token = f"{socket.gethostname()} {os.getpid()} {time.time_ns()}"
-
     told = [0.0]
 
     def tell(last: bool = False, tries: int = 20) -> None:

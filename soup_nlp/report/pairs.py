@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Required
 
@@ -10,6 +11,7 @@ from typing_extensions import TypedDict
 
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.errors import SoupError
 from soup_nlp.pipeline.case import solve_bytes
 from soup_nlp.report.folder import run
 from soup_nlp.report.verdict import exit_code
@@ -73,14 +75,14 @@ def places(names: Iterable[str]) -> list[str]:
     return [f"{PAIRS}/{name}/-" for name in names]
 
 
-def needed_bytes(problem: Problem) -> float:
-    """Estimate of the memory of a solve."""
-    return sum(solve_bytes(problem, problem.load_pair()).values())
-
-
-def fitting(workers: int, needs: float) -> int:
-    """How many of some workers have room in the free memory, if each needs so many bytes."""
-    return max(1, min(workers, int(psutil.virtual_memory().available / max(needs, 1.0))))
+def fitting(workers: int, problems: Iterable[Problem]) -> int:
+    """How many of some workers have room in the free memory, whichever problems they solve."""
+    needs = 1.0
+    for problem in problems if workers > 1 else ():
+        # an image that cannot be read is an error of its row
+        with suppress(SoupError):
+            needs = max(needs, sum(solve_bytes(problem, problem.load_pair()).values()))
+    return max(1, min(workers, int(psutil.virtual_memory().available / needs)))
 
 
 def solve_into(problem: Problem, folder: Path) -> Row:

@@ -20,7 +20,7 @@ from soup_nlp.report.pairs import PAIRS, ROWS
 from soup_nlp.report.result import PAGE, Result
 from soup_nlp.report.result import load as load_pair
 from soup_nlp.sequence.frames import pair_name
-from soup_nlp.sequence.links import make_chain, read_pair
+from soup_nlp.sequence.links import make_chain
 from soup_nlp.sequence.score import chain_lines, score
 from soup_nlp.storage.each import failed, read_rows
 from soup_nlp.storage.files import as_path, is_file, read_json, write_json, write_text
@@ -28,6 +28,8 @@ from soup_nlp.storage.folders import staged
 
 CHAIN = "chain.json"
 """File that makes a folder that of a chain."""
+KEPT = ("input", "start", "truth", "solution", "weights", "energy")
+"""Groups of arrays of a pair that a chain needs."""
 DEPTH_TOLERANCE = 1e-6
 """Largest relative difference of stored scales and poses from recomputed ones."""
 SINGLE = CHAIN, "trajectory.tum", PAGE
@@ -71,8 +73,13 @@ def read_chain(folder: Path) -> Chain:
 
 
 def read_pairs(folder: Path, count: int) -> Lazy[Result]:
-    """The pairs of a chain's folder, each read when it is needed."""
-    return Lazy(lambda k: read_pair(folder / PAIRS / pair_name(k)), count)
+    """The pairs of a chain's folder, each read when it is needed, with the arrays `KEPT`."""
+
+    def read(k: int) -> Result:
+        pair = load_pair(folder / PAIRS / pair_name(k))
+        return replace(pair, tree={name: pair.tree[name] for name in KEPT if name in pair.tree})
+
+    return Lazy(read, count)
 
 
 def check(folder: Path) -> CheckReport:

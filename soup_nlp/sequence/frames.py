@@ -101,13 +101,9 @@ def find_images(source: Path) -> list[Path]:
     In a folder with images named frame_*, only these are used. Hidden files are no images.
     """
     source = as_path(source, "frames")
-    root = next(folder for folder in (source, *source.parents) if folder.is_dir())
-    pattern = "*" if root == source else str(source.relative_to(root))
-    # glob leaves out hidden files
-    files = [root / name for name in glob(pattern, root_dir=root, recursive=True)]
     # links without a target and pipes are errors when they are read
-    chosen = [path for path in files if not path.is_dir()]
-    if root == source:
+    chosen = [path for path in _matching(source) if not path.is_dir()]
+    if source.is_dir():
         images = [path for path in chosen if path.suffix.lower() in IMAGES]
         chosen = [path for path in images if path.match(LAYOUT)] or images
     # cameras write a raw photo beside the developed one
@@ -121,6 +117,14 @@ def find_images(source: Path) -> list[Path]:
             hint=None if chosen or source.exists() else "check the name; nothing matches it",
         )
     return in_order(chosen)
+
+
+def _matching(source: Path) -> list[Path]:
+    """What is in a folder or matches a pattern; brackets of folders that exist are no pattern."""
+    root = next(folder for folder in (source, *source.parents) if folder.is_dir())
+    pattern = "*" if root == source else str(source.relative_to(root))
+    # glob leaves out hidden files
+    return [root / name for name in glob(pattern, root_dir=root, recursive=True)]
 
 
 def find_depths(images: list[Path]) -> list[Path]:
@@ -143,8 +147,7 @@ def numbered_files(folder: Path, kinds: Sequence[str], what: str, first: str = "
     pattern `first` are preferred. None is a DataError.
     """
     folder = as_path(folder, f"folder of {what}", home=True)
-    found = folder.glob("*") if folder.is_dir() else folder.parent.glob(folder.name)
-    files = [path for path in found if path.suffix.lower() in kinds]
+    files = [path for path in _matching(folder) if path.suffix.lower() in kinds]
     files = [path for path in files if first and path.match(first)] or files
     if not files:
         raise DataError(f"there is no {what}", where=folder, expected=f"files {', '.join(kinds)}")

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.evaluation.metrics import overlap_shares
 from soup_nlp.geometry.superpixels import Labels
 from soup_nlp.report.chain import STILL, Brief, Chain, Lazy, Link
-from soup_nlp.report.result import Result, load
+from soup_nlp.report.result import Result
 
 MIN_PIXELS = 200
 """Links with fewer pixels are flagged."""
@@ -23,14 +22,6 @@ MOST_DRAWN = 0.5
 chain is not good if a larger share of all its images is drawn."""
 LEAST_OVERLAP = 0.3
 """Smallest intersection over union of two components of one track."""
-KEPT = ("input", "start", "truth", "solution", "weights", "energy")
-"""Groups of arrays of a pair that a chain needs."""
-
-
-def read_pair(folder: Path) -> Result:
-    """The result of a folder, with the arrays that a chain needs."""
-    result = load(folder)
-    return replace(result, tree={name: result.tree[name] for name in KEPT if name in result.tree})
 
 
 def still(result: Result) -> bool:
@@ -74,8 +65,7 @@ def bridge(pairs: Sequence[Result], a: int) -> Link | None:
 def near_link(pairs: Sequence[Result], a: int) -> Link | None:
     """The link of a pair and the next one, from static pixels that are confident in both.
 
-    It is flagged where a pair has no parallax, or where no pixel is
-    confident in both.
+    It is flagged where a pair has no parallax, or where no pixel is confident in both.
     """
     first, second = pairs[a], pairs[a + 1]
     z, keep = first.depths[1], first.in_next(first.static, False)
@@ -141,12 +131,11 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
 
 
 def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:
-    """Numbers of the tracks: for every pair, a dict from component to track; 0 is the background.
+    """Tracks by component of every pair; 0 is the background.
 
     `matches` come from `follow`; `counts` are the components of every pair with the background.
     """
-    out: list[dict[int, int]] = []
-    new_number = count(1)
+    out, new_number = list[dict[int, int]](), count(1)
     for match, total in zip([{}, *matches], counts, strict=True):
         numbers = {new: out[-1][old] for old, new in match.items()}
         rest = {label: next(new_number) for label in range(1, total) if label not in numbers}

@@ -26,7 +26,6 @@ from soup_nlp.report.pairs import (
     fitting,
     head,
     kept_rows,
-    needed_bytes,
     places,
     solve_into,
 )
@@ -195,8 +194,8 @@ def solve_pairs(
         for name, problem in problems.items()
         if name not in done
     }
-    if workers > 1 and todo:
-        workers = fitting(workers, needed_bytes(problems[next(iter(todo))]))
+    # all pairs have one size
+    workers = fitting(workers, [problems[name] for name in todo][:1])
     with closing(each(todo, workers)) as ended:
         for name, result in ended:
             row = done[name] = {**heads[name], **result}
