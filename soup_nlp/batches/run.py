@@ -19,15 +19,7 @@ from soup_nlp.batches.page import page
 from soup_nlp.batches.sources import Source, problems_of
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError, SoupError
-from soup_nlp.report.pairs import (
-    PAIRS,
-    ROWS,
-    fitting,
-    head,
-    kept_rows,
-    places,
-    solve_into,
-)
+from soup_nlp.report import pairs as stored
 from soup_nlp.storage.each import Row, Say, append_row, each, failed, failure, reason
 from soup_nlp.storage.files import as_path, write_text
 from soup_nlp.storage.folders import claim, staged
@@ -94,17 +86,17 @@ def batch(
     """
     folder = as_path(out, "output folder")
     problems = problems_of(pairs, overrides)
-    claim(folder, [*FILES, *places(problems)], overwrite, journal=ROWS)
+    claim(folder, [*FILES, *stored.places(problems)], overwrite, journal=stored.ROWS)
     rows: dict[str, Row] = {}
     heads: dict[str, Row] = {}
     for name, problem in problems.items():
         try:
-            heads[name] = head(problem)
+            heads[name] = stored.head(problem)
         except SoupError as error:
             rows[name] = {"key": name, "pair": name, "seed": problem.seed}
             rows[name] |= failure(f"{type(error).__name__}: {error}")
     left = [name for name in problems if name not in rows]
-    workers = fitting(workers, [problems[name] for name in left])
+    workers = stored.fitting(workers, [problems[name] for name in left])
     token = f"{socket.gethostname()} {os.getpid()} {time.time_ns()}"
     told = [0.0]
 
@@ -128,7 +120,7 @@ def batch(
 
     with _alive(folder, token):
         while left:
-            known = kept_rows(folder, {name: heads[name] for name in left})
+            known = stored.kept_rows(folder, {name: heads[name] for name in left})
             rows |= {k: row for k, row in known.items() if not (retry_failed and failed(row))}
             todo = [name for name in left if name not in rows]
             home = folder.absolute()
@@ -144,7 +136,7 @@ def batch(
                         left.append(name)
                         continue
                     rows[name] = {**heads[name], **result}
-                    append_row(folder / ROWS, rows[name])
+                    append_row(folder / stored.ROWS, rows[name])
                     # only now, so that another run that takes the mark finds the row
                     _mark(folder, name).unlink(missing_ok=True)
                     tell()
@@ -159,7 +151,7 @@ def batch(
 
 def _mark(folder: Path, name: str) -> Path:
     """File that exists while a run solves a pair."""
-    return folder / PAIRS / f"{name}.claim"
+    return folder / stored.PAIRS / f"{name}.claim"
 
 
 def _solve(problem: Problem, folder: Path, own: Row, token: str, before: Row | None) -> Row:
@@ -169,8 +161,8 @@ def _solve(problem: Problem, folder: Path, own: Row, token: str, before: Row | N
     """
     mark = _mark(folder, problem.name)
     if _claimed(mark, token):
-        if kept_rows(folder, {problem.name: own}).get(problem.name) == before:
-            return solve_into(problem, folder)
+        if stored.kept_rows(folder, {problem.name: own}).get(problem.name) == before:
+            return stored.solve_into(problem, folder)
         mark.unlink(missing_ok=True)
     return {"claimed": True}
 
@@ -198,7 +190,7 @@ def _alive(folder: Path, token: str) -> Iterator[None]:
     stop = threading.Event()
 
     def marks() -> Iterator[Path]:
-        for mark in (folder / PAIRS).glob("*.claim"):
+        for mark in (folder / stored.PAIRS).glob("*.claim"):
             with suppress(OSError):
                 if mark.read_text() == token:
                     yield mark

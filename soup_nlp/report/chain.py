@@ -17,15 +17,8 @@ from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.rotation import RigidMotion
 from soup_nlp.geometry.surface import joined
-from soup_nlp.report.figures import (
-    Picture,
-    colourise_depth,
-    colourise_shares,
-    depth_legend,
-    depth_range,
-    shown,
-    strip,
-)
+from soup_nlp.report import figures
+from soup_nlp.report.figures import Picture, shown
 
 if TYPE_CHECKING:
     from soup_nlp.report.result import Result
@@ -164,19 +157,19 @@ class Frame:
         return joined(self.planes, self.labels, self.components, self.K)
 
     def _repr_html_(self) -> str:
-        near, far = depth_range(self.depth)
-        sigma = colourise_shares(self.sigma, 0.3, "viridis")
+        near, far = figures.depth_range(self.depth)
+        sigma = figures.colourise_shares(self.sigma, 0.3, "viridis")
         panels = [
             Picture("image", self.image),
             self.picture(near, far, "depth, pale = drawn"),
             Picture("expected depth error (1 sigma), bright = 30 % and more", sigma),
         ]
-        return shown(str(self), strip(panels, ""))
+        return shown(str(self), figures.strip(panels, ""))
 
     def picture(self, near: float, far: float, title: str) -> Picture:
         """The depth in colours from `near` to `far`, pale where it is drawn."""
-        image = colourise_depth(self.depth, near, far, self.drawn)
-        return Picture(title, image, depth_legend(near, far))
+        image = figures.colourise_depth(self.depth, near, far, self.drawn)
+        return Picture(title, image, figures.depth_legend(near, far))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,10 +217,10 @@ class Chain:
         )
 
     def _repr_html_(self) -> str:
-        near, far = depth_range(self.depths)
+        near, far = figures.depth_range(self.depths)
         chosen = sorted({*np.linspace(0, len(self) - 1, min(SHOWN_FRAMES, len(self))).astype(int)})
         panels = [self[k].picture(near, far, f"depth of frame {self.names[k]}") for k in chosen]
-        return shown(str(self), strip(panels, ""))
+        return shown(str(self), figures.strip(panels, ""))
 
     @property
     def name(self) -> str:
@@ -263,7 +256,7 @@ class Chain:
     @cached_property
     def depth_range(self) -> tuple[float, float]:
         """(near, far) of the colours of depth in the shown unit, one for all frames."""
-        return depth_range(self.depths * (self.metre or 1.0))
+        return figures.depth_range(self.depths * (self.metre or 1.0))
 
     @cached_property
     def certainty(self) -> dict[str, float]:

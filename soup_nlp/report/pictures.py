@@ -9,20 +9,9 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.arrays import AnyFloat, Image
+from soup_nlp.report import figures
 from soup_nlp.report.chain import Chain
-from soup_nlp.report.figures import (
-    Legend,
-    Picture,
-    colourise_depth,
-    colourise_flow,
-    colourise_normals,
-    colourise_shares,
-    component_colours,
-    depth_legend,
-    draw_superpixels,
-    flow_limit,
-    strip,
-)
+from soup_nlp.report.figures import Legend, Picture
 from soup_nlp.report.findings import LEAST
 
 if TYPE_CHECKING:
@@ -43,7 +32,7 @@ def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
     """
     result = chain.pairs[k]
     before, after = result.images
-    cells = draw_superpixels(before, result.labels)
+    cells = figures.draw_superpixels(before, result.labels)
     flow, flow_confidence = _flow(result)
     drawn = {
         "image_ref": Picture("reference frame", before),
@@ -66,7 +55,7 @@ def _components(chain: Chain, k: int) -> Picture:
     """The image in the colours of the components."""
     result, track = chain.pairs[k], chain.tracks[k]
     part, count = result.components.of_pixel, len(track)
-    colours = component_colours(max(track) + 1)[track]
+    colours = figures.component_colours(max(track) + 1)[track]
     pixels = np.bincount(part.ravel(), minlength=count) / part.size
     texts = [f"{number}: {share:.1%}" for number, share in zip(track, pixels, strict=True)][:6]
     kind = "component" if result.bends.any() else "rigid component"
@@ -80,17 +69,17 @@ def _flow(result: Result) -> tuple[Picture, Picture]:
     """Flow and its confidence."""
     sure = np.clip(result.flow_confidence, 0, 1).astype(float)
     used = np.where((sure > 0)[..., None], result.flow.astype(float), np.nan)
-    limit = flow_limit(used)
+    limit = figures.flow_limit(used)
     title = f"flow to the next frame: white = 0 px, full colour = {limit:.3g} px, black = unusable"
     grey = np.repeat((255 * sure).round().astype(np.uint8)[:, :, None], 3, axis=2)
     ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
     share = f"{np.mean(sure > 0):.0%} of the pixels usable"
     turns = np.linspace(0, 2 * np.pi, 128)
-    hues = colourise_flow(np.stack([np.cos(turns), np.sin(turns)], axis=1)[None], 1.0)
+    hues = figures.colourise_flow(np.stack([np.cos(turns), np.sin(turns)], axis=1)[None], 1.0)
     ways = Legend(hues, ("right", "down", "left", "up", "right"))
     ends = Legend(ramp, ("0", "0.5", "1"))
     return (
-        Picture(title, colourise_flow(used, limit), ways),
+        Picture(title, figures.colourise_flow(used, limit), ways),
         Picture(f"flow confidence; black = unusable ({share})", grey, ends),
     )
 
@@ -99,7 +88,8 @@ def _depths(chain: Chain, k: int) -> dict[str, Picture]:
     """Depths of both frames and of the truth, with one colour scale."""
     result, truth, (near, far) = chain.pairs[k], chain.pairs[k].true_depth, chain.depth_range
     scores, metre, out = result.summary.get("metrics", {}), chain.metre or 1.0, {}
-    bar, seen = depth_legend(near, far, f" {chain.length}"), result.in_next(result.drawn, False)
+    bar = figures.depth_legend(near, far, f" {chain.length}")
+    seen = result.in_next(result.drawn, False)
     for name, frame, z, drawn, scored in (
         ("depth_ref", "reference", result.depths[0], result.drawn, "solution"),
         ("depth_next", "next", result.depths[1], seen, "solution_next"),
@@ -109,9 +99,9 @@ def _depths(chain: Chain, k: int) -> dict[str, Picture]:
         title += "; grey = unseen" * (frame == "next")
         if drawn.mean() >= LEAST:
             title += "; pale = drawn" + f" ({drawn.mean():.0%})" * (frame == "reference")
-        out[name] = Picture(title, colourise_depth(metre * z, near, far, drawn), bar)
+        out[name] = Picture(title, figures.colourise_depth(metre * z, near, far, drawn), bar)
     if truth is not None:
-        true = colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)
+        true = figures.colourise_depth(_enlarged(np.where(truth > 0, truth, np.nan)), near, far)
         out["depth_true"] = Picture("true depth; grey = no truth", true, bar)
     return out
 
@@ -140,19 +130,20 @@ def _shares(title: str, values: AnyFloat, colours: str, ticks: Sequence[float]) 
     """Picture of shares (H, W) in a colour map of OpenCV that ends at the last tick."""
     limit, texts = ticks[-1], [f"{100 * x:.0f} %" for x in ticks]
     texts[-1] = f"\u2265 {texts[-1]}"
-    bar = Legend(colourise_shares(np.linspace(0, limit, 128)[None], limit, colours), tuple(texts))
-    return Picture(title, colourise_shares(values, limit, colours), bar)
+    ramp = figures.colourise_shares(np.linspace(0, limit, 128)[None], limit, colours)
+    image = figures.colourise_shares(values, limit, colours)
+    return Picture(title, image, Legend(ramp, tuple(texts)))
 
 
 def _normals(result: Result) -> Picture:
     n = result.reconstruction.normals
     entries = {"camera": (0, 0, -1), "right": (1, 0, 0), "left": (-1, 0, 0),
                "up": (0, -1, 0), "down": (0, 1, 0)}  # fmt: skip
-    row = colourise_normals(np.array([list(entries.values())], float))
-    return Picture("surface normals", colourise_normals(n), Legend(row, tuple(entries)))
+    row = figures.colourise_normals(np.array([list(entries.values())], float))
+    return Picture("surface normals", figures.colourise_normals(n), Legend(row, tuple(entries)))
 
 
 def overview(drawn: Mapping[str, Picture], title: str) -> Image:
     """The pictures of a result in whole rows of three columns; the last ones may be left out."""
     panels = [*drawn.values()]
-    return strip(panels[: len(panels) // 3 * 3], title)
+    return figures.strip(panels[: len(panels) // 3 * 3], title)

@@ -18,17 +18,9 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
 from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.pipeline.run import ProblemKeys, sections
+from soup_nlp.report import pairs as stored
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import write_png
-from soup_nlp.report.pairs import (
-    PAIRS,
-    ROWS,
-    fitting,
-    head,
-    kept_rows,
-    places,
-    solve_into,
-)
 from soup_nlp.sequence.folder import CHAIN, SINGLE, chain_files, read_pairs, write_chain
 from soup_nlp.sequence.frames import (
     DEPTHS,
@@ -135,14 +127,14 @@ def solve_chain(
     chosen = replace(chosen, files=files, keys=common, overrides=overrides)
     # a wrong key or scene is found before the first pair is solved
     chosen.problem(0)
-    names = places(map(pair_name, range(count - 1)))
-    claim(folder, [*chain_files(count), *names], overwrite, subject, ROWS)
+    names = stored.places(map(pair_name, range(count - 1)))
+    claim(folder, [*chain_files(count), *names], overwrite, subject, stored.ROWS)
     chosen = one_camera(chosen)
     problems = {one.name: one for one in map(chosen.problem, range(count - 1))}
     # a pair that is solved otherwise ends the chain that it was part of
-    heads = {name: head(problem) for name, problem in problems.items()}
-    kept = {name for name, row in kept_rows(folder, heads).items() if not failed(row)}
-    stale = any((folder / PAIRS / name).exists() for name in problems.keys() - kept)
+    heads = {name: stored.head(problem) for name, problem in problems.items()}
+    kept = {name for name, row in stored.kept_rows(folder, heads).items() if not failed(row)}
+    stale = any((folder / stored.PAIRS / name).exists() for name in problems.keys() - kept)
     if stale and is_file(folder / CHAIN) and not overwrite:
         raise DataError(
             "output folder holds a chain that was solved otherwise",
@@ -188,18 +180,18 @@ def solve_pairs(
     Problems and their `head` are by name of the folder. Fewer than `workers` processes run where
     their memory would not suffice. `say` is called with (done, total, row) after every solve.
     """
-    done = {k: row for k, row in kept_rows(folder, heads).items() if not failed(row)}
+    done = {k: row for k, row in stored.kept_rows(folder, heads).items() if not failed(row)}
     todo = {
-        name: partial(solve_into, problem, folder.resolve())
+        name: partial(stored.solve_into, problem, folder.resolve())
         for name, problem in problems.items()
         if name not in done
     }
     # all pairs have one size
-    workers = fitting(workers, [problems[name] for name in todo][:1])
+    workers = stored.fitting(workers, [problems[name] for name in todo][:1])
     with closing(each(todo, workers)) as ended:
         for name, result in ended:
             row = done[name] = {**heads[name], **result}
-            append_row(folder / ROWS, row)
+            append_row(folder / stored.ROWS, row)
             # those of a worker process would be printed as Python prints them
             for text in row.get("warnings", ()):
                 warnings.warn(text, DataWarning, stacklevel=2)

@@ -148,7 +148,7 @@ def test_an_unreadable_frame_is_found_before_the_first_solve(kind, tmp_path, cap
     def solve(*args):
         raise AssertionError("a pair was solved")
 
-    monkeypatch.setattr(solving, "solve_into", solve)
+    monkeypatch.setattr(solving.stored, "solve_into", solve)
     for k in range(3):
         write_png(tmp_path / f"{k}.png", IMAGE)
     last = tmp_path / "3.png"

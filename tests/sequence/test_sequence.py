@@ -260,7 +260,7 @@ def test_a_pair_that_was_solved_otherwise_is_solved_again(tmp_path, monkeypatch,
         problems = {one.name: one for one in map(frames.problem, range(count))}
         return problems, {name: head(problem) for name, problem in problems.items()}
 
-    monkeypatch.setattr(solving, "solve_into", solve)
+    monkeypatch.setattr(solving.stored, "solve_into", solve)
     for seed in (1, 1, 2, 1):
         solving.solve_pairs(*pairs(1, seed), tmp_path)
         assert (tmp_path / "pairs" / "000_001" / "result.h5").is_file()
