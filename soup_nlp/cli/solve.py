@@ -25,9 +25,9 @@ from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
 from soup_nlp.report.result import PAGE
 from soup_nlp.report.verdict import exit_code, verdict
 from soup_nlp.sequence.folder import SINGLE
-from soup_nlp.sequence.frames import IMAGES, VIDEOS
+from soup_nlp.sequence.frames import IMAGES, VIDEOS, named
 from soup_nlp.sequence.score import chain_exit_code
-from soup_nlp.sequence.solve import named, solve_chain
+from soup_nlp.sequence.solve import solve_chain
 from soup_nlp.storage.each import Row
 from soup_nlp.storage.files import as_path, is_file, is_folder
 from soup_nlp.storage.folders import default_folder

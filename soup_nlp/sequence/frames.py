@@ -1,5 +1,6 @@
 """Frames of a sequence, of image files, a video or a rendered scene."""
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -17,12 +18,13 @@ import PIL.Image
 from PIL import ImageSequence
 
 from soup_nlp.arrays import Image
-from soup_nlp.config.problem import Problem, make_problem
+from soup_nlp.config.problem import Problem, make_problem, title
+from soup_nlp.data.accept import ImageLike, image_of, is_path
 from soup_nlp.data.formats.images import RAW, read_image
-from soup_nlp.errors import DataError
+from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.figures import write_png
-from soup_nlp.storage.files import as_path, require_file
-from soup_nlp.storage.folders import staged
+from soup_nlp.storage.files import as_path, is_folder, require_file
+from soup_nlp.storage.folders import claim, staged
 
 Raw = dict[str, Any]
 
@@ -37,11 +39,22 @@ VIDEOS = (
 )  # fmt: skip
 """Suffixes by which a message knows a video; any file that is no image is tried as one."""
 DEPTHS = (".png", ".npy", ".npz", ".pfm", ".dpt")
-"""Suffixes of depth maps."""
 FLOWS = (".flo", ".png", ".npy")
-"""Suffixes of flows."""
+"""Suffixes of depth maps and of flows."""
+OF_PAIRS = {
+    ("flow", "source"): FLOWS,
+    ("flow", "backward"): FLOWS,
+    ("flow", "confidence"): (".npy", ".png"),
+    ("depth_prior", "source"): DEPTHS,
+}
+"""Keys that may name a folder with a file for each pair, and the suffixes of these."""
 LAYOUT = "frame_*"
 """Pattern of the images in a folder that also holds other images, such as depth."""
+SCENE = "scene:"
+"""Prefix of the name of a rendered scene."""
+
+Source = str | Path | Sequence[ImageLike]
+"""Folder or pattern of images, video, scene:NAME, or a list of files, arrays or PIL images."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +108,74 @@ def pair_name(k: int) -> str:
     return f"{k:03d}_{k + 1:03d}"
 
 
+def named(frames: Source, folder: Path | None = None) -> tuple[str, str]:
+    """Name of a sequence, and the subject of its output folder: what it is the result of.
+
+    Images in memory are named after the folder.
+    """
+    if isinstance(frames, str) and frames.startswith(SCENE):
+        return title(frames.removeprefix(SCENE)), frames
+    first = frames if isinstance(frames, str | Path) else next(iter(frames), None)
+    if not isinstance(first, str | Path):
+        folder = Path(folder or "chain").absolute()
+        return folder.name, f"sequence of images in memory for {folder}"
+    path = as_path(first, "frames", home=True).absolute()
+    # several images, or a pattern, are named after their folder
+    if first is not frames or not path.exists():
+        path = path.parent
+    return title(path.stem if path.is_file() else path.name), f"sequence {path}"
+
+
+def find_frames(
+    source: Source, out: Path, camera: Raw, stride: int, most: int | None, depth_scale: float | None
+) -> Frames:
+    """The frames of a source; those of a video, and arrays, are written into the folder `out`."""
+    if isinstance(source, str) and source.startswith(SCENE):
+        if stride != 1 or camera:
+            raise ConfigError("a rendered scene has its own camera and steps", found=source)
+        scene = source.removeprefix(SCENE)
+        return Frames(tuple(f"{scene}: frame {k}" for k in range(most or 10)), scene=scene)
+    depths = list[Path]()
+    if not isinstance(source, str | Path):
+        images = _files(source, out)[::stride][:most]
+    elif is_video(path := as_path(source, "frames", home=True)):
+        images = video_frames(path, _written_frames(out), stride, most)
+    else:
+        images = find_images(path)[::stride][:most]
+        depths = [] if "undistort" in camera else find_depths(images)
+    if len(images) < 2:
+        raise ConfigError(
+            "a sequence needs two frames at least",
+            where="stride" if stride != 1 else None,
+            found=len(images),
+            expected="more frames, or a smaller stride",
+        )
+    images, depths = ([p.absolute() for p in paths] for paths in (images, depths))
+    beside = images[0].parent / "K.txt"
+    if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
+        camera = {"intrinsics": str(beside), **camera}
+    check_sizes(images, turn="intrinsics" not in camera)
+    return Frames(tuple(map(str, images)), camera, depths, depth_scale)
+
+
+def _files(frames: Sequence[ImageLike], folder: Path) -> list[Path]:
+    if all(map(is_path, frames)):
+        if any(str(frame).startswith(SCENE) for frame in frames):
+            raise DataError("a rendered scene is a sequence by itself", found=[*frames])
+        return [as_path(frame, "image", home=True) for frame in frames]
+    names, place = [f"{k:04d}.png" for k in range(len(frames))], _written_frames(folder)
+    with staged(place, whole=True) as new:
+        for name, frame in zip(names, frames):
+            write_png(new / name, image_of(frame, f"frame {name}"))
+    return [place / name for name in names]
+
+
+def _written_frames(folder: Path) -> Path:
+    """Folder of frames that are written for a chain; DataError if a file or link is in its way."""
+    claim(folder, ["frames/-"], overwrite=True)
+    return folder / "frames"
+
+
 def find_images(source: Path) -> list[Path]:
     """Images, two at least, of a folder or pattern such as `clip/*.jpg`, in order of their numbers.
 
@@ -133,11 +214,8 @@ def find_depths(images: list[Path]) -> list[Path]:
     for path in images:
         stem = path.stem.replace("frame_", "depth_")
         beside = [path.with_name(stem + suffix) for suffix in DEPTHS]
-        depths = [p for p in beside if p.is_file() and p != path]
-        if not depths:
-            return []
-        out.append(depths[0])
-    return out
+        out += [p for p in beside if p.is_file() and p != path][:1]
+    return out if len(out) == len(images) else []
 
 
 def numbered_files(folder: Path, kinds: Sequence[str], what: str, first: str = "") -> list[Path]:
@@ -152,6 +230,23 @@ def numbered_files(folder: Path, kinds: Sequence[str], what: str, first: str = "
     if not files:
         raise DataError(f"there is no {what}", where=folder, expected=f"files {', '.join(kinds)}")
     return in_order(files)
+
+
+def files_of_pairs(keys: Raw, count: int, stride: int) -> dict[tuple[str, str], list[Path]]:
+    """Files of every pair, by section and key of the problem that name their folder or pattern."""
+    out = {}
+    for (section, key), kinds in OF_PAIRS.items():
+        name = (keys.get(section) or {}).get(key)
+        if not isinstance(name, str | Path) or not ("*" in str(name) or is_folder(name)):
+            continue
+        found = numbered_files(Path(name), kinds, f"{section}.{key}")
+        if stride != 1:
+            raise ConfigError("files of pairs need all frames", where="stride", expected="1")
+        if len(found) < count:
+            expected = f"one for each of {count} pairs"
+            raise DataError("a file is missing", where=name, found=len(found), expected=expected)
+        out[section, key] = [path.absolute() for path in found]
+    return out
 
 
 def check_sizes(images: Sequence[Path], turn: bool) -> None:

@@ -17,7 +17,6 @@ from soup_nlp.report.verdict import sectioned
 from soup_nlp.sequence.links import MOST_DRAWN
 from soup_nlp.storage.files import read_text
 
-AFFINE = Convention("affine")
 AVERAGED = ("mre_own_scale", "mre_one_scale", "mre_affine", "rmse", "delta1")
 """Scores of frames of which a chain has the mean."""
 SAMPLES = 4_000_000
@@ -29,10 +28,8 @@ def score(
 ) -> dict[str, Any] | None:
     """Errors of depth and path; None without a truth.
 
-    Args:
-        chain: The chain.
-        truths: True depth (H, W) of every frame; None for that of the pairs.
-        poses: (K + 1, 4, 4) true world_from_camera; None for the motions of the pairs' truth.
+    `truths` are the true depths (H, W) of all frames, None for those of the pairs, and `poses`
+    (K + 1, 4, 4) the true world_from_camera, None for the motions of the pairs' truth.
 
     Returns:
         "frames": MRE of every frame with its own median scale ("own_scale"), with one for all
@@ -72,7 +69,7 @@ def score(
                 "frame": k,
                 "mre_own_scale": own.mre,
                 "mre_one_scale": one.mre,
-                "mre_affine": depth_metrics(z, true, AFFINE).mre,
+                "mre_affine": depth_metrics(z, true, Convention("affine")).mre,
                 "rmse": one.rmse,
                 "delta1": one.delta1,
                 "own_scale": factor,
@@ -134,13 +131,13 @@ def score_lines(scores: Mapping[str, Any] | None) -> list[str]:
     """Scores by frame as lines of text."""
     if scores is None:
         return ["the truth knows no pixel of any frame"]
-    heads = ("frame", "own scale", "one scale", "scale, shift", "RMSE", "d<1.25", "coverage")
+    heads = ("own scale", "one scale", "scale, shift", "RMSE", "d<1.25", "coverage")
     rows = [
         f"{f['frame']:>5}{f['mre_own_scale']:>13.4f}{f['mre_one_scale']:>13.4f}"
         f"{f['mre_affine']:>13.4f}{f['rmse']:>13.4g}{f['delta1']:>13.1%}{f['coverage']:>13.1%}"
         for f in scores["frames"]
     ]
-    head = f"{heads[0]:>5}" + "".join(f"{word:>13}" for word in heads[1:])
+    head = "frame" + "".join(f"{word:>13}" for word in heads)
     title = "MRE (Abs Rel) of the depth by its scale, no depth cap; RMSE and delta with one scale"
     return [title, head, *rows, score_text(scores)]
 

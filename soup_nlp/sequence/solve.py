@@ -1,6 +1,5 @@
 """A sequence from any source, solved into a folder: `soup_nlp.chain` and its command."""
 
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
@@ -11,8 +10,7 @@ from typing import Unpack
 
 import numpy as np
 
-from soup_nlp.config.problem import Problem, title
-from soup_nlp.data.accept import ImageLike, image_of, is_path
+from soup_nlp.config.problem import Problem
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
@@ -20,43 +18,26 @@ from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.pipeline.run import ProblemKeys, sections
 from soup_nlp.report import pairs as stored
 from soup_nlp.report.chain import Chain
-from soup_nlp.report.figures import write_png
 from soup_nlp.sequence.folder import CHAIN, SINGLE, chain_files, read_pairs, write_chain
 from soup_nlp.sequence.frames import (
-    DEPTHS,
-    FLOWS,
     Frames,
     Raw,
-    check_sizes,
-    find_depths,
-    find_images,
-    is_video,
-    numbered_files,
+    Source,
+    files_of_pairs,
+    find_frames,
+    named,
     pair_name,
-    video_frames,
 )
 from soup_nlp.sequence.links import make_chain
 from soup_nlp.storage.each import Row, Say, append_row, each, failed
-from soup_nlp.storage.files import as_path, is_file, is_folder
+from soup_nlp.storage.files import as_path, is_file
 from soup_nlp.storage.folders import claim, staged
 
-SCENE = "scene:"
-"""Prefix of the name of a rendered scene."""
-OF_PAIRS: Raw = {"output": {"page": False}, "refine": {"rounds": 1}}
+DEFAULTS: Raw = {"output": {"page": False}, "refine": {"rounds": 1}}
 """Keys of every pair unless others are given: the sequence has its own page, and one round of the
 refinement does most of its work."""
-FILES = {
-    ("flow", "source"): FLOWS,
-    ("flow", "backward"): FLOWS,
-    ("flow", "confidence"): (".npy", ".png"),
-    ("depth_prior", "source"): DEPTHS,
-}
-"""Keys that may name a folder with a file for each pair, and the suffixes of these."""
 PROBED = 3
 """Number of pairs whose flow measures a focal length that is not known."""
-
-Source = str | Path | Sequence[ImageLike]
-"""Folder or pattern of images, video, scene:NAME, or a list of files, arrays or PIL images."""
 
 
 def solve_chain(
@@ -99,8 +80,7 @@ def solve_chain(
             pair, in the order of their numbers.
 
     Raises:
-        ConfigError: two cameras are given, the stride or a key is wrong, a scene is unknown or has
-            another stride.
+        ConfigError: two cameras are given, or the stride, a key or a scene is wrong.
         DataError: the frames are no sequence, one is damaged, or the folder holds the result of
             another one.
         SolverError: a pair cannot be solved; the others are kept.
@@ -118,12 +98,12 @@ def solve_chain(
     claim(folder, SINGLE, overwrite, subject)
     # every solve gives the warnings of its images
     with warnings.catch_warnings(action="ignore", category=DataWarning):
-        chosen = _frames(source, folder, camera, stride, frames, depth_scale)
+        chosen = find_frames(source, folder, camera, stride, frames, depth_scale)
     common = sections(keys, "chain")
-    for section, defaults in OF_PAIRS.items():
+    for section, defaults in DEFAULTS.items():
         common[section] = {**defaults, **common.get(section, {})}
     count = len(chosen)
-    files = _files_of_pairs(common, count - 1, stride)
+    files = files_of_pairs(common, count - 1, stride)
     chosen = replace(chosen, files=files, keys=common, overrides=overrides)
     # a wrong key or scene is found before the first pair is solved
     chosen.problem(0)
@@ -149,23 +129,6 @@ def solve_chain(
     chain = make_chain(read_pairs(folder, count - 1))
     with staged(folder, whole=True, overwrite=overwrite, subject=subject) as new:
         return write_chain(new, chain, name, chosen.names)
-
-
-def _files_of_pairs(keys: Raw, count: int, stride: int) -> dict[tuple[str, str], list[Path]]:
-    """Files of every pair, by section and key of the problem that name their folder or pattern."""
-    out = {}
-    for (section, key), kinds in FILES.items():
-        name = (keys.get(section) or {}).get(key)
-        if not isinstance(name, str | Path) or not ("*" in str(name) or is_folder(name)):
-            continue
-        found = numbered_files(Path(name), kinds, f"{section}.{key}")
-        if stride != 1:
-            raise ConfigError("files of pairs need all frames", where="stride", expected="1")
-        if len(found) < count:
-            expected = f"one for each of {count} pairs"
-            raise DataError("a file is missing", where=name, found=len(found), expected=expected)
-        out[section, key] = [path.absolute() for path in found]
-    return out
 
 
 def solve_pairs(
@@ -235,77 +198,3 @@ def one_camera(frames: Frames) -> Frames:
         stacklevel=3,
     )
     return replace(frames, camera={**frames.camera, "fov": fov, "focal_sigma": sigma})
-
-
-def named(frames: Source, folder: Path | None = None) -> tuple[str, str]:
-    """Name of a sequence, and the subject of its output folder: what it is the result of.
-
-    Images in memory are named after the folder.
-    """
-    if isinstance(frames, str) and frames.startswith(SCENE):
-        return title(frames.removeprefix(SCENE)), frames
-    first = frames if isinstance(frames, str | Path) else next(iter(frames), None)
-    if not isinstance(first, str | Path):
-        folder = Path(folder or "chain").absolute()
-        return folder.name, f"sequence of images in memory for {folder}"
-    path = as_path(first, "frames", home=True).absolute()
-    # several images, or a pattern, are named after their folder
-    if first is not frames or not path.exists():
-        path = path.parent
-    return title(path.stem if path.is_file() else path.name), f"sequence {path}"
-
-
-def _frames(
-    source: Source,
-    out: Path,
-    camera: Raw,
-    stride: int,
-    most: int | None,
-    depth_scale: float | None,
-) -> Frames:
-    """The frames of a source."""
-    if isinstance(source, str) and source.startswith(SCENE):
-        if stride != 1 or camera:
-            raise ConfigError("a rendered scene has its own camera and steps", found=source)
-        scene = source.removeprefix(SCENE)
-        return Frames(tuple(f"{scene}: frame {k}" for k in range(most or 10)), scene=scene)
-    depths = list[Path]()
-    if not isinstance(source, str | Path):
-        images = _files(source, out)[::stride][:most]
-    elif is_video(path := as_path(source, "frames", home=True)):
-        images = video_frames(path, _written_frames(out), stride, most)
-    else:
-        images = find_images(path)[::stride][:most]
-        depths = [] if "undistort" in camera else find_depths(images)
-    if len(images) < 2:
-        raise ConfigError(
-            "a sequence needs two frames at least",
-            where="stride" if stride != 1 else None,
-            found=len(images),
-            expected="more frames, or a smaller stride",
-        )
-    images, depths = ([p.absolute() for p in paths] for paths in (images, depths))
-    beside = images[0].parent / "K.txt"
-    if not camera.keys() & {"intrinsics", "fov"} and os.path.lexists(beside):
-        camera = {"intrinsics": str(beside), **camera}
-    check_sizes(images, turn="intrinsics" not in camera)
-    return Frames(tuple(map(str, images)), camera, depths, depth_scale)
-
-
-def _files(frames: Sequence[ImageLike], folder: Path) -> list[Path]:
-    """Files of images; arrays are written into the folder of the chain."""
-    if all(is_path(frame) for frame in frames):
-        if any(str(frame).startswith(SCENE) for frame in frames):
-            raise DataError("a rendered scene is a sequence by itself", found=[*frames])
-        return [as_path(frame, "image", home=True) for frame in frames]
-    names, place = [f"{k:04d}.png" for k in range(len(frames))], _written_frames(folder)
-    with staged(place, whole=True) as new:
-        for name, frame in zip(names, frames):
-            write_png(new / name, image_of(frame, f"frame {name}"))
-    return [place / name for name in names]
-
-
-def _written_frames(folder: Path) -> Path:
-    """Folder of frames that are written for a chain; DataError if a file or link is in its way."""
-    claim(folder, ["frames/-"], overwrite=True)
-    return folder / "frames"
