@@ -1,6 +1,6 @@
 """Folders of results and chains: read, checked, shown and converted; that of a chain written."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NotRequired
@@ -9,7 +9,6 @@ import numpy as np
 from annotated_types import Len
 from typing_extensions import TypedDict
 
-from soup_nlp.arrays import Float
 from soup_nlp.errors import DataError
 from soup_nlp.report.chain import AXES, Chain, Lazy
 from soup_nlp.report.check import CheckReport, Claim, check_folder, written
@@ -54,13 +53,8 @@ def is_chain(folder: Path) -> bool:
 def load(folder: str | Path) -> Result | Chain:
     """A result of `solve`, `import` or `Run.save`, or a chain: depth, points, sigma, motions.
 
-    `reconstruction`, `components`, `camera` and `metrics` of a result are those of the `Run`.
-
-    Args:
-        folder: Its folder.
-
-    Raises:
-        DataError: the folder holds neither, or a damaged one.
+    `reconstruction`, `components`, `camera` and `metrics` of a result are those of the `Run`. A
+    folder that holds neither, or a damaged one, is a DataError.
     """
     folder = as_path(folder, "result folder")
     return read_chain(folder) if is_chain(folder) else load_pair(folder)
@@ -91,11 +85,11 @@ def check(folder: Path) -> CheckReport:
         right = float(check_folder(folder / PAIRS / pair_name(k)).ok)
         claims.append(Claim(f"pair {pair_name(k)}: every claim", 1.0, right))
     poses = np.array([m.matrix for m in chain.world_from_camera])
-    arrays: Mapping[str, tuple[Any, Float]] = {
-        "scales by the pairs": ([row["scale"] for row in chain.summary["scales"]], chain.scales),
-        "camera poses by pairs and scales": (chain.summary["world_from_camera"], poses),
-    }
-    for name, (stored, found) in arrays.items():
+    scales = [row["scale"] for row in chain.summary["scales"]]
+    for name, stored, found in (
+        ("scales by the pairs", scales, chain.scales),
+        ("camera poses by pairs and scales", chain.summary["world_from_camera"], poses),
+    ):
         # null in JSON becomes NaN, which is no rounding error
         claimed = np.array(stored, float)
         gap = float(np.abs(claimed - found).max()) if claimed.shape == found.shape else np.inf
@@ -123,8 +117,8 @@ def convert(
         return write_formats(new, chain, names)
 
 
-def renew_page(folder: Path) -> Path:
-    """Make the page of a result or a chain again, unless it was changed; returns its path."""
+def renew_page(folder: Path) -> None:
+    """Make the page of a result or a chain again, unless it was changed."""
     found = chain_of(folder)
     with staged(folder) as new:
         try:
@@ -132,11 +126,10 @@ def renew_page(folder: Path) -> Path:
         except (KeyError, ValueError, IndexError, TypeError) as error:
             lacks, hint = "result lacks what a page shows", "solve it again"
             raise DataError(lacks, where=folder, found=repr(error), hint=hint) from error
-    return folder / PAGE
 
 
 def chain_files(count: int) -> list[str]:
-    """Names of the files of a chain of `count` frames."""
+    """Files of a chain of `count` frames."""
     return [*SINGLE, *(f"depth/{k:04d}.png" for k in range(count))]
 
 
@@ -152,8 +145,8 @@ def write_chain(folder: Path, chain: Chain, name: str, sources: Sequence[str]) -
         write_depth_png16(folder / "depth" / f"{frame.name}.png", frame.depth, scale)
     contents = {"name": name, "sources": list(sources), **summary(chain)}
     contents |= {"depth_png_scale": scale, "score": score(chain)}
-    contents["verdict"] = chain_lines(replace(chain, summary=contents))
     chain = replace(chain, summary=contents)
+    contents["verdict"] = chain_lines(chain)
     write_json(folder / CHAIN, contents)
     write_formats(folder, chain, ["tum"])
     write_text(folder / PAGE, page(chain))
@@ -171,10 +164,7 @@ def summary(chain: Chain) -> dict[str, Any]:
             {
                 "pairs": [k.first, k.second],
                 "ratio": float(np.exp(k.log_ratio)),
-                "spread": k.spread,
-                "pixels": k.pixels,
-                "bridge": k.bridge,
-                "flagged": k.flagged,
+                **{name: getattr(k, name) for name in ("spread", "pixels", "bridge", "flagged")},
             }
             for k in chain.links
         ],

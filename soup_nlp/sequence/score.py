@@ -49,18 +49,18 @@ def score(
 
     if truths is None and not chain.pairs[0].tree["truth"]:
         return None
-    own_scale, ratios, frames = dict[int, float](), list[Float](), []
+    scored, ratios, frames = list[int](), list[Float](), []
     for k, frame in enumerate(chain):
         if (true := truth(k)) is not None:
             z, step = frame.depth, max(1, -(-frame.depth.size * len(chain) // SAMPLES))
             compared = MEDIAN.mask(true) & (z > 0)
             # of a long chain, the median over some pixels of every frame
             ratios.append((true[compared] / z[compared])[::step])
-            own_scale[k] = depth_metrics(z, true).scale
-    if not own_scale:
+            scored.append(k)
+    if not scored:
         return None
     scale = float(np.median(np.concatenate(ratios)))
-    for k, factor in own_scale.items():
+    for k in scored:
         z, true = chain.depth(k), truth(k)
         assert true is not None
         own, one = depth_metrics(z, true), depth_metrics(scale * z, true, UNSCALED)
@@ -72,7 +72,7 @@ def score(
                 "mre_affine": depth_metrics(z, true, Convention("affine")).mre,
                 "rmse": one.rmse,
                 "delta1": one.delta1,
-                "own_scale": factor,
+                "own_scale": own.scale,
                 "coverage": own.coverage,
             }
         )
