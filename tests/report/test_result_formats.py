@@ -155,8 +155,9 @@ def test_cameras_with_skew_have_no_colmap_model(tmp_path, result):
         write_formats(tmp_path, Chain.of(replace(result, tree=tree)), ["colmap"])
 
 
-def test_depth_is_read_by_numpy_and_opencv(tmp_path, result):
-    write_formats(tmp_path, Chain.of(result), ["npy", "pfm"])
+def test_maps_are_read_by_numpy_opencv_and_pillow(tmp_path, result):
+    names = write_formats(tmp_path, Chain.of(result), ["npy", "pfm", "masks", "flow"])
+    assert set(names) == {p.name for p in tmp_path.iterdir()}
     for name, depth in zip(("ref", "next"), result.depths):
         known = np.isfinite(depth)
         found = np.load(tmp_path / f"depth_{name}.npy")
@@ -164,6 +165,17 @@ def test_depth_is_read_by_numpy_and_opencv(tmp_path, result):
         found = cv2.imread(str(tmp_path / f"depth_{name}.pfm"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(found, np.where(known, depth, np.inf).astype(np.float32))
         np.testing.assert_array_equal(read_pfm(tmp_path / f"depth_{name}.pfm")[known], found[known])
+        labels, moving = (
+            np.asarray(Image.open(tmp_path / f"{k}_{name}.png")) for k in ("components", "moving")
+        )
+        assert labels.dtype == moving.dtype == np.uint8
+        np.testing.assert_array_equal(moving, 255 * (labels > 0))
+        # the board comes nearer
+        assert (moving > 0).mean() == pytest.approx(board().mean(), rel=0.3 * (name == "next"))
+    uv = cv2.readOpticalFlow(str(tmp_path / "flow_ref.flo"))
+    np.testing.assert_array_equal(uv, result.flow.astype(np.float32))
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / "K.txt"), K)
+    np.testing.assert_array_equal(np.load(tmp_path / "sigma_ref.npy"), np.float32(result.sigma))
 
 
 @pytest.mark.slow
@@ -177,44 +189,26 @@ def test_recordings_are_read_by_rerun(tmp_path, result):
     assert [rows.get(f"/world/{name}") for name in both] == [2] * 4
 
 
-def test_the_trajectory_of_a_pair(tmp_path, result):
-    assert write_formats(tmp_path, Chain.of(result), ["tum"]) == ["trajectory.tum"]
-    # it holds ref_from_camera
+def test_the_path_of_a_pair_is_ref_from_camera(tmp_path, result):
+    names = write_formats(tmp_path, Chain.of(result), ["tum", "kitti"])
+    assert names == ["trajectory.tum", "poses.txt"]
     first, second = np.loadtxt(tmp_path / "trajectory.tum")
     np.testing.assert_allclose(first, [0, 0, 0, 0, 0, 0, 0, 1])
     np.testing.assert_allclose(second[1:4], CAMERA.centre, atol=1e-8)
     found = Rotation.from_quat(second[4:]).as_matrix()
     np.testing.assert_allclose(found, CAMERA.R.T, atol=1e-8)
-
-
-def test_masks_flow_cameras_and_poses_are_plain_files(tmp_path, result):
-    names = write_formats(tmp_path, Chain.of(result), ["masks", "flow", "npy", "kitti"])
-    assert set(names) == {p.name for p in tmp_path.iterdir()}
-    for name, share in (("ref", board().mean()), ("next", None)):
-        labels, moving = (np.asarray(Image.open(tmp_path / f"{k}_{name}.png")) for k in MASKS)
-        assert labels.dtype == moving.dtype == np.uint8
-        np.testing.assert_array_equal(moving, 255 * (labels > 0))
-        assert (moving > 0).mean() == pytest.approx(share or board().mean(), rel=0.3 * (not share))
-    uv = cv2.readOpticalFlow(str(tmp_path / "flow_ref.flo"))
-    np.testing.assert_array_equal(uv, result.flow.astype(np.float32))
-    np.testing.assert_array_equal(np.loadtxt(tmp_path / "K.txt"), K)
-    np.testing.assert_array_equal(np.load(tmp_path / "sigma_ref.npy"), np.float32(result.sigma))
     first, second = np.loadtxt(tmp_path / "poses.txt").reshape(2, 3, 4)
     np.testing.assert_allclose(first, np.eye(4)[:3])
     np.testing.assert_allclose(second, np.linalg.inv(CAMERA.matrix)[:3], atol=1e-8)
 
 
-MASKS = "components", "moving"
-
-
 def test_transforms_project_points_where_the_cameras_see_them(tmp_path, result):
     write_formats(tmp_path, Chain.of(result), ["transforms"])
     told = json.loads((tmp_path / "transforms" / "transforms.json").read_text())
-    point = np.array(
-        [*result.reconstruction.points_ref[30, 10] * [1, -1, -1], 1]
-    )  # on the wall, y up
-    where = [np.array([10, 30]), np.array([10, 30]) + result.reconstruction.flow[30, 10]]
-    for frame, at in zip(told["frames"], where, strict=True):
+    rec, start = result.reconstruction, np.array([10, 30])
+    # on the wall, y up
+    point = np.array([*rec.points_ref[30, 10] * [1, -1, -1], 1])
+    for frame, at in zip(told["frames"], (start, start + rec.flow[30, 10]), strict=True):
         x, y, z, _ = np.linalg.inv(frame["transform_matrix"]) @ point
         uv = frame["fl_x"] * x / -z + frame["cx"], frame["fl_y"] * -y / -z + frame["cy"]
         np.testing.assert_allclose(uv, at + 0.5, atol=1e-6)
