@@ -273,26 +273,23 @@ class Chain:
         # the last frame is the next one of the last pair
         last = int(number == len(self.pairs))
         pair, tracks = self.pairs[number - last], self.tracks[number - last]
-        components, sigma = tracks[pair.components.of_pixel], pair.sigma
-        sure, labels, drawn = pair.sure, pair.labels, pair.drawn
-        if last:
-            components, labels = pair.in_next(components, -1), pair.in_next(labels, 0)
-            sigma, sure = pair.in_next(sigma, np.nan), pair.in_next(sure, False)
-            drawn = pair.in_next(drawn, False)
+        maps: dict[str, tuple[NDArray[Any], float]] = {
+            "sigma": (pair.sigma, np.nan),
+            "drawn": (pair.drawn, False),
+            "sure": (pair.sure, False),
+            "labels": (pair.labels, 0),
+            "components": (tracks[pair.components.of_pixel].astype(np.int32), -1),
+        }
         return Frame(
             name=self.names[number],
             image=pair.images[last],
             K=(pair.K, pair.K_next)[last],
             depth=pair.depths[last],
-            sigma=sigma,
-            drawn=drawn,
-            components=components.astype(np.int32),
             pose=self.world_from_camera[number],
-            sure=sure,
-            labels=labels,
             planes=pair.planes[last],
             flow=None if last else pair.flow,
             unit=self.unit,
+            **{name: pair.in_next(*x) if last else x[0] for name, x in maps.items()},
         )
 
     def __iter__(self) -> Iterator[Frame]:
