@@ -36,22 +36,11 @@ def test_a_name_or_unit_is_one_line_of_text(text: object) -> None:
         Pair(IMAGE, IMAGE, (8, 8, 3.5, 3.5), name=text)
 
 
-def test_the_source_of_a_flow_is_one_line() -> None:
-    flow = Flow(np.zeros((2, 2, 2)), source=HOSTILE)
-    assert str(flow).isprintable()
-
-
-def test_text_of_a_stored_file_is_one_line(tmp_path: Path) -> None:
+def test_text_of_a_flow_and_of_a_stored_file_is_one_line(tmp_path: Path) -> None:
+    assert str(Flow(np.zeros((2, 2, 2)), source=HOSTILE)).isprintable()
     (tmp_path / "a.json").write_text(json.dumps({"unit": HOSTILE, HOSTILE: [HOSTILE]}))
     stored = read_json(tmp_path / "a.json", "a", dict[str, Any])
-    for text in (stored["unit"], *stored, *stored[[*stored][1]]):
-        assert text.isprintable()
-
-
-def hostile_summary() -> dict[str, Any]:
-    name = HOSTILE.replace("\ud800", "")
-    told = {"name": name, "status": name, "converged": False, "certainty": CERTAINTY}
-    return {**told, "sources": [name] * 2, "verdict": [name]}
+    assert all(text.isprintable() for text in (stored["unit"], *stored, *stored[[*stored][1]]))
 
 
 def test_text_leaves_no_file_broken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -64,11 +53,14 @@ def test_text_leaves_no_file_broken(tmp_path: Path, capsys: pytest.CaptureFixtur
     FORMATS["tum"].whole["trajectory.tum"](tmp_path / "a.tum", chain)
     lines = (tmp_path / "a.tum").read_text().splitlines()
     assert [line[0] for line in lines] == ["#", "#", "0"]
-    shown = page(replace(Chain.of(small_result()), summary=hostile_summary()))
+    name = HOSTILE.replace("\ud800", "")
+    told = {"name": name, "status": name, "converged": False, "certainty": CERTAINTY}
+    told |= {"sources": [name] * 2, "verdict": [name]}
+    shown = page(replace(Chain.of(small_result()), summary=told))
     assert "<img src" not in shown
     assert "&lt;img src" in shown
     assert strip([Picture(HOSTILE, IMAGE)], HOSTILE).size
     with warnings.catch_warnings():
-        print_warning(HOSTILE.replace("\ud800", ""), DataWarning)
+        print_warning(name, DataWarning)
     said = capsys.readouterr().err
     assert said.removesuffix("\n").isprintable()

@@ -327,8 +327,12 @@ def test_a_chain_takes_the_keys_of_a_pair_and_files_of_every_pair(tmp_path):
         assert told["sizes"]["superpixels"] == pytest.approx(20, rel=0.3)
     assert (tmp_path / "out" / "pairs" / "000_001" / "log.txt").is_file()
     assert not (tmp_path / "out" / "pairs" / "000_001" / "report.html").exists()
-    for more, message in (({"stride": 2}, "all frames"), ({"frames": 3}, "one for each of 2")):
-        (tmp_path / "flow" / "1.npy").unlink(missing_ok=True)
+    (tmp_path / "flow" / "1.npy").unlink()
+    for more, message in (
+        ({"stride": 0}, "unknown stride"),
+        ({"stride": 2}, "all frames"),
+        ({"frames": 3}, "one for each of 2"),
+    ):
         with pytest.raises(SoupError, match=message):
             soup_nlp.chain(source, tmp_path / "more", intrinsics=camera, **{**keys, **more})
     with pytest.raises(ConfigError, match="superpixel"):
