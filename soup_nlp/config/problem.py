@@ -32,7 +32,7 @@ from soup_nlp.schema.section import (
     nearest,
 )
 from soup_nlp.solve.solver_options import SolverOptions, refuse_libraries
-from soup_nlp.start.start_options import StartOptions
+from soup_nlp.start.views import StartOptions
 from soup_nlp.storage.files import as_path, is_file, is_folder, read_text
 from soup_nlp.storage.folders import digest_of
 

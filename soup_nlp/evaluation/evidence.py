@@ -17,6 +17,7 @@ from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.start.bending import (
+    CLIP_PX,
     PLAIN_TURN,
     displaced,
     fit_robustly,
@@ -34,8 +35,6 @@ from soup_nlp.start.camera_error import (
 from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.regions import SCENE
 
-CLIP_PX = 3.0
-"""Limit of a superpixel's error where explanations are compared, pixels."""
 LEAST_MEMBERS = 3
 """Least number of superpixels with flow of a component whose depth can be known."""
 

@@ -28,8 +28,7 @@ from soup_nlp.start.occlusion import covering
 from soup_nlp.start.prior_evidence import JUDGED_PIECES, LEAST_SIGMA, PriorEvidence, judged
 from soup_nlp.start.propose import Start, most_usual, propose
 from soup_nlp.start.regions import TIES, TOO_FAST
-from soup_nlp.start.start_options import HOMOGRAPHY, SeededStart
-from soup_nlp.start.views import FlowFit
+from soup_nlp.start.views import FlowFit, SeededStart
 from soup_nlp.storage.progress import Watch
 from soup_nlp.storage.system import require_memory
 
@@ -138,8 +137,7 @@ STARTS = 3
 def _flow_fit(problem: Problem, pair: Pair, seg: Segmentation, sample: int = 0) -> FlowFit:
     """The flow of a pair as affine maps, fitted to one of its samples."""
     assert pair.flow is not None
-    own = HOMOGRAPHY if problem.start.method == "homography" else {}
-    options = SeededStart(**dict(problem.start), **own, seed=problem.seed ^ sample)
+    options = SeededStart(**dict(problem.start), seed=problem.seed ^ sample)
     return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, options)
 
 

@@ -41,7 +41,7 @@ from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined, RefineOptions
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
-from soup_nlp.start.start_options import StartOptions
+from soup_nlp.start.views import StartOptions
 from soup_nlp.storage.progress import Listener, Watch
 
 EXACT, EXACT_PARALLAX = 0.015, 1.0

@@ -1,12 +1,10 @@
 """Bending surfaces: flow discontinuities, surfaces, and an initialisation without relief.
 
 The flow is discontinuous along the outline of a rigid component that moves independently. On a
-bending surface it is continuous, but no single rigid motion explains it. If such a surface is cut
-into rigid pieces, each with its own parallax, the depths do not follow its shape.
-
-On a rigid surface one motion explains the flow of most superpixels, whatever else moves there; on
-a bending surface no motion does. The test does not depend on the number of superpixels or of rigid
-components.
+bending surface it is continuous, but no single rigid motion explains it: one explains the flow of
+most superpixels of a rigid surface, whatever else moves there. If a bending surface is cut into
+rigid pieces, each with its own parallax, the depths do not follow its shape. The test does not
+depend on the number of superpixels or of rigid components.
 """
 
 from collections.abc import Callable
@@ -18,25 +16,24 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.labelling import PIECE_SIZE, Labelling, candidates, dominant
+from soup_nlp.start.labelling import (
+    IN_NOISE,
+    LEAST_GAP_PX,
+    LEAST_SHARED,
+    PIECE_SIZE,
+    Labelling,
+    candidates,
+    dominant,
+)
 from soup_nlp.start.regions import connected_labels, connected_pieces, numbered
-from soup_nlp.start.views import FlowFit, Views
+from soup_nlp.start.views import JUMP_PX, FlowFit, Views
 
 REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
 with the diameter of the superpixel."""
-RELIEF = 0.5
-"""Standard deviation of log depth within a scene."""
-AT_REST = 0.8
-"""Least ratio of what a turn explains to what the main rigid motion explains, if the camera
-rests."""
-LEAST_GAP, TURN_PX, TURN_SHARE = 3.0, 0.03, 9e-5
-"""Error up to which a motion explains the flow: in units of the flow's noise, and in pixels, or as
-a share of the longer side of a small image."""
-LEAST_GAP_PX = 0.5
-"""Pixels by which depths must explain the flow of a component better than one depth or a turn, at
-least `LEAST_GAP` noises of the flow, so that it determines them; from a third on it may confirm a
-prior."""
+AT_REST, TURN_SHARE = 0.8, 9e-5
+"""Least ratio of what a turn explains to what the main rigid motion explains, if the camera rests,
+and the error up to which it explains the flow, as a share of the longer side of a small image."""
 MATRIX_STEP, LEAST_MOVED_DEPTH = 1e-5, 1e-3
 """Step by which matrices of motions are differentiated, and least depth of a moved point."""
 FIT_PIXELS, LEAST_SCALE = 3000, 0.02
@@ -45,7 +42,7 @@ FIT_PIXELS, LEAST_SCALE = 3000, 0.02
 
 def least_gap(noise: float) -> float:
     """Pixels of relief that determine the depth of a component, by the noise of the flow."""
-    return max(LEAST_GAP_PX, LEAST_GAP * noise)
+    return max(LEAST_GAP_PX, IN_NOISE * noise)
 
 
 def reference_noise(residual: Float) -> float:
@@ -57,16 +54,16 @@ def turn_alone(flow: FlowFit, choice: Labelling) -> Float | None:
     """The camera's (3, 3) rotation, if a turn explains nearly as much as the main motion does.
 
     Of what is seen it explains at least `AT_REST` of the superpixels that the main rigid motion
-    explains with depths. Explained is an error of at most `LEAST_GAP` noises beyond that of an
-    affine flow, or of `TURN_PX` (in a small image `TURN_SHARE` of its longer side). A zoom and a
-    shift of the next image are free, because they leave a residual that depths explain; the
+    explains with depths. Explained is an error of at most `IN_NOISE` noises beyond that of an
+    affine flow, or of `LEAST_SHARED` (in a small image `TURN_SHARE` of its longer side). A zoom and
+    a shift of the next image are free, because they leave a residual that depths explain; the
     rotation itself, which a shift can replace, is that of the plain turn.
     """
     at = np.flatnonzero(flow.views.usable)
     if not len(at):
         return None
-    least = min(TURN_PX, TURN_SHARE * max(flow.seg.labels.shape))
-    most = max(least, LEAST_GAP * reference_noise(flow.residual))
+    least = min(LEAST_SHARED, TURN_SHARE * max(flow.seg.labels.shape))
+    most = max(least, IN_NOISE * reference_noise(flow.residual))
     rigid = (choice.label == 0) & (choice.excess < most)
     turned = fit_turn(flow.views.subset(at), ANY_TURN)[1] - flow.residual[at] < most
     if not turned.any() or turned.sum() < AT_REST * rigid[at].sum():
@@ -96,6 +93,10 @@ def displaced(x: Float) -> Float:
     return np.concatenate([R, T], axis=-1)
 
 
+CLIP_PX = 3.0
+"""Limit of a superpixel's error where explanations are compared, pixels."""
+
+
 def trimmed_mean(error: Float) -> float:
     """Mean error without the largest tenth, which a component may include by mistake."""
     return float(np.mean(np.sort(error)[: max(1, int(np.ceil(0.9 * len(error))))]))
@@ -107,12 +108,9 @@ def fit_robustly(
     """(7,) parameters with the least Cauchy loss of points off their targets, by narrowing scales,
     and (M, 2) distances there, pixels.
 
-    Args:
-        matrix: `turned` or `displaced`, matrices (..., 3, C) by parameters.
-        size: Number of parameters that are free; the others are 0.
-        point: (M, C) points.
-        target: (M, 2) rays to which they move, without the third component.
-        scale: (M, 2) weights of the distances, pixels per ray unit.
+    The first `size` parameters of the matrices (..., 3, C), `turned` or `displaced`, are free, the
+    others 0. They move points (M, C) to target rays (M, 2), without their third component; `scale`
+    (M, 2) weighs the distances, pixels per ray unit.
     """
     point, target, scale = point.T, target.T, scale.T
     free = np.eye(ANY_TURN)[:size]
@@ -153,9 +151,8 @@ def moving_pieces(flow: FlowFit) -> Int:
     0 is everything that the turn explains, the others are connected pieces of what moves. Those
     with too few superpixels whose flow is usable count as still.
     """
-    jump = flow.options.discontinuity_px
-    still = fit_turn(flow.views)[1] < jump
-    piece = connected_labels(~flow.seg.across(still) & (flow.jump < jump), flow.seg)
+    still = fit_turn(flow.views)[1] < JUMP_PX
+    piece = connected_labels(~flow.seg.across(still) & (flow.jump < JUMP_PX), flow.seg)
     still |= np.bincount(piece, flow.views.usable)[piece] < PIECE_SIZE
     return numbered(np.where(still, -1, piece))
 
@@ -190,14 +187,8 @@ def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float
     """Fronto-parallel superpixels at depth 1 in both frames, rotated in the image plane.
 
     Two views of a bending surface do not determine its relief. An initialisation without relief
-    favours none, and the energy determines it.
-
-    Args:
-        views: Rays, targets and confidence of every superpixel.
-        turn: (3, 3) rotation of the camera, applied last; None for the identity.
-
-    Returns:
-        The soup, mean plane distance 1, and (N,) its mean re-projection error in pixels.
+    favours none, and the energy determines it. The camera's rotation `turn` (3, 3) is applied last.
+    Returns the soup, mean plane distance 1, and (N,) its mean re-projection error in pixels.
     """
     turn = np.eye(3) if turn is None else turn
     w = views.weight + 1e-9
@@ -246,16 +237,13 @@ MOST_NOISES, LEAST_NOISES, LEAST_EXCESS_PX, MOST_EXCESS_PX = 2.5, 4.0, 0.01, 0.0
 
 
 def surface_motions(flow: FlowFit, surface: Int) -> tuple[list[Motion], Mask]:
-    """The best rigid motion of each surface (N,) that does not bend, and which surfaces bend.
+    """The motion that most of the image shares, the best one of each surface (N,) that does not
+    bend, and (N,) True where the surface bends.
 
     A surface bends if the best rigid motion leaves a median excess over the residual of affine
     flows that noise does not explain, or from which depth, which explains what a turn alone does
     not, stands out less than `TELLS` times: an error shared along the epipolar lines would then
     cause much of the relief.
-
-    Returns:
-        The motion that most of the image shares and those of the surfaces, and (N,) True where the
-        surface bends.
     """
     views, usable = flow.views, flow.views.usable
     noise = reference_noise(flow.residual)

@@ -1,4 +1,10 @@
-"""Rigid two-view motion from flow: robust estimation and refinement."""
+"""Rigid two-view motion from flow: robust estimation, refinement, and the choice of a motion.
+
+A small turn and a small translation move an image almost alike (the bas-relief ambiguity). Motions
+whose residuals differ by less than the systematic error of the flow explain it equally well, and
+their depths range from a flat scene to one that recedes to infinity. Among them the one whose log
+depths vary as scenes do is the most probable (`most_probable`).
+"""
 
 from __future__ import annotations
 
@@ -13,14 +19,23 @@ from scipy.optimize import least_squares
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 
-REFINEMENTS, EVALUATIONS = 5, 30
-"""Largest number of robust fits of a motion, each with the noise estimated by the last, and of
-evaluations of a fit."""
+LEAST_MATCHES = 8
+"""Least number of correspondences that determine a motion, or tell anything of a depth."""
+REFINEMENTS, EVALUATIONS, TRANSLATION_FITS = 5, 30, 6
+"""Largest number of robust fits of a motion, each with the noise estimated by the last, of
+evaluations of a fit, and of re-weighted fits of a translation."""
 LEAST_WIDTH = 0.01
 """Smallest scale of the robust loss, pixels."""
 MOTION_SIGMA = np.array([0.02] * 3 + [0.3] * 2)
 """Standard deviations of the change of a motion by `refine_near`: rotation in radians, direction of
 the translation."""
+RELIEF, MOST_RELIEF = 0.5, 3.0
+"""Standard deviation of log depth within a scene, and limit of a log depth relative to the median:
+points at infinity or behind the camera."""
+MOTION_CHANGE = np.array([0.01] * 3 + [0.1] * 2)
+"""Usual change of a motion by `most_probable`."""
+EPIPOLAR_PX = 0.3
+"""Scale of the Cauchy loss of epipolar distances, pixels."""
 
 
 @dataclass(frozen=True)
@@ -98,12 +113,7 @@ def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
 
 
 def estimate(matches: Matches, threshold: float = 1.0) -> Motion | None:
-    """Motion with the most inliers, or None if the correspondences do not determine one.
-
-    Args:
-        matches: Correspondences.
-        threshold: Inlier distance, pixels.
-    """
+    """Motion with the most inliers, up to a distance in pixels; None if nothing determines one."""
     motion = essential_motion(matches, threshold)
     return None if motion is None else refine(motion, matches, threshold)
 
@@ -115,7 +125,7 @@ def essential_motion(matches: Matches, threshold: float | None) -> Motion | None
     every time.
     """
     r, q, _, focal = matches
-    if len(r) < 8:
+    if len(r) < LEAST_MATCHES:
         return None
     try:
         E, _ = cv2.findEssentialMat(
@@ -185,24 +195,15 @@ def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
     return moved(x)
 
 
-def refine_near(
-    motion: Motion, matches: Matches, noise: float, prior: Float = MOTION_SIGMA, rounds: int = 8
-) -> Motion:
-    """Motion near a given one that lowers the robust Sampson distance.
+def refine_near(motion: Motion, matches: Matches, noise: float, rounds: int = 8) -> Motion:
+    """Motion near a given one that lowers the robust Sampson distance; `noise` is in pixels.
 
-    Re-weighted Gauss-Newton steps. A prior holds the directions that a small patch does not
-    determine.
-
-    Args:
-        motion: Where to begin.
-        matches: Correspondences.
-        noise: Flow noise, pixels.
-        prior: (5,) standard deviations of the change, see `MOTION_SIGMA`.
-        rounds: Gauss-Newton steps.
+    Re-weighted Gauss-Newton steps. A prior (`MOTION_SIGMA`) holds the directions that a small patch
+    does not determine.
     """
     # one row per coordinate, the pixels contiguous
     r, q = (np.ascontiguousarray(v.T) for v in (matches.ray, matches.target))
-    R, t, turn, stiff = motion.R, motion.t, np.zeros(3), prior**-2.0
+    R, t, turn, stiff = motion.R, motion.t, np.zeros(3), MOTION_SIGMA**-2.0
     for _ in range(rounds):
         y, basis = R @ r, tangent(t)
         cross = np.cross(y, q, axis=0)
@@ -253,20 +254,12 @@ def essential_slope(motion: Motion, x: Float) -> Float:
     return np.concatenate([by_turn, by_shift]).reshape(5, 9)
 
 
-TRANSLATION_FITS = 6
-"""Re-weighted fits of a translation."""
-
-
 def fit_translation(R: Float, matches: Matches, noise: float) -> Motion:
-    """Motion with a given rotation whose translation explains correspondences best.
+    """Motion with a given rotation (3, 3) whose translation explains correspondences best.
 
     The epipolar constraint `t . (R r x q) = 0` is linear in t, which is the eigenvector of the
-    re-weighted scatter matrix with the smallest eigenvalue.
-
-    Args:
-        R: (3, 3) rotation.
-        matches: Correspondences.
-        noise: Flow noise, pixels: errors beyond it are down-weighted.
+    re-weighted scatter matrix with the smallest eigenvalue. Errors beyond the noise, pixels, are
+    down-weighted.
     """
     r, q, weight, focal = matches
     normal, w, t = np.cross(r @ R.T, q), weight, np.zeros(3)
@@ -282,3 +275,53 @@ def _facing(motion: Motion, matches: Matches) -> Motion:
     """The motion with the sign of its translation that puts most points in front of the camera."""
     vote = matches.weight @ np.sign(triangulate(motion, matches.ray, matches.target)[0])
     return motion if vote >= 0 else Motion(motion.R, -motion.t)
+
+
+def most_probable(
+    motions: Sequence[Motion],
+    matches: Matches,
+    error: float,
+    expected: Float | float = 0.0,
+    spread: float = RELIEF,
+) -> Motion:
+    """The motion that minimises the mean squared epipolar distance and the relief.
+
+    `mean rho(e, EPIPOLAR_PX) / error^2 + mean rho(log(z / median z), spread) / spread^2`, with e
+    the Sampson distance and rho(x, c) = c^2 log(1 + x^2 / c^2) the Cauchy loss. It begins at each
+    of the motions; `error` is the systematic one of the flow, pixels. Relief, whose standard
+    deviation is `spread`, is counted from the `expected` log depth (M,) of a depth prior.
+    """
+    root, results = np.sqrt(matches.weight / matches.weight.sum()), []
+
+    def residual(motion: Motion) -> Float:
+        distance = cauchy(matches.distance(motion), EPIPOLAR_PX)
+        depth = cauchy(relief(motion, matches.ray, matches.target, expected), spread)
+        return np.concatenate([root * distance / error, root * depth / spread])
+
+    for moved in map(around, motions):
+        end = least_squares(
+            lambda x, moved=moved: residual(moved(x)),
+            np.zeros(5),
+            x_scale=MOTION_CHANGE,
+            max_nfev=EVALUATIONS,
+        )
+        results.append((float(end.cost), moved(end.x)))
+    return min(results, key=lambda result: result[0])[1]
+
+
+def cauchy(x: Float, scale: float) -> Float:
+    """x (M,) whose squares are its Cauchy losses."""
+    return scale * np.sqrt(np.log1p((x / scale) ** 2))
+
+
+def relief(motion: Motion, r: Float, q: Float, expected: Float | float = 0.0) -> Float:
+    """(M,) log depth of correspondences under a motion, relative to the expected log depth.
+
+    The median is 0, and values are limited to `MOST_RELIEF`.
+    """
+    z, _ = triangulate(motion, r, q)
+    inverse = np.exp(expected) / np.where(np.abs(z) < 1e-12, 1e-12, z)
+    middle = np.median(inverse)
+    if middle <= 0:
+        return np.full(len(r), MOST_RELIEF)
+    return -np.log(np.clip(inverse / middle, np.exp(-MOST_RELIEF), np.exp(MOST_RELIEF)))

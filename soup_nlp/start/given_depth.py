@@ -15,13 +15,8 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import least_gap
-from soup_nlp.start.prior_evidence import (
-    COMPARED,
-    LEAST_SIGMA,
-    PriorEvidence,
-    Seen,
-    without_gaps,
-)
+from soup_nlp.start.epipolar import LEAST_MATCHES
+from soup_nlp.start.prior_evidence import LEAST_SIGMA, PriorEvidence, Seen, without_gaps
 from soup_nlp.start.propose import Start
 from soup_nlp.start.regions import FIXED, SCENE, TIES
 from soup_nlp.start.views import FlowFit
@@ -69,12 +64,6 @@ def by_prior(
     scale from the prior. Depths of the scene that the flow determines correct the
     prior near them and tell its error. All superpixels whose depth the flow does not determine,
     and those that bend, take depth and slope of the prior.
-
-    Args:
-        start: Start without the prior.
-        pair: Images and depth prior.
-        flow: The flow of its superpixels.
-        evidence: Evidence of flow and image for the prior.
     """
     seg, anchor, n = flow.seg, flow.views.anchor, len(flow.seg)
     value, with_value, whole = without_gaps(pair, seg)
@@ -120,18 +109,15 @@ def by_prior(
 def _shaped(
     seen: Seen, soup: Soup, c: int, prior: Float, sigma: float, determined: bool
 ) -> tuple[Soup, Mask]:
-    """Soup with the planes and the motion of a rigid component by flow and prior.
+    """Soup with the planes and the motion of a rigid component by flow and prior, see `settled`.
 
     Unless the flow has determined the depth of component `c`, it takes the motion that fits the log
-    depth (N,) of the prior, whose standard deviation is sigma.
-
-    Returns:
-        The soup, and (N,) True for members of the component whose depth the flow determines.
+    depth (N,) of the prior.
     """
     start, use, views = seen.start, seen.members(c), seen.flow.views
     mask = start.component == c
     rigid = np.ptp(soup.R[mask], axis=0).max() < 1e-9 and np.any(soup.translation[mask][0])
-    if len(use) < COMPARED or not rigid:
+    if len(use) < LEAST_MATCHES or not rigid:
         firm = mask & ~start.borrowed
         return soup, firm if firm.any() else mask
     if not determined:
@@ -148,12 +134,9 @@ def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:
     """
 
     def along_rows(values: Float, focal: float) -> Float:
-        wide = np.pad(
-            values, ((0, 0), (SLOPE_REACH, SLOPE_REACH)), mode="reflect", reflect_type="odd"
-        )
-        return (
-            focal * (wide[:, 2 * SLOPE_REACH :] - wide[:, : -2 * SLOPE_REACH]) / (2 * SLOPE_REACH)
-        )
+        reach, span = (SLOPE_REACH, SLOPE_REACH), 2 * SLOPE_REACH
+        wide = np.pad(values, ((0, 0), reach), mode="reflect", reflect_type="odd")
+        return focal * (wide[:, span:] - wide[:, :-span]) / span
 
     K, index = pair.K_ref, np.arange(len(seg))
     change = along_rows(inverse, K[0, 0]), along_rows(inverse.T, K[1, 1]).T

@@ -29,18 +29,17 @@ from soup_nlp.start.epipolar import (
     Motion,
     estimate,
     fit_translation,
+    most_probable,
     refine_near,
 )
 from soup_nlp.start.regions import belonging, connected_labels, connected_pieces
-from soup_nlp.start.views import FlowFit
+from soup_nlp.start.views import JUMP_PX, FlowFit
 
-CLIP = 3.0
-"""Errors are clipped at this many pixels where motions are compared."""
 LEAST_NOISE, MOST_NOISE = 0.05, 0.6
 """Limits of the flow's noise, pixels."""
-SHARED_SCALE, LEAST_SHARED = 3.0, 0.03
-"""Error that the flow shares, in units of the median error under the best motions, and its least,
-pixels."""
+IN_NOISE, LEAST_SHARED = 3.0, 0.03
+"""Error that large parts of a flow share, so that it is no evidence: in units of the noise, which
+is the median error under the best motions, and its least, pixels."""
 MOST_COST, CHANGE_COST, PRICE = 8.0, 6.0, 0.04
 """Largest cost of a superpixel, half the cost of one that differs from all its neighbours, and
 price of a motion by the number of superpixels: half a percent of them, if no other motion explains
@@ -50,10 +49,12 @@ PROPOSAL_SURFACES, PROPOSAL_PIECES, PROPOSAL_ROUNDS = 12, 6, 3
 and of rounds of proposals."""
 PIECE_SIZE = 4
 """Least number of superpixels that determine a motion."""
-UNEXPLAINED = 0.25
-"""Share of `MOST_COST` from which on a motion does not explain a superpixel."""
+UNEXPLAINED = 2.0
+"""Cost of a superpixel from which on a motion does not explain it."""
 MOTION_PIXELS, SCENE_PIXELS = 1500, 6000
 """Largest number of pixels to which a motion is fitted, and that of the whole image."""
+EXACT_PX = 0.005
+"""Error below which a flow is exact, as a rendered one is, and leaves no motion open, pixels."""
 
 
 def limited_noise(error: Float) -> float:
@@ -97,35 +98,50 @@ class Labelling:
     @property
     def unexplained(self) -> Mask:
         """(N,) True where the motion does not explain the flow."""
-        return _price(self.excess, self.shared) > UNEXPLAINED * MOST_COST
+        return _cost(self.excess, self.shared) > UNEXPLAINED
 
 
 def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
     """The labelling of least energy among the given motions and those that are proposed here.
 
-    A surface (N,) is a connected part with continuous flow.
-
-    Superpixels without usable flow take the motion of the surface that they continue.
+    A surface (N,) is a connected part with continuous flow. Superpixels without usable flow take
+    the motion of the surface that they continue. Connected pieces that save less than the price of
+    a motion take the most frequent one.
     """
-    views, seen = flow.views, flow.views.usable & ~flow.poor
+    views, rows = flow.views, np.arange(len(flow.seg))
+    seen = views.usable & ~flow.poor
     if not seen.any():
-        return Labelling.of(flow, motions[:1], np.zeros(len(flow.seg), np.int64), LEAST_SHARED)
-    motions = motions + _of_surfaces(flow, seen, surface, motions[0])
+        return Labelling.of(flow, motions[:1], 0 * rows, LEAST_SHARED)
+    groups: list[tuple[Mask, list[Motion]]]
+    groups = [((surface == c) & seen, []) for c in _largest(surface[seen], PROPOSAL_SURFACES)]
+    noise = limited_noise(flow.residual[seen])
+    motions = motions + _proposed(flow, groups, motions[0], noise)
     for left in reversed(range(PROPOSAL_ROUNDS + 1)):
         error = views.fit(motions).penalised() - flow.residual[:, None]
         excess = np.maximum(error, 0.0)
-        shared = max(LEAST_SHARED, SHARED_SCALE * float(np.median(excess.min(axis=1)[seen])))
-        cost = views.weight.mean(axis=1)[:, None] * _price(excess, shared)
+        shared = max(LEAST_SHARED, IN_NOISE * float(np.median(excess.min(axis=1)[seen])))
+        cost = views.weight.mean(axis=1)[:, None] * _cost(excess, shared)
         used, label = _paying(flow, cost)
+        motions, cost = [motions[c] for c in used], cost[:, used]
         if left:
-            bad = seen & (
-                cost[np.arange(len(cost)), np.array(used)[label]] > UNEXPLAINED * MOST_COST
-            )
-            kept = [motions[c] for c in used]
-            motions = _refitted(flow, kept, label, seen, bad, shared / SHARED_SCALE)
+            bad = seen & (cost[rows, label] > UNEXPLAINED)
+            piece = connected_pieces(bad, flow.seg)
+            groups = [((label == c) & seen, [m]) for c, m in enumerate(motions)]
+            groups += [(piece == c, []) for c in _largest(piece[bad], PROPOSAL_PIECES)]
+            main = motions[int(np.argmax(np.bincount(label[seen], minlength=len(motions))))]
+            motions = motions + _proposed(flow, groups, main, shared / IN_NOISE)
     label = belonging(flow.seg, label, seen)
-    label = _earned(flow, np.where(seen[:, None], cost[:, used], 0.0), label)
-    return Labelling.of(flow, [motions[c] for c in used], label, shared)
+    cost = np.where(seen[:, None], cost, 0.0)
+    first = int(np.argmax(np.bincount(label)))
+    piece = connected_labels(~flow.seg.across(label), flow.seg)
+    saved = np.bincount(piece, cost[:, first] - cost[rows, label])
+    label = np.where(saved[piece] < price_of_motion(len(label)), first, label)
+    return Labelling.of(flow, motions, label, shared)
+
+
+def _largest(label: Int, most: int) -> Int:
+    """The most frequent labels, at most so many."""
+    return np.argsort(-np.bincount(label, minlength=1))[:most]
 
 
 def price_of_motion(count: int) -> float:
@@ -133,23 +149,21 @@ def price_of_motion(count: int) -> float:
     return max(MOST_COST, PRICE * count)
 
 
-def _price(excess: Float, shared: float) -> Float:
+def _cost(excess: Float, shared: float) -> Float:
     return np.clip(excess / shared - 1.0, 0.0, MOST_COST)
 
 
 def dominant(flow: FlowFit) -> Motion:
     """The motion that most of the image shares."""
-    matches = flow.views.matches().confident(SCENE_PIXELS)
-    return estimate(matches, flow.options.threshold_px) or SIDEWAYS
+    return estimate(flow.views.matches().confident(SCENE_PIXELS)) or SIDEWAYS
 
 
-def _of_surfaces(flow: FlowFit, seen: Mask, surface: Int, main: Motion) -> list[Motion]:
-    """Motions of the surfaces (N,) with the most superpixels that are seen."""
-    largest = np.argsort(-np.bincount(surface[seen]))[:PROPOSAL_SURFACES]
-    groups = [np.flatnonzero((surface == c) & seen) for c in largest]
-    scale = limited_noise(flow.residual[seen])
-    large = [at for at in groups if len(at) >= PIECE_SIZE]
-    return [m for at in large for m in candidates(flow, at, main, [], scale)]
+def _proposed(
+    flow: FlowFit, groups: list[tuple[Mask, list[Motion]]], main: Motion, scale: float
+) -> list[Motion]:
+    """Candidates for groups (N,) of superpixels that are large enough, each with its motions."""
+    large = [(np.flatnonzero(mask), own) for mask, own in groups if mask.sum() >= PIECE_SIZE]
+    return [m for at, own in large for m in candidates(flow, at, main, own, scale)]
 
 
 def candidates(
@@ -166,22 +180,6 @@ def candidates(
     refined = [refine_near(m, matches, scale) for m in (*present, shift)]
     own = estimate(matches, max(3 * noise, 0.3))
     return refined if own is None else [*refined, own]
-
-
-def _refitted(
-    flow: FlowFit, motions: list[Motion], label: Int, seen: Mask, bad: Mask, scale: float
-) -> list[Motion]:
-    """Motions with candidates for the superpixels of each and for pieces that none explains."""
-    main = motions[int(np.argmax(np.bincount(label[seen], minlength=len(motions))))]
-    piece = connected_pieces(bad, flow.seg)
-    large = np.argsort(-np.bincount(piece[bad], minlength=1))[:PROPOSAL_PIECES]
-    groups = [((label == c) & seen, [m]) for c, m in enumerate(motions)]
-    out = list(motions)
-    for mask, own in groups + [(piece == c, []) for c in large]:
-        at = np.flatnonzero(mask)
-        if len(at) >= PIECE_SIZE:
-            out += candidates(flow, at, main, own, scale)
-    return out
 
 
 def _paying(flow: FlowFit, cost: Float) -> tuple[list[int], Int]:
@@ -211,18 +209,10 @@ def _paying(flow: FlowFit, cost: Float) -> tuple[list[int], Int]:
         del used[int(np.argmin(saved))]
 
 
-def _earned(flow: FlowFit, cost: Float, label: Int) -> Int:
-    """(N,) labels, where connected pieces that save less than a price over the main one take it."""
-    main, rows = int(np.argmax(np.bincount(label))), np.arange(len(label))
-    piece = connected_labels(~flow.seg.across(label), flow.seg)
-    saved = np.bincount(piece, cost[:, main] - cost[rows, label])
-    return np.where(saved[piece] < price_of_motion(len(label)), main, label)
-
-
 def smooth(flow: FlowFit, cost: Float) -> Int:
     """(N,) labels that minimise costs (N, M) plus `CHANGE_COST` where neighbours differ, by TRW-S.
 
-    The weight of a neighbour is its share of the outlines times its affinity.
+    The weight of a neighbour is its share of the outlines, the less the more the flow jumps there.
     """
     (n, m), seg = cost.shape, flow.seg
     if m == 1 or not len(seg.pairs):
@@ -230,21 +220,34 @@ def smooth(flow: FlowFit, cost: Float) -> Int:
     i, k = seg.pairs.T
     length = seg.boundary_length.astype(float)
     outline = np.bincount(i, length, n) + np.bincount(k, length, n)
-    weight = CHANGE_COST * flow_affinity(flow) * length * (1 / outline[i] + 1 / outline[k])
+    weight = CHANGE_COST * np.exp(-2 * flow.jump / JUMP_PX) * length
+    weight = weight * (1 / outline[i] + 1 / outline[k])
     return solve_trws(cost, seg.pairs, weight[:, None, None] * (1 - np.eye(m)), max_iter=30).labels
 
 
-def flow_affinity(flow: FlowFit) -> Float:
-    """(P,) affinity of two neighbours: 1 where their flow is continuous, towards 0 at jumps."""
-    return np.exp(-2 * flow.jump / flow.options.discontinuity_px)
+def settle(flow: FlowFit, choice: Labelling) -> Labelling:
+    """The labelling with the most probable motion of every rigid component (`most_probable`).
+
+    The error that the flow of a component shares follows from what its motion leaves unexplained,
+    across the epipolar lines: along them, depth would explain it.
+    """
+    motions = list(choice.motions)
+    for c, motion in enumerate(motions):
+        at = np.flatnonzero((choice.label == c) & flow.views.usable)
+        if len(at) < PIECE_SIZE:
+            continue
+        error = IN_NOISE * float(np.median(choice.excess[at]))
+        if error > EXACT_PX:
+            motions[c] = most_probable([motion], flow.anchor_matches(at), error)
+    return Labelling.of(flow, motions, choice.label, choice.shared)
 
 
 # --- regions that stand still in the image of a moving camera -------------------------------------
 
-FIXED_PX = 1.0
-"""Mean displacement up to which a superpixel may stand still, pixels: it may reflect movers."""
-CONTRADICTED_PX = 0.5
-"""Least error of the best depth, pixels, beside the displacement."""
+LEAST_GAP_PX = 0.5
+"""Pixels by which one explanation of the flow must be better than another to refute it: the best
+depth than none, or depths than one depth or a turn, so that the flow determines the depth of a
+component. From a third on it may confirm a prior."""
 LEAST_SCENE = 0.6
 """Least share of the superpixels that the camera's motion explains; below it, the
 still part may be the scene."""
@@ -265,17 +268,16 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     """
     seg, views, usable = flow.seg, flow.views, flow.views.usable
     none, shift = np.zeros(len(seg), bool), views.distance(views.ray)
-    may = usable & (shift < FIXED_PX)
+    may = usable & (shift < JUMP_PX)
     if may.sum() < PIECE_SIZE or not np.array_equal(flow.K_ref, flow.K_next):
         return none, shift
     camera = dominant(flow.without(may | ~usable))
     error = views.fit([camera]).penalised()[:, 0]
-    if (error[usable] < CONTRADICTED_PX).sum() < LEAST_SCENE * usable.sum():
+    if (error[usable] < LEAST_GAP_PX).sum() < LEAST_SCENE * usable.sum():
         return none, shift
-    may &= error - shift > CONTRADICTED_PX
-    moves = ~usable | (error > CONTRADICTED_PX)
-    continuous = flow.jump < flow.options.discontinuity_px
-    piece = connected_labels(moves[seg.pairs].all(axis=1) & continuous, seg)
+    may &= error - shift > LEAST_GAP_PX
+    moves = ~usable | (error > LEAST_GAP_PX)
+    piece = connected_labels(moves[seg.pairs].all(axis=1) & (flow.jump < JUMP_PX), seg)
     count, still_count = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
     mostly = (still_count >= PIECE_SIZE) & (still_count >= LEAST_STILL * count)
     return may & mostly[piece], shift

@@ -14,18 +14,13 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.start.regions import numbered
-from soup_nlp.start.views import FlowFit
+from soup_nlp.start.views import JUMP_PX, FlowFit
 
-WIDEST_STRIP = 8
-"""Largest width of a strip beside an outline, pixels."""
-LEAST_STRIP = 3
-"""Least number of pixels of a strip."""
-CLOSING_PX = 1.0
-"""Least speed at which two regions close in on each other or part, pixels per frame."""
-CONTRAST = 8.0
-"""Least difference between the mean costs of both strips that tells the order, grey levels."""
-MOST_GREY = 40.0
-"""Limit of the cost of a pixel, grey levels."""
+WIDEST_STRIP, LEAST_STRIP = 8, 3
+"""Largest width of a strip beside an outline, pixels, and least number of its pixels."""
+CONTRAST, MOST_GREY = 8.0, 40.0
+"""Least difference between the mean costs of both strips that tells the order, and limit of the
+cost of a pixel, grey levels."""
 LEAST_ORDER = 0.8
 """Probability from which the order along an outline counts."""
 
@@ -43,7 +38,7 @@ def covering(pair: Pair, flow: FlowFit) -> Float:
     where G is the area of the next frame between the boundary moved by u_i and moved by u_k.
     """
     seg, out = flow.seg, np.zeros(len(flow.seg.pairs))
-    rows = np.flatnonzero(flow.jump >= CLOSING_PX)
+    rows = np.flatnonzero(flow.jump >= JUMP_PX)
     if not len(rows):
         return out
     before, after = (
@@ -55,8 +50,7 @@ def covering(pair: Pair, flow: FlowFit) -> Float:
 
     def target(which: Int, at: Float) -> Float:
         # (M, ..., 2) pixels of the next frame
-        moved = flow.followed(which, rays(pair.K_ref, at))
-        return moved + pair.K_next[:2, 2]
+        return flow.followed(which, rays(pair.K_ref, at)) + pair.K_next[:2, 2]
 
     landed = [target(ends[:, e], edge) for e in (0, 1)]
     closing = np.einsum("mbc,mc->mb", landed[0] - landed[1], normal).mean(axis=1)
@@ -78,7 +72,7 @@ def covering(pair: Pair, flow: FlowFit) -> Float:
         enough = np.isfinite(strip[..., 0]).sum(axis=1) >= LEAST_STRIP
         uncovered[enough, e] = _cost(np.fmin.reduce(off[enough], axis=2))
     contrast = np.where(closing > 0, covered @ [1.0, -1.0], uncovered @ [-1.0, 1.0])
-    out[rows] = np.where(np.abs(closing) > CLOSING_PX, np.nan_to_num(contrast), 0.0)
+    out[rows] = np.where(np.abs(closing) > JUMP_PX, np.nan_to_num(contrast), 0.0)
     return out
 
 
@@ -112,15 +106,10 @@ def _cost(change: Float) -> Float:
 def vote(contrast: Float, region: Int, seg: Segmentation) -> Float:
     """(P,) order of every pair with its probability, see `Start.order`.
 
-    A pair along the outline between two regions votes if its contrast is above `CONTRAST`. All
+    A pair along the outline between two regions (N,) votes if its contrast is above `CONTRAST`. All
     pairs of the outline take the order of the majority. With m of n votes for it, its probability
     is `(m + 1) / (n + 2)`. Pairs that voted against it, and outlines with a probability of at most
-    `LEAST_ORDER`, get 0.
-
-    Args:
-        contrast: (P,) see `covering`.
-        region: (N,) region of every superpixel.
-        seg: Superpixels and graphs.
+    `LEAST_ORDER`, get 0. For the contrast (P,) see `covering`.
     """
     ends = region[seg.pairs]
     a, b = ends.min(axis=1), ends.max(axis=1)

@@ -20,12 +20,10 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.start.bending import RELIEF, displaced, fit_robustly, least_gap, trimmed_mean
-from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.labelling import CLIP
+from soup_nlp.start.bending import CLIP_PX, displaced, fit_robustly, least_gap, trimmed_mean
+from soup_nlp.start.epipolar import LEAST_MATCHES, RELIEF, Motion, most_probable
 from soup_nlp.start.propose import Start
 from soup_nlp.start.regions import SCENE
-from soup_nlp.start.settle import common_error, most_probable
 from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
 
 Kind = Literal["metric", "relative", "inverse", "ordinal"]
@@ -37,8 +35,9 @@ of a map by the superpixels, which explain next to nothing of independent pixels
 LEAST_SIGMA, UNCONFIRMED = 0.12, RELIEF * EXPLAINED**0.5
 """Standard deviation of log depth of a prior: the least, and that of an unconfirmed one, which is
 that of one that the flow hardly confirms in a usual scene."""
-COMPARED = 8
-"""Least number of superpixels whose flow is compared with a prior."""
+COMMON_NOISES, MOST_COMMON_PX = 1.5, 0.15
+"""Error of the flow that is the same over large parts of the image, in units of its noise, and its
+limit in pixels: more noise than that averages out."""
 DEEPEST = 50.0
 """Largest depth relative to the median where an inverse depth has a shift."""
 COMPARED_SIDE = 320
@@ -129,24 +128,23 @@ class Seen(NamedTuple):
     def motion(
         self, at: Int, inverse: Float, shifted: bool = False
     ) -> tuple[float, Float, Float, float]:
-        """The rigid motion of superpixels (M,) with inverse depths (M,), and their shift.
+        """The rigid motion of superpixels (M,) with inverse depths (M,).
 
-        Returns:
-            Error in pixels without the largest tenth, R and T of `X' = R X + T`, and the shift
-            added to all inverse depths, 0 unless `shifted`.
+        These are its error in pixels without the largest tenth, R and T of `X' = R X + T`, and the
+        shift added to all inverse depths, 0 unless `shifted`.
         """
         views, target = self.flow.views, self.flow.centre[at, :2]
         middle = float(np.median(np.abs(inverse)))
         point = np.column_stack([views.anchor[at], inverse / middle])
         scale = np.tile(views.focal, (len(at), 1))
         x, miss = fit_robustly(displaced, 7 if shifted else 6, point, target, scale)
-        error = trimmed_mean(np.minimum(np.linalg.norm(miss, axis=1), CLIP))
+        error = trimmed_mean(np.minimum(np.linalg.norm(miss, axis=1), CLIP_PX))
         return error, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6]
 
     def relief(self, c: int) -> float:
         """Error of the flow of a component at one depth, above the noise, pixels."""
         at = self.members(c)
-        if len(at) < COMPARED or self.start.at_rest:
+        if len(at) < LEAST_MATCHES or self.start.at_rest:
             return 0.0
         floor = min(self.start.noise, float(np.median(self.start.error[at])))
         return self.motion(at, np.ones(len(at)))[0] - floor
@@ -155,10 +153,8 @@ class Seen(NamedTuple):
         """Soup with planes and motion of a rigid component by its flow, near a prior's depths.
 
         Of the motions that explain the flow about as well, it has the one that agrees with the
-        log depth (N,) of the prior, whose standard deviation is sigma.
-
-        Returns:
-            The soup, and (N,) True for members of the component whose depth the flow determines.
+        log depth (N,) of the prior, whose standard deviation is sigma. The flow determines the
+        depth of the members that are True in the second result (N,).
         """
         start, views = self.start, self.flow.views
         mask, use = start.component == c, self.members(c)
@@ -166,10 +162,11 @@ class Seen(NamedTuple):
         tried = (soup.R[use[0]], soup.translation[use[0]]), by_prior
         motions = [Motion(R, T / np.linalg.norm(T)) for R, T in tried if np.any(T)]
         matches = self.flow.anchor_matches(use)
-        best = most_probable(motions, matches, common_error(start.noise), prior[use], sigma)
+        error = min(COMMON_NOISES * start.noise, MOST_COMMON_PX)
+        best = most_probable(motions, matches, error, prior[use], sigma)
         planes = views.fit([best])
         mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
-        strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP)
+        strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP_PX)
         strong &= self.usable & mask
         slope = np.where(strong[:, None], planes.slope[:, 0], 0.0)
         by_flow = views.soup(np.where(strong, mu, 1.0), slope, best.R, best.t)
@@ -200,22 +197,18 @@ def ranks(values: Float) -> Float:
 
 
 def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorEvidence:
-    """Evidence of flow and image for the depth prior of a pair.
+    """Evidence of flow and image for the depth prior of a pair, whose kind is found if it is None.
 
-    Args:
-        start: Start without the prior, with about `JUDGED_PIECES` superpixels.
-        pair: Images and depth prior.
-        flow: The flow of these superpixels.
-        kind: Kind of the prior's values; None to find it.
+    The start without the prior and the flow are those of about `JUDGED_PIECES` superpixels.
     """
     seen = Seen(start, flow)
     value, with_value, whole = without_gaps(pair, flow.seg)
     anchor, relief = flow.views.anchor, seen.relief(SCENE)
     known = with_value & seen.usable & (start.component == SCENE)
     determined = relief > least_gap(start.noise)
-    tells = relief > least_gap(start.noise) / 3 and known.sum() >= COMPARED
+    tells = relief > least_gap(start.noise) / 3 and known.sum() >= LEAST_MATCHES
     sure = known & ~start.borrowed
-    if tells and sure.sum() >= COMPARED:
+    if tells and sure.sum() >= LEAST_MATCHES:
         far = ranks(start.soup.depth_at(anchor)[sure]), ranks(value[sure])
     else:
         # lower parts of an image are mostly nearer
@@ -228,7 +221,7 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
         shifted = as_log_depth(kind, value, shift)
         soup, strong = seen.settled(start.soup, SCENE, shifted(value), UNCONFIRMED)
         depth = np.log(soup.depth_at(anchor))
-        if (strong & known).sum() >= COMPARED:
+        if (strong & known).sum() >= LEAST_MATCHES:
             by_flow, gap = (
                 float(np.ptp(np.quantile(log[strong & known], (0.16, 0.84)))) / 2
                 for log in (depth, depth - shifted(value))
@@ -244,13 +237,8 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
 
 
 def as_log_depth(kind: Kind, value: Float, shift: float = 0.0) -> Callable[[Float], Float]:
-    """Log depth, up to a common scale, as a function of a prior's values.
-
-    Args:
-        kind: Kind of the values.
-        value: (N,) values of the superpixels.
-        shift: Added to values of the kind `inverse`.
-    """
+    """Log depth, up to a common scale, as a function of a prior's values, to which `shift` is added
+    if they are inverse. Those of the superpixels (N,) rank ordinal ones."""
     if kind == "ordinal":
         known, rank = np.sort(value), np.arange(1, len(value) + 1) / (len(value) + 1)
         return lambda v: RELIEF * special.ndtri(np.interp(v, known, rank))
@@ -272,7 +260,7 @@ def edge_margin(values: Float, image: Image) -> float:
     if np.ptp(small) < 1e-9:
         return -np.inf
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(float), (0, 0), 1.5)
-    edges, steps = _ranks(resized(_gradient(grey))), _ranks(_gradient(small))
+    edges, steps = (_ordinal(v) for v in (resized(_gradient(grey)), _gradient(small)))
     superpixel = segment(resized(image), JUDGED_PIECES)
     count = np.maximum(np.bincount(superpixel.ravel()), 1)
 
@@ -307,8 +295,7 @@ def _gradient(values: Float) -> Float:
     return np.hypot(*(cv2.Sobel(values, cv2.CV_64F, x, 1 - x, ksize=3) for x in (1, 0)))
 
 
-def _ranks(values: Float) -> Float:
+def _ordinal(values: Float) -> Float:
     """Ranks of all values, from -1/2 to 1/2; equal values in the order of the array."""
-    rank = np.empty(values.size)
-    rank[np.argsort(values, axis=None, kind="stable")] = np.arange(values.size)
+    rank = np.argsort(np.argsort(values, axis=None, kind="stable"))
     return rank.reshape(values.shape) / values.size - 0.5

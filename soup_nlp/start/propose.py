@@ -17,7 +17,14 @@ from soup_nlp.start.bending import (
     torn,
     turn_alone,
 )
-from soup_nlp.start.epipolar import SIDEWAYS, Matches, Motion, essential_motion, stacked
+from soup_nlp.start.epipolar import (
+    LEAST_MATCHES,
+    SIDEWAYS,
+    Matches,
+    Motion,
+    essential_motion,
+    stacked,
+)
 from soup_nlp.start.labelling import (
     LEAST_NOISE,
     PIECE_SIZE,
@@ -25,6 +32,7 @@ from soup_nlp.start.labelling import (
     fixed_to_camera,
     labelled,
     limited_noise,
+    settle,
 )
 from soup_nlp.start.occlusion import vote
 from soup_nlp.start.regions import (
@@ -36,8 +44,7 @@ from soup_nlp.start.regions import (
     numbered,
 )
 from soup_nlp.start.scales import ground, held, on_ground, scaled
-from soup_nlp.start.settle import settle
-from soup_nlp.start.views import LEAST_PARALLAX_PX, LEAST_PIXELS, LEAST_SEEN, FlowFit, Views
+from soup_nlp.start.views import JUMP_PX, LEAST_PARALLAX_PX, LEAST_SEEN, FlowFit, Views
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +152,8 @@ def most_usual(starts: Sequence[Start], seg: Segmentation, ray: Float) -> tuple[
 
     Starts from other samples of one flow label and scale components differently where it hardly
     tells them; most agree where one goes astray. Of S starts, the one with the least mean
-    difference of log depth over pixels and other starts is taken, up to a common scale.
-
-    Args:
-        starts: S starts on the same superpixels.
-        seg: Superpixels.
-        ray: (N, 3) rays of the anchors.
+    difference of log depth at the anchors' rays (N, 3) over pixels and other starts is taken, up to
+    a common scale.
     """
     if len(starts) == 1:
         return 0, starts[0]
@@ -176,7 +179,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     contrast = np.zeros(len(seg.pairs)) if contrast is None else contrast
     fixed, shift = fixed_to_camera(flow)
     flow = flow.without(fixed)
-    surface = connected_labels(flow.jump < o.discontinuity_px, seg)
+    surface = connected_labels(flow.jump < JUMP_PX, seg)
     motions, bends = surface_motions(flow, surface)
     bends &= o.bending
     jumping = torn(flow, surface, bends)
@@ -190,8 +193,9 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
             soup = receding(flow.views, soup)
         every = np.ones(len(seg), bool)
         start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
-        start = replace(start, surface=surface, bends=every, unexplained=jumping)
-        start = replace(start, at_rest=turn is not None)
+        start = replace(
+            start, surface=surface, bends=every, unexplained=jumping, at_rest=turn is not None
+        )
         part = _scene_first(surface) if turn is None else moving_pieces(flow)
         return _ordered(flow, start, part, contrast)
     choice = settle(rigid, choice)
@@ -215,13 +219,14 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     scale, tie = scaled(flow, soup, component, order, fixed, floor)
     soup = replace(soup, lam=soup.lam * scale)
     soup, lifted = on_ground(flow, soup, floor, reliable, component)
-    weak, wrong = weak | lifted, wrong | lifted
-    noise = limited_noise(error[~bends])
+    wrong = (wrong | lifted) & ~bends
+    piece = connected_pieces(wrong, seg)
+    large = np.bincount(piece[wrong], minlength=1)[piece] >= PIECE_SIZE
     return Start(
         soup=soup.normalised(),
         error=error,
         parallax=parallax,
-        borrowed=weak,
+        borrowed=weak | lifted,
         motion=label,
         component=component,
         part=component,
@@ -229,9 +234,9 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         surface=surface,
         tie=tie,
         bends=bends,
-        unexplained=jumping | _large(wrong & ~bends, seg),
-        wrong=wrong & ~bends,
-        noise=noise,
+        unexplained=jumping | (wrong & large),
+        wrong=wrong,
+        noise=limited_noise(error[~bends]),
         order=held(flow, soup, component, tie, order, contrast),
     )
 
@@ -255,16 +260,9 @@ def _scene_first(label: Int, counts: Mask | None = None) -> Int:
     return numbered(np.where(label == scene, -1, label))
 
 
-def _large(mask: Mask, seg: Segmentation) -> Mask:
-    """(N,) the mask (N,) without connected pieces that are too small to have a motion."""
-    piece = connected_pieces(mask, seg)
-    return mask & (np.bincount(piece[mask], minlength=1)[piece] >= PIECE_SIZE)
-
-
 def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Mask]:
-    """Planes under the chosen motions, and (N,) True where they are borrowed from neighbours.
-
-    Where the motion does not explain the flow, `wrong` (N,) is True.
+    """Planes under the chosen motions, and (N,) True where they are borrowed from neighbours, also
+    where the motion does not explain the flow, `wrong` (N,).
     """
     fit, parallax, views = choice.fit, choice.parallax, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
@@ -299,8 +297,8 @@ def receding(views: Views, soup: Soup) -> Soup:
 
 # --- the paper's initialisation: epipolar geometry and homography of every superpixel -------------
 
-PATCH_PIXELS = 400
-"""Largest number of correspondences to which a motion is fitted."""
+PATCH_PIXELS, PATCH_PX = 400, 0.5
+"""Largest number of correspondences to which a motion is fitted, and their inlier distance."""
 
 
 def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
@@ -309,11 +307,8 @@ def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
     The motion (R, t) of a superpixel comes from the flow of itself and of its nearest neighbours,
     by essential matrix and cheirality; its plane then follows from `q ~ (R - t n^T / d) r`, which
     is linear in n / d. A superpixel for which this fails takes the result of the nearest one for
-    which it succeeds. All anchors have the same depth, which the paper takes as a positive
-    constant (Sec. 4.4.1).
-
-    Returns:
-        The soup, not normalised, and (N,) True where the result of another superpixel was taken.
+    which it succeeds, (N,) True in the second result. All anchors have the same depth, which the
+    paper takes as a positive constant (Sec. 4.4.1). The soup is not normalised.
     """
     seg, anchor = flow.seg, flow.views.anchor
     patches = [_patch(flow, i) for i in range(len(seg))]
@@ -329,16 +324,13 @@ def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
 
 
 def _patch(flow: FlowFit, i: int) -> tuple[Motion, Float] | None:
-    """Motion of a superpixel, and m = -n / d with |t| = 1 as the length unit.
-
-    None if its flow does not determine them.
-    """
-    views, o = flow.views, flow.options
+    """Motion of a superpixel, and m = -n / d with |t| = 1 as the length unit, if determined."""
+    views = flow.views
     inside = views.subset(np.array([i])).matches().confident(PATCH_PIXELS)
-    if len(inside.ray) < LEAST_PIXELS:
+    if len(inside.ray) < LEAST_MATCHES:
         return None
     around = views.subset(np.append(i, flow.seg.knn[i])).matches()
-    motion = essential_motion(around.confident(PATCH_PIXELS), o.threshold_px)
+    motion = essential_motion(around.confident(PATCH_PIXELS), PATCH_PX)
     if motion is None:
         return None
     m, seen = plane_of(motion, inside), np.vstack([inside.ray, views.anchor[i]])

@@ -5,8 +5,6 @@ belongs to. Inverse depth is linear in the image on a plane, so a surface is con
 harmonic extension of inverse depth along edges where the image is continuous.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
@@ -15,13 +13,10 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.graph import Segmentation, connected
 
 
-def connected_pieces(mask: Mask, seg: Segmentation, hold: Mask | bool = True) -> Int:
-    """(N,) connected component of every superpixel of a mask (N,), -1 outside.
-
-    Pairs of neighbours join them, if `hold` (P,) marks these pairs.
-    """
-    joined = np.asarray(mask[seg.pairs].all(axis=1) & hold)
-    return np.where(mask, connected_labels(joined, seg), -1)
+def connected_pieces(mask: Mask, seg: Segmentation) -> Int:
+    """(N,) connected component of every superpixel of a mask (N,), -1 outside."""
+    inside = np.asarray(mask[seg.pairs].all(axis=1))
+    return np.where(mask, connected_labels(inside, seg), -1)
 
 
 def connected_labels(hold: Mask, seg: Segmentation) -> Int:
@@ -36,10 +31,6 @@ def numbered(label: Int) -> Int:
 
 SCENE = 0
 """Index of the component that is the static scene: depths and motions refer to it."""
-
-
-STEEP_COSINE = 0.5
-"""Cosine of the angle to the vertical up to which a neighbour lies below."""
 TIES = (
     "reference",
     "contact below",
@@ -61,42 +52,6 @@ than the scene."""
 FIXED, TOO_FAST = TIES.index("fixed in the image"), TIES.index("too fast")
 
 
-class Outlines(NamedTuple):
-    """The B neighbour pairs that join two components, in both directions (2 B entries).
-
-    Attributes:
-        component: First component of the pair.
-        other: Second component of the pair.
-        neighbour: Superpixel of the second component.
-        contact: Length of their boundary, pixels.
-        below: Whether the second lies below the first in the image.
-    """
-
-    component: Int
-    other: Int
-    neighbour: Int
-    contact: Float
-    below: Mask
-
-
-def outlines(label: Int, seg: Segmentation) -> Outlines:
-    """Contacts between the components that `label` (N,) gives the superpixels."""
-    ends = label[seg.pairs]
-    across = ends[:, 0] != ends[:, 1]
-    component, other = np.concatenate([ends[across], ends[across, ::-1]]).T
-    neighbour = seg.pairs[across, ::-1].T.ravel()
-    contact = np.tile(seg.boundary_length[across], 2).astype(float)
-    way = np.diff(seg.anchors[seg.pairs[across]], axis=1)[:, 0]
-    down = way[:, 1] / np.linalg.norm(way, axis=1)
-    below = np.concatenate([down, -down]) > STEEP_COSINE
-    return Outlines(component, other, neighbour, contact, below)
-
-
-def quantile(value: Float, weight: Float, share: float) -> float:
-    """Weighted quantile: the value below which a share of the weight lies."""
-    return float(np.quantile(value, share, weights=weight, method="inverted_cdf"))
-
-
 # --- what is not seen continues what is around it -------------------------------------------------
 
 COLOUR_EXPONENT = 3.0
@@ -111,21 +66,14 @@ def likeness(seg: Segmentation) -> Float:
     return np.asarray(seg.boundary_length * colour**COLOUR_EXPONENT)
 
 
-def laplacian(weight: Float, seg: Segmentation) -> sparse.csr_matrix:
-    """(N, N) Laplacian of the neighbour pairs with weights (P,)."""
-    i, k = seg.pairs.T
-    n = len(seg)
-    W = sparse.coo_matrix((weight, (i, k)), (n, n)).tocsr()
-    W = W + W.T
-    return sparse.diags(np.asarray(W.sum(axis=1)).ravel()) - W
-
-
 def harmonic(weight: Float, seg: Segmentation, value: Float, known: Mask) -> Float:
     """(N, C) values where they are known (N,), and their harmonic extension elsewhere."""
-    L = laplacian(weight, seg)
     out = np.array(value, float)
     if known.all() or not known.any():
         return out
+    W = sparse.coo_matrix((weight, tuple(seg.pairs.T)), (len(seg), len(seg))).tocsr()
+    W = W + W.T
+    L = sparse.diags(np.asarray(W.sum(axis=1)).ravel()) - W
     A = L[~known][:, ~known] + 1e-12 * sparse.identity(int((~known).sum()))
     b = -L[~known][:, known] @ out[known]
     out[~known] = spsolve(A.tocsc(), b).reshape(b.shape)

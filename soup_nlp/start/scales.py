@@ -26,56 +26,41 @@ from scipy.optimize import linprog
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.occlusion import CLOSING_PX, CONTRAST
-from soup_nlp.start.regions import (
-    FIXED,
-    SCENE,
-    STEEP_COSINE,
-    TIES,
-    TOO_FAST,
-    numbered,
-    outlines,
-    quantile,
-)
-from soup_nlp.start.views import FlowFit
+from soup_nlp.start.occlusion import CONTRAST
+from soup_nlp.start.regions import FIXED, SCENE, TIES, TOO_FAST, numbered
+from soup_nlp.start.views import JUMP_PX, FlowFit
 
+STEEP_COSINE = 0.5
+"""Cosine of the angle to the vertical up to which a neighbour lies below."""
 HIDES = 0.3
 """Quantile of the depth ratios along the outline of a component, which hides what is behind it."""
 STRONG = 3.0
 """Weight of the contact below a component and of the order along an outline, relative to the
 contact of a whole outline."""
-FASTER = 1.5
-"""Price of a log unit by which a component moves farther than the scene."""
-FREE_PACE = 1.0
-"""Log units by which a component that stands on something may move farther than the scene."""
+FASTER, FREE_PACE = 1.5, 1.0
+"""Price of a log unit by which a component moves farther than the scene, and how many are free."""
 UNDER = 2.0
 """Price of a log unit by which a component lies below the ground."""
 LEAST_STEP_IN_FRONT = 0.3
 """Least step of log depth along the outline of what covers something: true steps have medians of
 0.2 to 1.9."""
-MOST_LOG_PACE = np.log(100.0)
-"""If motion and contact differ by more, in logarithms, the camera is taken to be at rest."""
-MOST_LOG_SCALE = 6.0
-"""Largest log scale."""
-LEAST_DISPLACEMENT = 1e-12
-"""Displacements count as at least this, so that their ratio is finite."""
+MOST_LOG_PACE, MOST_LOG_SCALE = np.log(100.0), 6.0
+"""If motion and contact differ by more, in logarithms, the camera is taken to be at rest; largest
+log scale."""
 
 
 class Rows(NamedTuple):
-    """Rows `w_up max(r, 0) + w_down max(-r, 0)`, r = x_a - x_b - value, of a kind of `TIES`."""
+    """Rows `w_up max(r, 0) + w_down max(-r, 0)`, r = x_a - x_b - value, of a kind of `TIES`.
+
+    Every field is an array, or a number for all rows.
+    """
 
     a: Int
-    b: Int
+    b: Int | int
     value: Float
-    up: Float
-    down: Float
-    tie: Int
-
-
-def rows(a: Int, b: Int, value: Float, up: Float | float, down: Float | float, tie: str) -> Rows:
-    """Rows of one kind; weights may be numbers."""
-    wide = (np.broadcast_to(v, len(a)) for v in (up, down, TIES.index(tie)))
-    return Rows(a, np.broadcast_to(b, len(a)), value, *wide)
+    up: Float | float
+    down: Float | float
+    tie: Int | int
 
 
 def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
@@ -83,23 +68,24 @@ def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
 
     A row decides if it is exact at the minimum; among several the one of the largest weight.
     """
-    r = Rows(*(np.concatenate(v) for v in zip(*parts)))
-    m, each = len(r.a), np.arange(len(r.a))
+    wide = (np.broadcast_arrays(*part) for part in parts)
+    a, b, value, up, down, kind = (np.concatenate(v) for v in zip(*wide))
+    m, each = len(a), np.arange(len(a))
     one = np.ones(m)
-    columns = np.concatenate([r.a, r.b, count + each, count + m + each])
+    columns = np.concatenate([a, b, count + each, count + m + each])
     A = sparse.coo_matrix(
         (np.concatenate([one, -one, -one, one]), (np.tile(each, 4), columns)), (m, count + 2 * m)
     )
     bounds = np.tile([-MOST_LOG_SCALE, MOST_LOG_SCALE], (count, 1))
     bounds[still] = 0.0
     slack = np.tile([0.0, np.inf], (2 * m, 1))
-    cost = np.concatenate([np.zeros(count), r.up, r.down])
-    x = linprog(cost, A_eq=A.tocsr(), b_eq=r.value, bounds=np.vstack([bounds, slack])).x[:count]
-    exact = np.abs(x[r.a] - x[r.b] - r.value) < 1e-7
+    cost = np.concatenate([np.zeros(count), up, down])
+    x = linprog(cost, A_eq=A.tocsr(), b_eq=value, bounds=np.vstack([bounds, slack])).x[:count]
+    exact = np.abs(x[a] - x[b] - value) < 1e-7
     tie = np.full(count, TIES.index("nothing"))
-    for end in (r.b, r.a):
-        for row in np.flatnonzero(exact)[np.argsort((r.up + r.down)[exact], kind="stable")]:
-            tie[end[row]] = r.tie[row]
+    for end in (b, a):
+        for row in np.flatnonzero(exact)[np.argsort((up + down)[exact], kind="stable")]:
+            tie[end[row]] = kind[row]
     tie[still] = TIES.index("reference")
     return x, tie
 
@@ -108,33 +94,44 @@ def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> Rows:
     """Rows of contact between components (N,); none stands on one that is fixed (N,)."""
     seg = flow.seg
     across = seg.across(label)
-    zi, zk = soup.depth_across(seg.pairs[across], flow.middle[across])
-    ratio = np.log(np.concatenate([zk / zi, zi / zk]))
-    around = outlines(label, seg)
-    mine = (around.component != SCENE) & ~fixed[around.neighbour]
-    a, b, length = around.component[mine], around.other[mine], around.contact[mine]
-    below = around.below[mine] & flow.options.upright
+    pairs = seg.pairs[across]
+    zi, zk = soup.depth_across(pairs, flow.middle[across])
+    way = np.diff(seg.anchors[pairs], axis=1)[:, 0]
+    down = way[:, 1] / np.linalg.norm(way, axis=1)
+    # every pair in both directions, but for those from the scene
+    own, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    mine = (label[own] != SCENE) & ~fixed[other]
+    ratio = np.log(np.concatenate([zk / zi, zi / zk]))[mine]
+    length = np.tile(seg.boundary_length[across], 2).astype(float)[mine]
+    below = (np.concatenate([down, -down]) > STEEP_COSINE)[mine] & flow.options.upright
+    a, b = label[own[mine]], label[other[mine]]
     part = 2 * a + below
     weight = length / np.bincount(part, length)[part] * np.where(below, STRONG, 1.0)
     tie = np.where(below, TIES.index("contact below"), TIES.index("outline"))
-    return Rows(a, b, ratio[mine], weight * (1 - HIDES), weight * HIDES, tie)
+    return Rows(a, b, ratio, weight * (1 - HIDES), weight * HIDES, tie)
 
 
 def pace(flow: FlowFit, soup: Soup, label: Int) -> Rows:
-    """Rows of the displacement of components (N,)."""
-    far = log_pace(displacement(soup, flow.views.anchor, label), label)
-    c = np.flatnonzero((np.abs(far) < MOST_LOG_PACE) & (np.arange(len(far)) != SCENE))
-    return rows(c, np.array(SCENE), FREE_PACE - far[c], FASTER, 0.0, "too fast")
+    """Rows of how far the anchors of components (N,) move relative to the camera, which turns as
+    the scene does; medians count."""
+    point = soup.points(flow.views.anchor)
+    first = int(np.argmax(label == SCENE))
+    moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation - point @ soup.R[first].T
+    far = np.linalg.norm(moved, axis=1)
+    median = np.array([np.median(far[label == c]) for c in range(int(label.max()) + 1)])
+    median = np.maximum(median, 1e-12)
+    ratio = np.log(median / median[SCENE])
+    c = np.flatnonzero((np.abs(ratio) < MOST_LOG_PACE) & (np.arange(len(ratio)) != SCENE))
+    return Rows(c, SCENE, FREE_PACE - ratio[c], FASTER, 0.0, TOO_FAST)
 
 
 def above(flow: FlowFit, soup: Soup, label: Int, floor: Float) -> Rows:
     """Rows of the ground, whose inverse depth is floor (N,), 0 where there is none."""
     mu, size = 1 / soup.depth_at(flow.views.anchor), flow.seg.sizes
     at = np.flatnonzero((floor > 0) & (label != SCENE))
-    weight = size[at] / np.bincount(label, size)[label[at]]
-    return rows(
-        label[at], np.array(SCENE), np.log(mu[at] / floor[at]), UNDER * weight, 0.0, "ground"
-    )
+    weight = UNDER * (size[at] / np.bincount(label, size)[label[at]])
+    value = np.log(mu[at] / floor[at])
+    return Rows(label[at], SCENE, value, weight, 0.0, TIES.index("ground"))
 
 
 def before(flow: FlowFit, soup: Soup, label: Int, order: Float) -> Rows:
@@ -152,7 +149,8 @@ def before(flow: FlowFit, soup: Soup, label: Int, order: Float) -> Rows:
     length = seg.boundary_length[at].astype(float)
     outline = numbered(front * (int(label.max()) + 1) + back)
     weight = STRONG * length / np.bincount(outline, length)[outline]
-    return rows(front, back, np.log(z[1] / z[0]) - LEAST_STEP_IN_FRONT, weight, 0.0, "occlusion")
+    value = np.log(z[1] / z[0]) - LEAST_STEP_IN_FRONT
+    return Rows(front, back, value, weight, 0.0, TIES.index("occlusion"))
 
 
 def scaled(
@@ -165,14 +163,9 @@ def scaled(
 ) -> tuple[Float, Int]:
     """(N,) scale of the component (N,) of every superpixel, and (N,) what decides it.
 
-    Args:
-        flow: The flow of every superpixel.
-        soup: Planes and motions.
-        label: (N,) component.
-        order: (P,) order by occlusion, see `Start.order`.
-        fixed: (N,) True where the image stands still before a moving camera.
-        floor: (N,) inverse depth of the ground, 0 where there is none. None if there is no rigid
-            scene, with which displacements could be compared.
+    The image stands still before a moving camera where it is fixed (N,). The floor (N,) is the
+    inverse depth of the ground, 0 where there is none; None without a rigid scene, with which
+    displacements could be compared. For the order (P,) see `Start.order`.
     """
     count = int(label.max()) + 1
     if count == 1 or not len(flow.seg.pairs):
@@ -184,9 +177,6 @@ def scaled(
     x, tie = minimum(count, parts, np.array([SCENE]))
     tie = np.where(fixed, FIXED, tie[label])
     return np.exp(x)[label], tie
-
-
-# --- how far components move ---------------------------------------------------------------------
 
 
 def held(
@@ -201,39 +191,13 @@ def held(
     pairs = flow.seg.pairs
     by_order = (tie == TIES.index("occlusion"))[pairs].any(axis=1)
     told = np.abs(contrast) > CONTRAST
-    out = np.where(told | (by_order & (flow.jump >= CLOSING_PX)), order, 0.0)
+    out = np.where(told | (by_order & (flow.jump >= JUMP_PX)), order, 0.0)
     near = (tie == TOO_FAST)[pairs]
     z = soup.depth_across(pairs, flow.middle)
     second = np.where(z[1] < z[0], near[:, 1], 0.0)
     first = np.where(z[0] < z[1], near[:, 0], 0.0)
     out = np.where((out == 0) & flow.seg.across(label), second - first, out)
     return out if out.any() else None
-
-
-def log_pace(far: Float, label: Int) -> Float:
-    """(C,) log ratio of the median displacement of every component to that of the scene.
-
-    Args:
-        far: (N,) displacement relative to the camera (`displacement`).
-        label: (N,) index of the component.
-    """
-    median = np.array([np.median(far[label == c]) for c in range(int(label.max()) + 1)])
-    median = np.maximum(median, LEAST_DISPLACEMENT)
-    return np.asarray(np.log(median / median[SCENE]))
-
-
-def displacement(soup: Soup, ray: Float, label: Int) -> Float:
-    """(N,) how far anchors move relative to the camera, which turns as the scene does.
-
-    Args:
-        soup: Planes and motions.
-        ray: (N, 3) rays of the anchors.
-        label: (N,) index of the component.
-    """
-    point = soup.points(ray)
-    first = int(np.argmax(label == SCENE))
-    moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation - point @ soup.R[first].T
-    return np.linalg.norm(moved, axis=1)
 
 
 # --- the ground -----------------------------------------------------------------------------------
@@ -243,8 +207,8 @@ LEVEL = 0.92
 ON, OFF = 0.05, 0.2
 """Relative differences of inverse depth: up to the first a superpixel lies on the ground, from the
 second on it lies below."""
-LEAST_ON, MOST_BELOW = 0.05, 0.05
-"""Of the area with known depth, the least share on the ground and the largest share of another
+LEAST_ON = 0.05
+"""Of the area with known depth, the least share on the ground, and the largest share of another
 surface below it. Of wrong flow less must lie below it than on it."""
 GROUND_TRIALS = 500
 """Number of planes through three superpixels that are tried."""
@@ -284,7 +248,7 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
     plane_mu = ray @ best
     below = (plane_mu > 0) & (mu < (1 - OFF) * plane_mu)
     total, area_on, under = weight[at].sum(), weight[at][on(best)].sum(), reliable & below
-    most = MOST_BELOW * total if _level(mu, plane_mu, under, weight) else area_on
+    most = LEAST_ON * total if _level(mu, plane_mu, under, weight) else area_on
     if area_on < LEAST_ON * total or weight[under].sum() > most:
         return none
     return np.maximum(plane_mu, 0.0)
@@ -298,7 +262,8 @@ def _level(mu: Float, floor: Float, under: Mask, weight: Float) -> bool:
     if not under.any():
         return False
     ratio = mu[under] / floor[under]
-    near = np.abs(ratio / quantile(ratio, weight[under], 0.5) - 1) < OFF
+    middle = np.quantile(ratio, 0.5, weights=weight[under], method="inverted_cdf")
+    near = np.abs(ratio / middle - 1) < OFF
     return bool(weight[under][near].sum() > 0.5 * weight[under].sum())
 
 
@@ -308,14 +273,8 @@ def on_ground(
     """The soup with what is below the ground lifted to it, and (N,) True where that is.
 
     Superpixels of the scene keep the translation they share: their flow is wrong. Where most of
-    what is reliable below the ground is another surface, that is kept.
-
-    Args:
-        flow: The flow of every superpixel.
-        soup: Start, its components scaled.
-        floor: (N,) inverse depth of the ground, see `ground`.
-        reliable: (N,) True where the depth is reliable.
-        component: (N,) group that moves as one.
+    what is reliable (N,) below the ground is another surface, that is kept. For the floor (N,) see
+    `ground`.
     """
     mu, scene = 1 / soup.depth_at(flow.views.anchor), component == SCENE
     lifted = mu < (1 - OFF) * floor

@@ -1,9 +1,9 @@
-"""Data of the plane fits: rays and flow targets of the sampled pixels of every superpixel."""
+"""Options of the initialisation, and the flow of every superpixel at sampled pixels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -15,9 +15,34 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import PlaneFit, about_anchor, fit_planes, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
-from soup_nlp.start.epipolar import Matches, Motion, stacked
-from soup_nlp.start.start_options import SeededStart
+from soup_nlp.schema.section import Section, Seed
+from soup_nlp.start.epipolar import LEAST_MATCHES, Matches, Motion, stacked
 
+
+class StartOptions(Section):
+    """How the initialisation is made."""
+
+    method: Literal["shared", "homography"] = "shared"
+    """shared (every superpixel takes one of the motions of the whole image) or homography (the
+    paper's: epipolar geometry and homography of every superpixel, equal scales)."""
+    bending: bool = True
+    """Whether surfaces may bend; if false, everything is rigid."""
+    upright: bool = True
+    """Whether the image is upright, so that components stand on what is below them. If false, a
+    component is scaled by its whole outline."""
+    ground: bool = True
+    """Use the ground of an upright image, a level plane on which much of the scene lies: unreliable
+    depths and components below it are lifted."""
+
+
+class SeededStart(StartOptions):
+    """StartOptions with the seed of sampling, which a problem has once."""
+
+    seed: Seed = 0
+
+
+SAMPLES = {"shared": 40, "homography": 100}
+"""Sampled pixels per superpixel, by the method."""
 USABLE = 0.5
 """Mean confidence above which the flow of a superpixel counts."""
 LEAST_PARALLAX_PX = 0.25
@@ -25,8 +50,9 @@ LEAST_PARALLAX_PX = 0.25
 LEAST_SEEN = 0.1
 """Mean confidence of all pixels of a superpixel from which its flow determines its depth: fewer
 pixels match by chance as well."""
-LEAST_PIXELS = 8
-"""Least number of usable pixels of a superpixel that has views of its own, and of an image."""
+JUMP_PX = 1.0
+"""Least jump of the flow between two neighbours at which a surface ends, pixels: what moves
+less relative to something stands still before it."""
 CACHED = 1 << 16
 """Pixels times motions that are fitted at once: 0.5 MB per array, so that the cache holds them."""
 
@@ -80,13 +106,10 @@ class Views:
         return np.asarray(np.sum(self.weight * value, axis=1) / total)
 
     def soup(self, mu: Float, slope: Float, R: Float, T: Float) -> Soup:
-        """Planes with motions `X' = R X + T`, all scales such that `d` is 1.
+        """Planes with motions `X' = R X + T` of each or of all, all scales such that `d` is 1.
 
-        Args:
-            mu: (N,) inverse depth at the anchors.
-            slope: (N, 2) relative change of mu over the radius.
-            R: (N, 3, 3) rotations, or (3, 3) of all.
-            T: (N, 3) translations, or (3,) of all.
+        mu (N,) is the inverse depth at the anchors, slope (N, 2) its relative change over the
+        radius.
         """
         n, D = normal_and_distance(about_anchor(1 / mu, slope / self.radius[:, None], self.anchor))
         R = np.broadcast_to(R, (len(D), 3, 3)).copy()
@@ -147,20 +170,20 @@ class FlowFit(NamedTuple):
         """Sample and fit a flow with confidence.
 
         Raises:
-            DataError: fewer than 8 pixels have a usable flow.
+            DataError: fewer than `LEAST_MATCHES` pixels have a usable flow.
         """
         o = options or SeededStart()
-        index, filled = sample_pixels(seg.labels, flow, o.samples, o.seed)
-        if filled.sum() < LEAST_PIXELS:
+        index, filled = sample_pixels(seg.labels, flow, SAMPLES[o.method], o.seed)
+        if filled.sum() < LEAST_MATCHES:
             raise DataError(
                 "too few pixels have a usable flow",
                 where=f"flow {flow.source}",
                 found=int(filled.sum()),
-                expected=f"at least {LEAST_PIXELS}",
+                expected=f"at least {LEAST_MATCHES}",
                 hint="two frames of one scene, with texture and closer in time; "
                 "of a flow from a file, look at its values and confidence",
             )
-        poor = filled.sum(axis=1) < LEAST_PIXELS
+        poor = filled.sum(axis=1) < LEAST_MATCHES
         if not poor.all():
             source = seg.nearest(~poor)
             index, filled = index[source], filled[source]
@@ -206,14 +229,8 @@ class FlowFit(NamedTuple):
 
     def anchor_matches(self, at: Int) -> Matches:
         """Correspondences of the anchors of superpixels `at`, all with the same weight."""
-        return Matches(
-            self.views.anchor[at], self.centre[at], np.ones(len(at)), self.views.focal[0]
-        )
-
-    @property
-    def displacement(self) -> Float:
-        """(N, 2) pixels from the anchors to their targets, each from its principal point."""
-        return self.fit[:, 0] - self.views.anchor[:, :2] * self.views.focal
+        v = self.views
+        return Matches(v.anchor[at], self.centre[at], np.ones(len(at)), v.focal[0])
 
 
 QUADRATIC_PX, AFFINE_FITS = 0.1, 8

@@ -15,7 +15,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.report.findings import hints
-from soup_nlp.start.bending import ANY_TURN, LEAST_GAP_PX, PLAIN_TURN, fit_robustly, turned
+from soup_nlp.start.bending import ANY_TURN, PLAIN_TURN, fit_robustly, turned
 from soup_nlp.start.camera_error import (
     CameraError,
     better_camera,
@@ -24,6 +24,7 @@ from soup_nlp.start.camera_error import (
     likeliest,
 )
 from soup_nlp.start.epipolar import Matches, Motion, estimate, triangulate
+from soup_nlp.start.labelling import LEAST_GAP_PX
 
 NOISE = 0.05
 

@@ -14,8 +14,7 @@ from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.start.start_options import SeededStart
-from soup_nlp.start.views import FlowFit, Views
+from soup_nlp.start.views import FlowFit, SeededStart, Views
 
 Float = NDArray[np.float64]
 

@@ -25,7 +25,6 @@ from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import (
     ANY_TURN,
     AT_REST,
-    LEAST_GAP,
     REFERENCE,
     constant_depth,
     fit_turn,
@@ -33,7 +32,7 @@ from soup_nlp.start.bending import (
     torn,
     turn_alone,
 )
-from soup_nlp.start.labelling import LEAST_NOISE, dominant, labelled
+from soup_nlp.start.labelling import IN_NOISE, LEAST_NOISE, dominant, labelled
 from soup_nlp.start.regions import connected_labels
 from soup_nlp.start.views import FlowFit
 
@@ -316,7 +315,7 @@ def test_depth_within_three_noises_of_the_flow_is_not_seen():
     # the residual of affine flows is part of the error
     part = np.sqrt(REFERENCE / len(c))
     for share, sees in ((0.95, True), (1.05, False)):
-        residual = np.full(len(c), share * error / (LEAST_GAP + part) * part)
+        residual = np.full(len(c), share * error / (IN_NOISE + part) * part)
         assert (turn_alone(flow._replace(residual=residual), choice) is None) == sees
 
 

@@ -15,13 +15,13 @@ from soup_nlp.start.epipolar import SIDEWAYS, Motion
 from soup_nlp.start.labelling import (
     CHANGE_COST,
     MOST_COST,
-    flow_affinity,
     labelled,
     price_of_motion,
     smooth,
 )
 from soup_nlp.start.propose import propose
 from soup_nlp.start.regions import belonging, connected_labels, continued, harmonic, likeness
+from soup_nlp.start.views import FlowFit
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_every_region_gets_one_motion(world, given):
 def test_an_error_that_the_flow_shares_is_no_motion():
     """Every cost up to the shared error is 0, however many superpixels have it."""
     shared = 0.2
-    price = labelling._price(np.array([0.0, 0.1, 0.2, 0.3, 99.0]), shared)
+    price = labelling._cost(np.array([0.0, 0.1, 0.2, 0.3, 99.0]), shared)
     np.testing.assert_allclose(price, [0, 0, 0, 0.5, MOST_COST], atol=1e-12)
 
 
@@ -87,8 +87,6 @@ def fitted_like(seg):
     """A flow that does not move, of superpixels."""
     height, width = seg.labels.shape
     K = camera.intrinsics(50.0, 50.0, width / 2, height / 2)
-    from soup_nlp.start.views import FlowFit
-
     none = Flow(np.zeros((height, width, 2), np.float32), np.ones((height, width)), "test")
     return FlowFit.of(seg, none, K, K)
 
@@ -101,9 +99,7 @@ def test_neighbours_agree_unless_the_flow_jumps(world):
     wrong = rng.random(n) < 0.2
     mine = np.where(wrong, 1 - component, component)[:, None]
     cost = np.where(np.arange(2) == mine, 0.0, 0.5 * CHANGE_COST)
-    near = flow_affinity(flow)
-    assert near.max() <= 1
-    assert near[flow.jump > 3 * flow.options.discontinuity_px].max() < 0.01
+    near = np.exp(-2 * flow.jump)
     label = smooth(flow, cost)
     assert (label == component).mean() > 0.95
     # no single change is better

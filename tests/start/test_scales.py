@@ -6,7 +6,7 @@ from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry import camera
 from soup_nlp.start.regions import TIES, TOO_FAST
-from soup_nlp.start.scales import FREE_PACE, LEAST_STEP_IN_FRONT, Rows, held, minimum, rows, scaled
+from soup_nlp.start.scales import FREE_PACE, LEAST_STEP_IN_FRONT, Rows, held, minimum, scaled
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 HANGS = [[0] * 5, [0, 0, 1, 0, 0], [0] * 5, [0] * 5]
@@ -39,7 +39,7 @@ def test_the_minimum_is_one():
     rng = np.random.default_rng(0)
     a, b = rng.integers(0, 4, (2, 40))
     value, up, down = rng.normal(size=40), rng.random(40), rng.random(40)
-    r = rows(a, b, value, up, down, "outline")
+    r = Rows(a, b, value, up, down, TIES.index("outline"))
     x, tie = minimum(4, [r], np.array([0]))
     assert x[0] == 0
     assert tie[0] == TIES.index("reference")
@@ -52,9 +52,9 @@ def test_the_minimum_is_one():
 
 def test_a_row_is_a_weighted_quantile():
     value = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    zero, one = np.zeros(5, int), np.ones(5, int)
+    one, tie = np.ones(5, int), TIES.index("outline")
     for share, expected in ((0.1, 1.0), (0.5, 3.0), (0.7, 4.0)):
-        x, _ = minimum(2, [rows(one, zero, value, 1 - share, share, "outline")], np.array([0]))
+        x, _ = minimum(2, [Rows(one, 0, value, 1 - share, share, tie)], np.array([0]))
         np.testing.assert_allclose(x[1], expected, atol=1e-9)
 
 

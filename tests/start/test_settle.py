@@ -11,8 +11,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
 from soup_nlp.pipeline import case
 from soup_nlp.start.camera_error import camera_error
-from soup_nlp.start.epipolar import Matches, Motion
-from soup_nlp.start.settle import MOST_RELIEF, cauchy, most_probable, relief
+from soup_nlp.start.epipolar import MOST_RELIEF, Matches, Motion, cauchy, most_probable, relief
 
 FOCAL = 500.0
 TRUE = Motion(rotation.exp(np.array([0.004, -0.006, 0.002])), np.array([0.6, 0.0, 0.8]))
