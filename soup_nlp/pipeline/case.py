@@ -24,10 +24,9 @@ from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.camera_error import camera_error
 from soup_nlp.start.epipolar import Matches, estimate
 from soup_nlp.start.given_depth import Given, by_prior
-from soup_nlp.start.occlusion import covering
 from soup_nlp.start.prior_evidence import JUDGED_PIECES, LEAST_SIGMA, PriorEvidence, judged
 from soup_nlp.start.propose import Start, most_usual, propose
-from soup_nlp.start.regions import TIES, TOO_FAST
+from soup_nlp.start.regions import TIES, TOO_FAST, covering
 from soup_nlp.start.views import FlowFit, SeededStart
 from soup_nlp.storage.progress import Watch
 from soup_nlp.storage.system import require_memory

@@ -20,6 +20,7 @@ from soup_nlp.start.labelling import (
     IN_NOISE,
     LEAST_GAP_PX,
     LEAST_SHARED,
+    MOTION_PIXELS,
     PIECE_SIZE,
     Labelling,
     candidates,
@@ -36,8 +37,8 @@ AT_REST, TURN_SHARE = 0.8, 9e-5
 and the error up to which it explains the flow, as a share of the longer side of a small image."""
 MATRIX_STEP, LEAST_MOVED_DEPTH = 1e-5, 1e-3
 """Step by which matrices of motions are differentiated, and least depth of a moved point."""
-FIT_PIXELS, LEAST_SCALE = 3000, 0.02
-"""Pixels of the fit of a turn, and the least scale of the refinement of a motion, pixels."""
+LEAST_SCALE = 0.02
+"""Least scale of the refinement of a motion, pixels."""
 
 
 def least_gap(noise: float) -> float:
@@ -139,7 +140,7 @@ def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
 
     The first `size` parameters of `turned` are free.
     """
-    ray, target, weight, _ = views.matches(FIT_PIXELS)
+    ray, target, weight, _ = views.matches(2 * MOTION_PIXELS)
     scale = np.sqrt(weight)[:, None] * views.focal
     x, _ = fit_robustly(turned, size, ray, target[:, :2], scale)
     return rotation.exp(x[:3]), views.distance(views.ray @ turned(x).T)

@@ -15,6 +15,7 @@ from scipy import special
 from soup_nlp.arrays import Float
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.start.epipolar import Matches, Motion, essential_motion, refine_near, triangulate
+from soup_nlp.start.labelling import EXACT_PX, LEAST_NOISE
 
 ERROR_KINDS = {
     "focal length": (0.8, 0.25),
@@ -33,11 +34,9 @@ MEASUREMENTS = 80
 image, so that its pixels are no independent ones."""
 LEAST_ODDS = 3.0
 """Log odds at which there is an error, and, against it, none that counts: twenty to one."""
-ERROR_PIXELS, ERROR_NOISE_PX, ERROR_FITS = 2000, 0.05, 4
-"""Largest number of correspondences, the scale of their robust loss in pixels, and the rounds of a
-fit that begins at that of the error before."""
-LEAST_MEDIAN_PX = 0.005
-"""Least median error of a flow, pixels: that of a rendered flow is rounding."""
+ERROR_PIXELS, ERROR_FITS = 2000, 4
+"""Largest number of correspondences, and the rounds of a fit that begins at that of the error
+before."""
 MOST_CHANGE = 2.5
 """Largest log ratio of a depth to the median: what is behind the camera is farther away."""
 
@@ -68,19 +67,13 @@ class CameraError(NamedTuple):
 
         Depth is triangulated with the best motion, a common factor left out. It is 0 where the odds
         against an error are `LEAST_ODDS`; what the flow leaves open, such as the focal length on a
-        straight drive, counts.
-
-        Args:
-            ray: (N, 3) rays of the reference frame.
-            target: (N, 3) rays of the same points of the answer in the next frame.
-            depth: (N,) their depth.
+        straight drive, counts. The points (N,) of the answer have rays (N, 3) in both frames.
         """
         if not self.motions or self.log_odds <= -LEAST_ODDS:
             return np.zeros(len(ray))
-        rows = []
-        for x, motion in zip(self.tried, self.motions, strict=True):
-            z, _ = triangulate(motion, *corrected(self.kind, x, ray, target))
-            rows.append(_relative(np.where(z > 0, z, np.inf)))
+        tried = zip(self.tried, self.motions, strict=True)
+        depths = (triangulate(m, *corrected(self.kind, x, ray, target))[0] for x, m in tried)
+        rows = [_relative(np.where(z > 0, z, np.inf)) for z in depths]
         # a foreign solver may return a depth that is no number
         change = np.nan_to_num(np.array(rows) - _relative(depth))
         change -= np.mean(change, axis=1, keepdims=True)
@@ -114,38 +107,31 @@ def camera_error(matches: Matches, kind: str, deviation: float, wrong: float = 1
 
     With s(x) the Sampson distances of the best motion if the error is x, and g the least of their
     medians, the flow has the probability `exp(-MEASUREMENTS mean log(1 + (s(x) / g)^2))`, that of
-    errors with a Cauchy distribution. Errors are normal, with a probability `wrong` of one.
-
-    Args:
-        matches: Correspondences with the camera as it is.
-        kind: One of `ERROR_KINDS`.
-        deviation: Standard deviation of the error.
-        wrong: Probability of an error, without the flow; 1 for a guess.
+    errors with a Cauchy distribution. Errors of the camera are normal with this deviation; `wrong`
+    is the probability of one without the flow, 1 for a guess. `kind` is one of `ERROR_KINDS`.
     """
     matches = matches.confident(ERROR_PIXELS)
     distance, motions = _explained(matches, kind, deviation)
     prior = float(special.logit(wrong))
     if not motions:
         return CameraError(kind, 0.0, deviation, prior)
-    noise = max(float(np.median(distance, axis=1).min()), LEAST_MEDIAN_PX)
+    noise = max(float(np.median(distance, axis=1).min()), EXACT_PX)
     against = MEASUREMENTS * np.mean(np.log1p((distance / noise) ** 2), axis=1)
     gain = against[len(TRIED_ERRORS) // 2] - against - TRIED_ERRORS**2 / 2
     density = special.softmax(gain)
     x = deviation * TRIED_ERRORS
     mean = float(density @ x)
     # no finer than the errors that are tried
-    spread = max(
-        float(np.sqrt(density @ (x - mean) ** 2)), deviation * (TRIED_ERRORS[1] - TRIED_ERRORS[0])
-    )
+    finest = deviation * (TRIED_ERRORS[1] - TRIED_ERRORS[0])
+    spread = max(float(np.sqrt(density @ (x - mean) ** 2)), finest)
     # the flow is so much more probable with an error
     more = float(special.logsumexp(gain) - special.logsumexp(-(TRIED_ERRORS**2) / 2))
     return CameraError(kind, mean, spread, prior + more, tuple(x), tuple(density), motions)
 
 
 def _explained(matches: Matches, kind: str, deviation: float) -> tuple[Float, tuple[Motion, ...]]:
-    """The best motion with every error, and its Sampson distances (len(TRIED_ERRORS), M), pixels.
-
-    There are no motions where the flow determines none.
+    """The best motion with every error, and its Sampson distances (len(TRIED_ERRORS), M), pixels;
+    no motions where the flow determines none.
 
     Motions change little from one error to the next. That of a focal length changes much from one
     end to the other, and is sought from the ends as well.
@@ -166,9 +152,9 @@ def _explained(matches: Matches, kind: str, deviation: float) -> tuple[Float, tu
         if motion is None:
             continue
         for k in way:
-            motion = refine_near(motion, tried[k], ERROR_NOISE_PX, rounds=ERROR_FITS)
+            motion = refine_near(motion, tried[k], LEAST_NOISE, ERROR_FITS)
             distance = _distance(tried[k], motion, kind, errors[k], matches)
-            error = float(np.mean(np.log1p((distance / ERROR_NOISE_PX) ** 2)))
+            error = float(np.mean(np.log1p((distance / LEAST_NOISE) ** 2)))
             if error < least[k]:
                 best[k], least[k], motions[k] = distance, error, motion
     complete = len(motions) == count

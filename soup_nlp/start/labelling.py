@@ -51,8 +51,9 @@ PIECE_SIZE = 4
 """Least number of superpixels that determine a motion."""
 UNEXPLAINED = 2.0
 """Cost of a superpixel from which on a motion does not explain it."""
-MOTION_PIXELS, SCENE_PIXELS = 1500, 6000
-"""Largest number of pixels to which a motion is fitted, and that of the whole image."""
+MOTION_PIXELS = 1500
+"""Largest number of pixels to which a motion is fitted, a turn to twice and the motion of the whole
+image to four times as many."""
 EXACT_PX = 0.005
 """Error below which a flow is exact, as a rendered one is, and leaves no motion open, pixels."""
 
@@ -155,7 +156,7 @@ def _cost(excess: Float, shared: float) -> Float:
 
 def dominant(flow: FlowFit) -> Motion:
     """The motion that most of the image shares."""
-    return estimate(flow.views.matches().confident(SCENE_PIXELS)) or SIDEWAYS
+    return estimate(flow.views.matches().confident(4 * MOTION_PIXELS)) or SIDEWAYS
 
 
 def _proposed(

@@ -34,7 +34,6 @@ from soup_nlp.start.labelling import (
     limited_noise,
     settle,
 )
-from soup_nlp.start.occlusion import vote
 from soup_nlp.start.regions import (
     SCENE,
     TIES,
@@ -42,6 +41,7 @@ from soup_nlp.start.regions import (
     connected_pieces,
     continued,
     numbered,
+    vote,
 )
 from soup_nlp.start.scales import ground, held, on_ground, scaled
 from soup_nlp.start.views import JUMP_PX, LEAST_PARALLAX_PX, LEAST_SEEN, FlowFit, Views
@@ -77,7 +77,7 @@ class Start:
         at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Noise of the flow, pixels, see `limited_noise`.
         order: (P,) probability that the second superpixel of a neighbour pair covers the first one,
-            negative if the first covers the second, 0 where neither is known (`start.occlusion`,
+            negative if the first covers the second, 0 where neither is known (`covering`,
             `order_in_front`); None where nothing is known.
         scatter: (N,) root mean square difference of log depth from the starts that were not taken
             (`most_usual`); 0 where there is one.

@@ -26,8 +26,7 @@ from scipy.optimize import linprog
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.occlusion import CONTRAST
-from soup_nlp.start.regions import FIXED, SCENE, TIES, TOO_FAST, numbered
+from soup_nlp.start.regions import CONTRAST, FIXED, SCENE, TIES, TOO_FAST, numbered
 from soup_nlp.start.views import JUMP_PX, FlowFit
 
 STEEP_COSINE = 0.5

@@ -15,9 +15,8 @@ from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
-from soup_nlp.start.occlusion import LEAST_ORDER, covering, vote
 from soup_nlp.start.propose import Start, propose
-from soup_nlp.start.regions import TIES
+from soup_nlp.start.regions import LEAST_ORDER, TIES, covering, vote
 from soup_nlp.start.scales import LEAST_STEP_IN_FRONT
 
 HEIGHT, WIDTH, CELL = 96, 128, 16

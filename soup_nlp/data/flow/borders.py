@@ -18,19 +18,14 @@ from soup_nlp.geometry.superpixels import LEAST_PIECE, Labels, split_components
 
 SCALE_PX = 0.25
 """Smallest residual that a fit may treat as an outlier, pixels."""
-ROUNDS = 3
-"""Re-weighted fits of an affine flow."""
-SWEEPS = 12
-"""Number of sweeps, in each of which a border moves at most one pixel, after each of two fits."""
+ROUNDS, SWEEPS = 3, 12
+"""Re-weighted fits of an affine flow, and sweeps after each of two fits, in each of which a border
+moves at most one pixel."""
 LEAST_STEP = 0.05
 """Least reduction of the residual of log depth for which a pixel changes its superpixel."""
 
 
-def follow_flow(
-    labels: NDArray[np.integer],
-    flow: Flow,
-    margin_px: float = 1.0,
-) -> Labels:
+def follow_flow(labels: NDArray[np.integer], flow: Flow, margin_px: float = 1.0) -> Labels:
     """Move borders of superpixels, labels (H, W), to discontinuities of the flow.
 
     In every sweep a border pixel changes to the neighbour whose affine flow (see `fit_affine`) is
@@ -74,9 +69,6 @@ def follow_depth(labels: NDArray[np.integer], log_depth: Float) -> Labels:
     units = np.where(finite, log_depth, 0.0) / LEAST_STEP
     both = np.stack([units, np.zeros_like(units)], axis=-1)
     return follow_flow(labels, Flow(both.astype(np.float32), finite.astype(np.float32), "depth"))
-
-
-# --- affine flow of superpixels ---
 
 
 @dataclass(frozen=True)

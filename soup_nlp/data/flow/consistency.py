@@ -20,11 +20,9 @@ from soup_nlp.errors import DataError
 SUPPORT = 15
 """Side of the window over which the round-trip error is averaged, pixels: a wrong flow may be
 consistent at a single pixel, but rarely in a whole window."""
-
-LIMIT = 3.0
-"""Round-trip error, pixels, above which a flow is not used: its confidence would be 0.0001."""
-MOST = 5.0
-"""Largest error that counts in the mean of a window, pixels."""
+LIMIT, MOST = 3.0, 5.0
+"""Round-trip error, pixels, above which a flow is not used: its confidence would be 0.0001; and
+largest error that counts in the mean of a window."""
 
 
 def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
@@ -35,7 +33,7 @@ def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
     """
     height, width = forward.shape[:2]
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    inside = ~leaves(forward, (backward.shape[0], backward.shape[1]))
+    inside = ~leaves(forward, backward.shape)
     x = np.where(inside, u + forward[:, :, 0], 0.0).astype(np.float32)
     y = np.where(inside, v + forward[:, :, 1], 0.0).astype(np.float32)
     back = sampled(backward, x, y)
@@ -51,7 +49,7 @@ def sampled(image: NDArray[Any], x: FloatMap, y: FloatMap) -> FloatMap:
     return np.asarray(cv2.remap(values, x, y, kind, borderMode=border))
 
 
-def leaves(flow: NDArray[np.floating], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def leaves(flow: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """(H, W) bool, True where a flow (H, W, 2) is not finite or points outside the next image."""
     height, width = flow.shape[:2]
     x = np.arange(width)[None, :] + flow[:, :, 0]
@@ -72,11 +70,9 @@ def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:
     return np.asarray(confidence, dtype=np.float32)
 
 
-BETTER = 0.8
-"""Ratio of two photometric errors below which the changed flow is clearly better."""
-FLAT = 0.02
-"""Photometric error, standard deviations of grey, below which images agree with every flow."""
-OTHER = "is it of these two images, in this order, in pixels?"
+BETTER, FLAT = 0.8, 0.02
+"""Ratio of two photometric errors below which the changed flow is clearly better, and photometric
+error, standard deviations of grey, below which images agree with every flow."""
 MOST_PIXELS = 250_000
 """Largest number of pixels that are compared."""
 
@@ -115,7 +111,8 @@ def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
     without = differences(at @ A[:, :2].T + A[:, 2] - at)
     problem, hint, least = "", "", BETTER
     if not backward and mean(without, without) < BETTER * mean(along, along):
-        problem, hint = "flow does not fit the images: it is worse than no flow", OTHER
+        problem = "flow does not fit the images: it is worse than no flow"
+        hint = "is it of these two images, in this order, in pixels?"
     for cause, changed in _changes(uv, pair).items():
         new = differences(changed)
         # a pixel that leaves the image along either flow is not compared
@@ -138,8 +135,8 @@ EDGE, SAME, CHANGED = 10.0, 6.0, 20.0
 """Grey levels: least gradient of an edge per pixel, largest change of one that stands still, and
 least difference to where the flow around it leads."""
 MOVES_PX, SHRUNK, WINDOWS = 2.0, 8, 8
-"""Least flow around such an edge, pixels; by which factor flows are shrunk for their medians, and
-how many windows of a median the longer side holds."""
+"""Least flow around such an edge, or difference to a flow that follows a still layer, pixels; by
+which factor flows are shrunk for their medians, and how many windows the longer side holds."""
 
 
 def standing_edges(pair: Pair) -> float:

@@ -16,23 +16,19 @@ from scipy.fft import dctn, idctn
 
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.census import census, census_at
+from soup_nlp.data.flow.consistency import MOVES_PX
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.camera import pixel_grid, rays
 
-LEVELS = 64
-"""Number of depths that are tried for each kind of plane."""
-REACH = 0.25
-"""Largest displacement tried, in widths of the image, at unit distance from the epipole."""
-WINDOW = 31
-"""Side of the window over which costs are averaged, pixels."""
+LEVELS, REACH = 64, 0.25
+"""Number of depths that are tried for each kind of plane, and largest displacement tried, in widths
+of the image, at unit distance from the epipole."""
+WINDOW, STRIDE = 31, 4
+"""Side of the window over which costs are averaged, and distance between the examined pixels."""
 TAU = 0.35
 """Truncation of the census cost."""
-STRIDE = 4
-"""Distance between the examined pixels, pixels."""
 STILL_PX = 0.5
 """Largest displacement of a static pixel, pixels."""
-MOVED_PX = 2.0
-"""Smallest difference of two displacements that counts as a contradiction, pixels."""
 MIN_GAIN_STATIC, MIN_GAIN = 0.02, -0.01
 """Smallest reduction of the cost by the new flow for a static pixel to count as contradicted, and
 for any pixel to be replaced once enough static pixels are contradicted."""
@@ -49,22 +45,16 @@ def without_still_layer(ref: Image, nxt: Image) -> tuple[Image, Image]:
     from both. The images are recovered from the rest by Poisson's equation with free borders
     (cosine transforms). Regions without a static layer lose some contrast in both images.
     """
-    ref, nxt = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (ref, nxt))
-    first, second = (_derivatives(image.astype(np.float32)) for image in (ref, nxt))
-    shared = [
-        np.where(a * b > 0, np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0)
-        for a, b in zip(first, second, strict=True)
-    ]
-    return tuple(  # type: ignore[return-value]
-        _integrated(derivatives[0] - shared[0], derivatives[1] - shared[1], float(image.mean()))
-        for derivatives, image in ((first, ref), (second, nxt))
-    )
-
-
-def _derivatives(image: FloatMap) -> tuple[FloatMap, FloatMap]:
-    """Differences to the pixels on the right and below; 0 at the border."""
-    along = np.diff(image, axis=1, append=image[:, -1:])
-    return along, np.diff(image, axis=0, append=image[-1:])
+    images = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (ref, nxt)])
+    values = images.astype(np.float32)
+    # differences of both images to the pixels on the right and below; 0 at the border
+    along = np.diff(values, axis=2, append=values[..., -1:])
+    down = np.diff(values, axis=1, append=values[:, -1:])
+    for both in (along, down):
+        a, b = both
+        both -= np.where(a * b > 0, np.sign(a) * np.minimum(np.abs(a), np.abs(b)), 0)
+    first, second = (_integrated(along[k], down[k], float(images[k].mean())) for k in (0, 1))
+    return first, second
 
 
 def _integrated(along: FloatMap, down: FloatMap, mean: float) -> Image:
@@ -114,7 +104,7 @@ def corrected(
     now = flow.uv[::STRIDE, ::STRIDE]
     gain = cost_at(u + now[..., 0], v + now[..., 1]) - cost
     moved = np.linalg.norm(swept - now, axis=2)
-    contradicted = still(flow)[::STRIDE, ::STRIDE] & (gain > MIN_GAIN_STATIC) & (moved > MOVED_PX)
+    contradicted = still(flow)[::STRIDE, ::STRIDE] & (gain > MIN_GAIN_STATIC) & (moved > MOVES_PX)
     if contradicted.mean() < MIN_CONTRADICTED:
         return None
 
@@ -123,7 +113,7 @@ def corrected(
         return np.asarray(cv2.resize(coarse, size)[: ref.shape[0], : ref.shape[1]], np.float32)
 
     gain = cv2.blur(gain, (9, 9))
-    wrong = (full(gain) > MIN_GAIN) & (full(moved) > MOVED_PX)
+    wrong = (full(gain) > MIN_GAIN) & (full(moved) > MOVES_PX)
     guess = np.where(wrong[..., None], full(swept), flow.uv).astype(np.float32)
     # DIS on the two finest scales
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)

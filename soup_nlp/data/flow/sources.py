@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from soup_nlp.arrays import Image
 from soup_nlp.data.flow.consistency import check_flow, confidence_of, round_trip_error
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.formats.map_files import read_confidence, read_flow
@@ -22,20 +21,12 @@ from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.schema.section import Section
 from soup_nlp.storage.files import PathLike, is_file
 
-FlowSource = Callable[[Image, Image], Flow]
-
 METHODS = ("dis", "truth")
 """Flow methods of this package."""
 
-ENTRY_POINTS = "soup_nlp.flow"
-"""Entry-point group in which other packages register flow methods."""
-
-NOISE = "truth+noise:"
-"""Prefix of the source "true flow with noise", followed by the standard deviation in pixels."""
-
-CORRELATION = 5.0
-"""Standard deviation of the Gaussian that blurs the noise, pixels."""
-
+NOISE, CORRELATION = "truth+noise:", 5.0
+"""Prefix of the source "true flow with noise", followed by the standard deviation in pixels, and
+that of the Gaussian that blurs the noise, pixels."""
 BLACK = 24
 """Largest grey level of a black bar: black of limited range is 16, and its coding has errors."""
 
@@ -72,12 +63,11 @@ def flow_from_truth(pair: Pair, source: str = "truth") -> Flow:
     if not 0 <= sigma < 1000:
         what = "noise of the flow is not a number of pixels"
         raise DataError(what, found=source, expected=f"{NOISE}0.5")
-    height, width = flow.confidence.shape
-    pad = int(np.ceil(4 * CORRELATION))
+    (height, width), pad = flow.confidence.shape, int(4 * CORRELATION)
     shape = (height + 2 * pad, width + 2 * pad, 2)
     noise = np.random.default_rng(0).standard_normal(shape).astype(np.float32)
     blurred = cv2.GaussianBlur(noise, (0, 0), CORRELATION)
-    noise = np.asarray(blurred, np.float32)[pad : pad + height, pad : pad + width]
+    noise = np.asarray(blurred[pad : pad + height, pad : pad + width], np.float32)
     # normalise: the deviation of blurred noise differs from its expectation in a small image
     noise = noise * np.float32(sigma / max(float(noise.std()), 1e-12))
     uv = np.where(flow.confidence[:, :, None] > 0, flow.uv + noise, flow.uv)
@@ -108,9 +98,7 @@ class FlowOptions(Section):
         given = self.is_file() or source.startswith("truth")
         near = pair if given else at_common_focal(pair)
         flow = resolve_flow(near, source, self.consistency)
-        if near is pair:
-            return flow
-        return resized_flow(flow, near, pair)
+        return flow if near is pair else resized_flow(flow, near, pair)
 
     def _with_confidence(self, pair: Pair, source: str, path: Callable[[str], Path]) -> Flow:
         """The flow of a file, its confidence from a backward flow and a map."""
@@ -125,16 +113,15 @@ class FlowOptions(Section):
         flow = resolve_flow(pair, source)
         confidence = flow.confidence.copy()
         if self.backward:
-            back = load_flow(path(self.backward))
-            size = pair.image_next.shape
+            back, size = load_flow(path(self.backward)), pair.image_next.shape
             check_size("backward flow and next image", back.uv.shape, size, self.backward)
             check_flow(back, pair, backward=True)
-            back_uv = np.where(back.confidence[..., None] > 0, back.uv, np.nan)
-            gap = round_trip_error(flow.uv, back_uv)
+            known = back.confidence[..., None] > 0
+            gap = round_trip_error(flow.uv, np.where(known, back.uv, np.nan))
             confidence *= confidence_of(gap) if self.consistency else np.isfinite(gap)
         if self.confidence:
-            checked = Flow(flow.uv, read_confidence(path(self.confidence)), self.confidence)
-            confidence *= checked.confidence
+            sure = read_confidence(path(self.confidence))
+            confidence *= Flow(flow.uv, sure, self.confidence).confidence
         if not confidence.any():
             raise DataError(
                 "the flow has confidence 0 everywhere",
@@ -155,7 +142,7 @@ class FlowOptions(Section):
 
 def flow_sources() -> dict[str, EntryPoint]:
     """Flow methods of installed plug-ins by name."""
-    return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    return {point.name: point for point in entry_points(group="soup_nlp.flow")}
 
 
 def is_named(source: str) -> bool:
@@ -213,8 +200,7 @@ def _without_bars(flow: Flow, pair: Pair) -> Flow:
 def _run_plugin(point: EntryPoint, pair: Pair) -> Flow:
     where = f"flow plug-in {point.name!r} ({point.value})"
     try:
-        method: FlowSource = point.load()
-        flow = method(pair.image_ref, pair.image_next)
+        flow = point.load()(pair.image_ref, pair.image_next)
     except DataError:
         raise
     except Exception as error:
