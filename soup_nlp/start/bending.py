@@ -147,11 +147,8 @@ def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
 
 
 def moving_pieces(flow: FlowFit) -> Int:
-    """(N,) piece of every superpixel before a camera at rest, or one that only turns.
-
-    0 is everything that the turn explains, the others are connected pieces of what moves. Those
-    with too few superpixels whose flow is usable count as still.
-    """
+    """(N,) connected piece of what moves before a camera that turns at most; 0 is what the turn
+    explains, and pieces with too few superpixels whose flow is usable."""
     still = fit_turn(flow.views)[1] < JUMP_PX
     piece = connected_labels(~flow.seg.across(still) & (flow.jump < JUMP_PX), flow.seg)
     still |= np.bincount(piece, flow.views.usable)[piece] < PIECE_SIZE
@@ -215,10 +212,7 @@ move differently: surfaces that bend have at most 6.4, vehicles that seem to ben
 
 
 def torn(flow: FlowFit, surface: Int, bends: Mask) -> Mask:
-    """(N,) True in connected regions that bend (N,) although the flow jumps inside.
-
-    The flow of a bending surface is continuous. Between parts that move differently it jumps.
-    """
+    """(N,) True in connected regions that bend although the flow jumps inside surfaces (N,)."""
     region, pairs = connected_pieces(bends, flow.seg), flow.seg.pairs
     inside = (bends & flow.views.usable)[pairs].all(axis=1) & ~flow.seg.across(surface)
     out = np.zeros(len(bends), bool)

@@ -1,9 +1,8 @@
 """Whether a depth prior belongs to a pair: by the depth that flow determines, else by image edges.
 
-Where the flow determines the depth of the scene, the right map differs less from that
-depth than one constant depth does. Where the camera rests or turns, the flow is no evidence. A map
-of another scene then differs from the right map in one way: shifted or mirrored, it follows the
-edges of the image as well as in its own place.
+Where the flow determines the depth of the scene, the right map differs less from that depth than
+one constant depth does. Where the camera rests or turns, the flow is no evidence. Shifted or
+mirrored, a map of another scene follows the edges of the image as well as in its own place.
 """
 
 from collections.abc import Callable
@@ -43,9 +42,8 @@ DEEPEST = 50.0
 COMPARED_SIDE = 320
 """Longer side of the maps that are compared, pixels."""
 JUDGED_PIECES = 300
-"""Superpixels with which a prior is judged, whatever a solve has. With 1,000 the flow of
-omd_occlusion_161 does not confirm its depth warped by 20 % (0.66 instead of 0.56), and maps that
-are shifted over the image vary little within superpixels, too."""
+"""Superpixels with which a prior is judged, whatever a solve has: maps that are shifted over the
+image vary little within smaller ones, too."""
 SHIFT_TRIALS, MOST_SHIFT, LEAST_SHIFT = 60, 1 / 3, 0.1
 """Shifted maps, every other one mirrored; the largest shift relative to the side, and the least one
 of a map that is not mirrored, relative to the width."""
@@ -62,8 +60,8 @@ class PriorEvidence:
     Attributes:
         kind: Kind of its values.
         log_depth: Log depth, up to a common scale, as a function of its values.
-        ratio: Spread of its log ratio to the depth of the scene by the flow, relative
-            to the spread of the log of that depth; NaN where the flow is no evidence.
+        ratio: Spread of its log ratio to the depth of the scene by the flow, relative to that of
+            the log of that depth; NaN where the flow is no evidence.
         sigma: Standard deviation of its log depth in the whole image; inf where it is not used.
         determined: Whether the flow determines the depth of the scene.
         margin: Standard deviations by which it follows the edges of the image better than by
@@ -97,10 +95,7 @@ class PriorEvidence:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the flow confirms the prior.
-
-        Where it does not determine depth, that has to make the prior surer.
-        """
+        """Whether the flow confirms the prior, which is to be surer where flow tells no depth."""
         return self.explained >= EXPLAINED and (self.determined or self.sigma < UNCONFIRMED)
 
     @property

@@ -58,27 +58,21 @@ class Start:
         borrowed: (N,) True where plane or motion come from neighbours.
         motion: (N,) index of its motion in `motions`, -1 where it has its own.
         component: (N,) index of the rigid component, which shares one scale: the superpixels of a
-            dominant motion, or a connected piece of superpixels with their own motions. The first
-            one is the scene (`SCENE`).
-        part: (N,) group that moves as one: its component; before a camera at rest each piece that
-            moves.
+            dominant motion, or a connected piece of superpixels with their own motions; `SCENE`.
+        part: (N,) group that moves as one: its component; at rest each piece that moves.
         motions: The motions that superpixels share.
-        surface: (N,) index of the surface: a connected group without flow discontinuities inside;
-            where a region bends, discontinuities make up most of its outline.
+        surface: (N,) index of the surface: a connected group without flow discontinuities inside.
         tie: (N,) origin of the scale of every superpixel's component, an index of `TIES`.
         bends: (N,) True where the energy for bending surfaces is used. Its connected regions are
-            components that start at a constant depth, each superpixel with a motion of its own. If
-            the rigid part is small or has no parallax, or the camera is at rest, the whole image is
-            one such component.
+            components that start at a constant depth, each superpixel with a motion of its own.
         unexplained: (N,) True where nothing tells the depth: the motion leaves a large error, or a
             region bends although its flow jumps, see `torn`.
-        wrong: (N,) True where the motion does not explain the flow, which then counts as
-            wrong.
+        wrong: (N,) True where the motion does not explain the flow, which does not count then.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Noise of the flow, pixels, see `limited_noise`.
         order: (P,) probability that the second superpixel of a neighbour pair covers the first one,
-            negative if the first covers the second, 0 where neither is known (`covering`,
-            `order_in_front`); None where nothing is known.
+            negative if the first covers the second, 0 where neither is known (`vote`, `held`);
+            None where nothing is known.
         scatter: (N,) root mean square difference of log depth from the starts that were not taken
             (`most_usual`); 0 where there is one.
     """
@@ -282,8 +276,7 @@ def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Ma
 
 RECEDES = 0.7
 """Relative change of inverse depth from the top to the bottom of an upright image of a scene that
-two views tell nothing of: most scenes recede upwards. True depths of cameras at rest have slopes of
-0.2 to 3, about 1 in the middle."""
+two views tell nothing of. True depths of cameras at rest have slopes of 0.2 to 3."""
 
 
 def receding(views: Views, soup: Soup) -> Soup:
@@ -302,13 +295,13 @@ PATCH_PIXELS, PATCH_PX = 400, 0.5
 
 
 def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
-    """The soup of independent superpixels with equal scales, and which of them borrowed.
+    """The soup of independent superpixels with equal scales, and which of them borrowed (N,).
 
     The motion (R, t) of a superpixel comes from the flow of itself and of its nearest neighbours,
     by essential matrix and cheirality; its plane then follows from `q ~ (R - t n^T / d) r`, which
     is linear in n / d. A superpixel for which this fails takes the result of the nearest one for
-    which it succeeds, (N,) True in the second result. All anchors have the same depth, which the
-    paper takes as a positive constant (Sec. 4.4.1). The soup is not normalised.
+    which it succeeds. All anchors have the same depth, a positive constant in the paper. The soup
+    is not normalised.
     """
     seg, anchor = flow.seg, flow.views.anchor
     patches = [_patch(flow, i) for i in range(len(seg))]

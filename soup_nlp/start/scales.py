@@ -10,11 +10,9 @@ pair of neighbours and x the log scales, the program adds up
 * order: by how much a component that covers another one is less than `LEAST_STEP_IN_FRONT`
   before it.
 
-What stands on the ground or lies below it: a superpixel without usable flow (it leaves the image,
-is dark or moves too fast) borrows its depth from its neighbours, and a component without a known
-support is scaled by its outline. Both may come out far below the road. In an upright image, a level
-plane on which much of the scene lies and below which almost nothing lies bounds the depth of
-everything seen below the horizon.
+Superpixels that borrow their depth, and components scaled by their outline, may come out far below
+the road. In an upright image, a level plane on which much of the scene lies and below which almost
+nothing lies bounds the depth of everything seen below the horizon.
 """
 
 from dataclasses import replace
@@ -256,7 +254,7 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
 def _level(mu: Float, floor: Float, under: Mask, weight: Float) -> bool:
     """Whether most of what lies under a plane (N,) has one distance from it.
 
-    It is then real, as the floor beside a table. Wrong flow leaves any depth.
+    It is then real, as the floor beside a table; wrong flow leaves any depth.
     """
     if not under.any():
         return False
