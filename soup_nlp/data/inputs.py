@@ -122,16 +122,9 @@ class FilesInput(FramesInput):
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
 
-        def depth(name: str | None) -> Float | None:
-            return None if name is None else read_depth(path(name), self.depth_scale)
-
         if self.intrinsics is not None and self.fov is not None:
-            raise ConfigError(
-                "two cameras are given",
-                where="input",
-                found="intrinsics and fov",
-                expected="one of them",
-            )
+            what, found = "two cameras are given", "intrinsics and fov"
+            raise ConfigError(what, where="input", found=found, expected="one of them")
         no_file = not isinstance(self.intrinsics, str)
         if self.undistort and (no_file or self.depth or self.depth_next):
             raise ConfigError(
@@ -141,7 +134,11 @@ class FilesInput(FramesInput):
                 expected="intrinsics in a file with distortion, and no true depth, which would"
                 " belong to the images before",
             )
-        truth = Truth(depth(self.depth), depth(self.depth_next), unit=self.unit)
+        depth, depth_next = (
+            None if name is None else read_depth(path(name), self.depth_scale)
+            for name in (self.depth, self.depth_next)
+        )
+        truth = Truth(depth, depth_next, unit=self.unit)
         cameras: list[Float | None] = []
         lenses: list[Float] = []
         for camera in (self.intrinsics, self.intrinsics_next or self.intrinsics):
@@ -152,16 +149,9 @@ class FilesInput(FramesInput):
             elif isinstance(camera, str):
                 K = read_intrinsics(path(camera))
             cameras.append(K)
-        return make_pair(
-            [path(self.ref), path(self.next)],
-            cameras,
-            truth,
-            self.white,
-            fov=self.fov,
-            focal_sigma=self.focal_sigma,
-            cropped=self.cropped,
-            distortion=lenses,
-        )
+        images, white, cropped = [path(self.ref), path(self.next)], self.white, self.cropped
+        focal = self.fov, self.focal_sigma
+        return make_pair(images, cameras, truth, white, cropped, *focal, distortion=lenses)
 
     def files(self) -> list[str]:
         """See `PairInput`."""
@@ -239,12 +229,9 @@ def pair_hash(pair: Pair) -> str:
     """Hash of images, cameras and, if there is one, the flow."""
     digest = hashlib.sha256()
     arrays: list[NDArray[Any]] = [pair.image_ref, pair.image_next, pair.K_ref, pair.K_next]
-    if pair.flow is not None:
-        arrays += [pair.flow.uv, pair.flow.confidence]
-    if pair.depth_prior is not None:
-        arrays.append(pair.depth_prior)
-    if pair.focal_sigma > 0:
-        arrays.append(np.array(pair.focal_sigma))
+    arrays += [] if pair.flow is None else [pair.flow.uv, pair.flow.confidence]
+    arrays += [] if pair.depth_prior is None else [pair.depth_prior]
+    arrays += [np.array(pair.focal_sigma)] if pair.focal_sigma > 0 else []
     for array in arrays:
         digest.update(f"{array.dtype} {array.shape}\0".encode())
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -20,12 +20,8 @@ RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
 class Network:
     """A network that onnxruntime runs on the CPU.
 
-    Its inputs are images (1, 3, H, W), or one stack (1, 6, H, W) of two, float, RGB. Images are
-    resized to a fixed size of the inputs, or else padded to a multiple of 8.
-
-    Args:
-        source: Path of an .onnx file.
-        count: Number of images, 1 or 2.
+    Its inputs are one or two images (1, 3, H, W), `count`, or one stack (1, 6, H, W) of two, float,
+    RGB. Images are resized to a fixed size of the inputs, or else padded to a multiple of 8.
     """
 
     def __init__(self, source: str, count: int) -> None:

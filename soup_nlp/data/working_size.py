@@ -25,18 +25,18 @@ def working_size(pair: Pair, megapixels: float | None) -> Pair:
     height, width = pair.size
     if megapixels is None or height * width <= megapixels * 1e6:
         return pair
-    factor = np.sqrt(megapixels * 1e6 / (height * width))
-    small = _at_sizes(pair, np.array([[factor], [factor]]))
-    truth, prior = pair.truth, pair.depth_prior
-    if truth is not None:
-        small = replace(small, truth=_truth(truth, pair, small))
-    if prior is not None:
-        small = replace(small, depth_prior=_nearest(prior, small.size))
-    return small if pair.flow is None else small.with_flow(resized_flow(pair.flow, pair, small))
+    small = _at_sizes(pair, np.sqrt(megapixels * 1e6 / (height * width)))
+    truth, prior, flow = pair.truth, pair.depth_prior, pair.flow
+    return replace(
+        small,
+        truth=truth and _truth(truth, pair, small),
+        depth_prior=None if prior is None else _nearest(prior, small.size),
+        flow=flow and resized_flow(flow, pair, small),
+    )
 
 
-def _at_sizes(pair: Pair, factors: Float) -> Pair:
-    """The images and cameras of a pair, reduced by factors (2, 2) or (2, 1) (height, width)."""
+def _at_sizes(pair: Pair, factors: Float | float) -> Pair:
+    """The images and cameras of a pair, reduced by one factor or by (2, 2) (height, width)."""
     images = pair.image_ref, pair.image_next
     shapes = np.array([image.shape[:2] for image in images])
     sizes = np.maximum(1, np.rint(shapes * factors)).astype(int)
@@ -88,10 +88,8 @@ def _nearest(values: NDArray[Any], size: Sequence[int]) -> NDArray[Any]:
 
 def _truth(truth: Truth, pair: Pair, small: Pair) -> Truth:
     """The truth at the sizes of the smaller images."""
-    ref, following = (
-        np.divide(image.shape[1::-1], old.shape[1::-1])
-        for image, old in ((small.image_ref, pair.image_ref), (small.image_next, pair.image_next))
-    )
+    ref = np.divide(small.image_ref.shape[1::-1], pair.image_ref.shape[1::-1])
+    following = np.divide(small.image_next.shape[1::-1], pair.image_next.shape[1::-1])
     changed: dict[str, Any] = {}
     for name in truth.known():
         value = getattr(truth, name)

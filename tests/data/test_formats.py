@@ -190,7 +190,7 @@ def test_pfm_golden_bytes(tmp_path: Path, scale: bytes, order: str, comment: byt
     rows = np.array([[1, 2, 3], [4, 5, 6]], order)
     head = b"Pf\n" + comment + b"3 2\n" + comment + scale + b"\n"
     path = put(tmp_path / "a.pfm", head + rows[::-1].tobytes())
-    np.testing.assert_array_equal(fmt.read_pfm(path), rows)
+    np.testing.assert_array_equal(fmt.read_depth(path), rows)
 
 
 def test_a_prior_is_read_from_more_files_than_a_depth(tmp_path: Path) -> None:

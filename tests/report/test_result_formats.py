@@ -11,7 +11,7 @@ from helpers_result import BOARD_Z, CAMERA, WALL_Z, K, board, small_result, toy_
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from soup_nlp.data.formats.map_files import read_pfm
+from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.formats import FORMATS, write_formats
@@ -164,7 +164,9 @@ def test_maps_are_read_by_numpy_opencv_and_pillow(tmp_path, result):
         np.testing.assert_array_equal(found, depth.astype(np.float32))
         found = cv2.imread(str(tmp_path / f"depth_{name}.pfm"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(found, np.where(known, depth, np.inf).astype(np.float32))
-        np.testing.assert_array_equal(read_pfm(tmp_path / f"depth_{name}.pfm")[known], found[known])
+        np.testing.assert_array_equal(
+            read_depth(tmp_path / f"depth_{name}.pfm")[known], found[known]
+        )
         labels, moving = (
             np.asarray(Image.open(tmp_path / f"{k}_{name}.png")) for k in ("components", "moving")
         )

@@ -268,12 +268,8 @@ class TumInput(PairInput):
         depths = folder.read(_tum_list, "depth.txt") or []
         numbers = self.frame, self.frame + self.step
         if numbers[1] >= len(images):
-            raise DataError(
-                "frame is not in the sequence",
-                where=folder.path / "rgb.txt",
-                found=numbers[1],
-                expected=f"0 to {len(images) - 1}",
-            )
+            what, where = "frame is not in the sequence", folder.path / "rgb.txt"
+            raise DataError(what, where=where, found=numbers[1], expected=f"0 to {len(images) - 1}")
         K = folder.read(read_intrinsics, "K.txt", "camera.txt")
         if K is None:
             sensor = re.search(r"freiburg[123]", str(folder.path.resolve()))
@@ -289,7 +285,7 @@ class TumInput(PairInput):
 
 
 def _tum_list(path: Path) -> list[tuple[float, str]]:
-    """(time stamp in seconds, name of a file) of each line of rgb.txt or depth.txt."""
+    """(time stamp in seconds, name of a file) of each line."""
     lines = [line.split() for line in read_text(path, "file list").splitlines()]
     try:
         return [(float(w[0]), w[1]) for w in lines if w and not w[0].startswith("#")]

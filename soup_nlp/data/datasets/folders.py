@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import skimage
+from numpy.typing import NDArray
 from pydantic import Field
 
 from soup_nlp.arrays import Float
@@ -61,12 +62,9 @@ class Folder:
     def __init__(self, path: PathLike, layout: str, below: str = "") -> None:
         self.path, self.layout = as_path(path, "dataset folder"), layout
         if not is_folder(self.path):
-            raise DataError(
-                "dataset folder is missing",
-                where=path,
-                found="a file" if is_file(path) else "nothing",
-                expected=f"a folder with {layout}",
-            )
+            found, expected = "a file" if is_file(path) else "nothing", f"a folder with {layout}"
+            what = "dataset folder is missing"
+            raise DataError(what, where=path, found=found, expected=expected)
         self.path = self.path / below if is_folder(self.path / below) else self.path
 
     def find(self, *names: str) -> Path | None:
@@ -101,24 +99,17 @@ def make_pair(
     cameras: Sequence[Float | None],
     truth: Truth,
     white: int | None = None,
-    *,
+    cropped: bool = False,
     fov: float | None = None,
     focal_sigma: float = 0.0,
-    cropped: bool = False,
     distortion: Sequence[Float] = (),
 ) -> Pair:
     """The pair of two image files; its truth is None if no part of it is known.
 
-    Args:
-        images: Reference and next image.
-        cameras: (3, 3) intrinsics of both frames, pixels; None is estimated (`estimated_cameras`).
-            If both are None, images are rotated by their EXIF orientation.
-        truth: Truth from its files.
-        white: Value of white in 16-bit images, see `read_images`.
-        fov: Horizontal field of view, degrees, if the cameras are not known.
-        focal_sigma: Standard deviation of the log focal length of `fov`.
-        cropped: The images are parts of larger ones, see `check_cameras`.
-        distortion: Coefficients (n,) of both lenses, removed from the images, see `undistorted`.
+    Intrinsics (3, 3) that are None are estimated (`estimated_cameras`) from `fov`, degrees, with
+    the deviation `focal_sigma`; if both are, images are rotated by their EXIF orientation. For
+    `white` see `read_images`, for `cropped` see `check_cameras`. The `distortion` (n,) of both
+    lenses is removed from the images, see `undistorted`.
     """
     # a given camera may belong to the stored or to the rotated image
     pictures = read_images(images, white, turn=all(K is None for K in cameras))
@@ -145,7 +136,6 @@ _DEPTHS = ".npy .dpt .pfm .png"
 
 
 def _names(stems: str, suffixes: str) -> list[str]:
-    """Names of files with one of the stems and one of the suffixes, separated by blanks."""
     return [f"{stem}{suffix}" for stem in stems.split() for suffix in suffixes.split()]
 
 
@@ -179,25 +169,20 @@ class FolderInput(FramesInput):
             folder.read(read_depth, *_names(stems, _DEPTHS), scale=self.depth_scale)
             for stems in ("depth depth_0 depth_ref", "depth_next depth_1")
         )
-        moving = folder.read(read_mask, *_names("moving", _IMAGES))
-        if moving is not None:
-            # connected regions
-            moving = skimage.measure.label(moving, connectivity=2).astype(np.int32)
         truth = Truth(
             depth_ref=depth,
             depth_next=depth_next,
             flow=folder.read(read_flow, *_names("flow", ".flo .npy .png")),
             occluded=folder.read(read_mask, *_names("occluded", _IMAGES)),
-            components=moving,
+            components=folder.read(_read_regions, *_names("moving", _IMAGES)),
             points=folder.read(_read_points, "points.npz", unit=self.unit),
             unit=self.unit,
         )
         cameras = [K, K if K_next is None else K_next]
-        return make_pair(images, cameras, truth, self.white, cropped=self.cropped)
+        return make_pair(images, cameras, truth, self.white, self.cropped)
 
 
 def _refuse_result(folder: Folder) -> None:
-    """Raise DataError for a folder with a result."""
     marked = read_sums(folder.path) is not None
     if marked or folder.find("result.h5"):
         raise DataError(
@@ -208,6 +193,11 @@ def _refuse_result(folder: Folder) -> None:
             hint="move the frames, K.txt and the truth to a folder of their own"
             + (f"; delete {SUMS} where no solve has left files" if marked else ""),
         )
+
+
+def _read_regions(path: Path) -> NDArray[np.int32]:
+    """Connected regions (H, W) of a mask, 0 for what is black."""
+    return np.asarray(skimage.measure.label(read_mask(path), connectivity=2), np.int32)
 
 
 def _read_points(path: Path, unit: str) -> Float:
@@ -225,7 +215,7 @@ def _read_points(path: Path, unit: str) -> Float:
     if unit not in scales:
         raise DataError("points are in millimetres", where=path, found=unit, expected="m or mm")
     points = np.column_stack([uv, xyz[:, 2] / scales[unit]]).astype(np.float64)
-    return np.asarray(points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)])
+    return points[np.isfinite(points).all(axis=1) & (points[:, 2] > 0)]
 
 
 class MotorcycleInput(PairInput):
@@ -242,10 +232,8 @@ class MotorcycleInput(PairInput):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-        from skimage import data
-
         try:
-            left, right, disparity = data.stereo_motorcycle()
+            left, right, disparity = skimage.data.stereo_motorcycle()
         except Exception as error:  # pooch, requests and OSError, by version
             raise DataError(
                 "the Motorcycle pair is not available",
@@ -255,19 +243,13 @@ class MotorcycleInput(PairInput):
                 hint="install pooch and call skimage.data.stereo_motorcycle() once online",
             ) from error
         focal, cx, cy, doffs, baseline = 994.978, 311.193, 254.877, 31.086, 0.193001
-        d = np.asarray(disparity, dtype=np.float64)
-        d = np.where(np.isfinite(d) & (d > 0), d, np.nan)
-        valid = np.isfinite(d)
+        valid = np.isfinite(disparity) & (disparity > 0)
+        d = np.where(valid, disparity.astype(np.float64), np.nan)
         truth = Truth(
             depth_ref=focal * baseline / (d + doffs),
             flow=np.dstack([-d, np.where(valid, 0.0, np.nan)]),
             components=np.where(valid, 0, -1).astype(np.int32),
             scene_flow=np.where(valid[:, :, None], [-baseline, 0.0, 0.0], np.nan),
         )
-        return Pair(
-            image_ref=np.ascontiguousarray(left[:, :, :3]),
-            image_next=np.ascontiguousarray(right[:, :, :3]),
-            K_ref=intrinsics(focal, focal, cx, cy),
-            K_next=intrinsics(focal, focal, cx + doffs, cy),
-            truth=truth,
-        )
+        K_ref, K_next = (intrinsics(focal, focal, x, cy) for x in (cx, cx + doffs))
+        return Pair(left, right, K_ref, K_next, truth=truth)

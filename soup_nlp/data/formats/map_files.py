@@ -99,7 +99,6 @@ def read_arrays(path: PathLike, what: str) -> dict[str, NDArray[Any]]:
 
 
 def _array(path: PathLike, what: str) -> NDArray[Any]:
-    """The array of a .npy file."""
     arrays = read_arrays(path, what)
     if "" not in arrays:
         raise DataError(f"{what} is not one array", where=path, expected="a .npy file")
@@ -164,8 +163,7 @@ def _read_flow_png(path: PathLike, what: str) -> Float:
 def read_vkitti_flow(path: PathLike) -> Float:
     """Read a Virtual KITTI flow PNG, u = (2 R / 65535 - 1) (W - 1), v likewise, B = 0 unknown."""
     unit = 2.0 / 65535.0 * _read_flow_png(path, "Virtual KITTI flow") - 1.0
-    height, width = unit.shape[:2]
-    return _known_flow(unit * [width - 1, height - 1], path)
+    return _known_flow(unit * np.subtract(unit.shape[1::-1], 1), path)
 
 
 def read_flow(path: PathLike) -> Float:
@@ -189,8 +187,7 @@ def read_confidence(path: PathLike) -> NDArray[Any]:
     if Path(path).suffix == ".npy":
         return _array(path, "confidence file")
     image = decode(path, "confidence map")
-    whole = image.dtype.kind == "u"
-    return image / np.iinfo(image.dtype).max if whole else image
+    return image / np.iinfo(image.dtype).max if image.dtype.kind == "u" else image
 
 
 def known_depth(depth: NDArray[Any], path: PathLike) -> Float:
@@ -220,11 +217,8 @@ def known_depth(depth: NDArray[Any], path: PathLike) -> Float:
     return out
 
 
-def read_pfm(path: PathLike) -> Float:
-    """Read a depth from a grey .pfm map, flipped so that row 0 is the top.
-
-    The sign of the scale in the header is the byte order; its magnitude is ignored.
-    """
+def _read_pfm(path: PathLike) -> FloatMap:
+    """The map of a grey .pfm file, row 0 at the top; the sign of its scale is the byte order."""
     content = read_bytes(path, "PFM file")
     number = rb"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
     gap = rb"\s+(?:#[^\n]*\n\s*)*"
@@ -240,7 +234,7 @@ def read_pfm(path: PathLike) -> Float:
         )
     size = int(header.group(2)), int(header.group(1))
     order = "<" if scale < 0 else ">"
-    return known_depth(_floats(content[header.end() :], size, order, path, "PFM file")[::-1], path)
+    return _floats(content[header.end() :], size, order, path, "PFM file")[::-1]
 
 
 def read_depth_png16(path: PathLike, scale: float) -> Float:
@@ -270,7 +264,7 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
     """Read a depth by the suffix of its file: .dpt (Sintel), .npy, .npz, .pfm or 16-bit .png.
 
     `scale` are the values per unit of length of a .png; without it `usual` is assumed, with a
-    warning.
+    warning. The magnitude of the scale in a .pfm is ignored.
     """
 
     def by_scale(path: PathLike) -> Float:
@@ -283,7 +277,7 @@ def read_depth(path: PathLike, scale: float | None = None, usual: float = MILLIM
         ".dpt": lambda p: _read_pieh(p, "depth file"),
         ".npy": lambda p: _array(p, "depth file"),
         ".npz": _one_map,
-        ".pfm": read_pfm,
+        ".pfm": _read_pfm,
         ".png": by_scale,
     }
     return known_depth(_by_suffix(path, readers, "depth"), path)

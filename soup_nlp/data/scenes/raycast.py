@@ -36,6 +36,16 @@ def inverse(pose: Float) -> Float:
     return out
 
 
+def moved(pose: Float, points: Float) -> Float:
+    """Points (N, 3) under a rigid transform (4, 4)."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def moved_back(pose: Float, points: Float) -> Float:
+    """Points (N, 3) under the inverse of a rigid transform (4, 4)."""
+    return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
 @dataclass(frozen=True)
 class Part:
     """A textured shape at a pose.
@@ -151,7 +161,7 @@ class Frame:
         """Indices of the pixels (N, 2) within the bounding rectangle of a shape's projection."""
         if shape.bound is not None:
             corners = np.array(list(product((-1, 1), repeat=3))) * shape.bound
-            seen = corners @ pose[:3, :3].T + pose[:3, 3]
+            seen = moved(pose, corners)
             if seen[:, 2].min() > NEAR:
                 at, (u, v) = camera.project(self.K, seen), uv.T
                 low, high = at.min(axis=0) - 1e-6, at.max(axis=0) + 1e-6
@@ -186,11 +196,9 @@ class Frame:
         rays = camera.rays(self.K, uv)
         for p in np.unique(part):
             on = np.flatnonzero(part == p)
-            item, shape, R, t = self.parts[p], self.shapes[p], *_split(self.poses[p])
-            ray = rays[on]
-            local = (depth[on, None] * ray - t) @ R
-            n = shape.normals(local) @ R.T
-            normals[on] = n
+            shape, R, ray = self.shapes[p], self.poses[p][:3, :3], rays[on]
+            local = moved_back(self.poses[p], depth[on, None] * ray)
+            normals[on] = n = shape.normals(local) @ R.T
             towards = np.einsum("ni,ni->n", n, ray)
             cosine = np.maximum(abs(towards) / np.linalg.norm(ray, axis=1), 0.02)
             across = depth[on] / self.K[0, 0]
@@ -204,18 +212,11 @@ class Frame:
             # one call for all: it costs more than its points in small images
             points = np.concatenate([local[~several], *(start + o * step for o in offsets)])
             sizes = np.concatenate([footprint[~several], np.tile(footprint[several], taps)])
-            seen = item.colour(shape, points, sizes)
+            seen = self.parts[p].colour(shape, points, sizes)
             one = len(on) - len(start)
-            shown = np.empty((len(on), 3), np.float32)
-            shown[~several] = seen[:one]
-            shown[several] = np.mean(seen[one:].reshape(taps, -1, 3), axis=0)
-            colour[on] = shown
+            colour[on[~several]] = seen[:one]
+            colour[on[several]] = np.mean(seen[one:].reshape(taps, -1, 3), axis=0)
         return colour, normals
-
-
-def _split(pose: Float) -> tuple[Float, Float]:
-    """Rotation (3, 3) and translation (3,) of a rigid transform (4, 4)."""
-    return pose[:3, :3], pose[:3, 3]
 
 
 def render(scene: Scene, K: Float, height: int, width: int) -> Pair:
@@ -225,22 +226,19 @@ def render(scene: Scene, K: Float, height: int, width: int) -> Pair:
     rectangle of the pixel centres, or is behind the camera (with a flow of NaN). Every ray must hit
     a surface, such as an infinite plane behind the bodies.
     """
-    size = height, width
-    uv = camera.pixel_grid(*size).reshape(-1, 2)
+    size, uv = (height, width), camera.pixel_grid(height, width).reshape(-1, 2)
     ref, following = Frame(scene, K, 0), Frame(scene, K, 1)
     (depth, part), (depth_next, part_next) = ref.trace(uv), following.trace(uv)
     motions = scene.motions()
     X = depth[:, None] * camera.rays(K, uv)
     X_next = np.empty_like(X)
     for p in np.unique(part):
-        on = part == p
-        R, t = _split(motions[ref.body[p]])
-        if np.isfinite(t).all():
-            X_next[on] = X[on] @ R.T + t
+        on, motion = part == p, motions[ref.body[p]]
+        if np.isfinite(motion).all():
+            X_next[on] = moved(motion, X[on])
         else:
-            (R, t), (R_next, t_next) = _split(ref.poses[p]), _split(following.poses[p])
-            material = ref.shapes[p].material((X[on] - t) @ R)
-            X_next[on] = following.shapes[p].place(material) @ R_next.T + t_next
+            material = ref.shapes[p].material(moved_back(ref.poses[p], X[on]))
+            X_next[on] = moved(following.poses[p], following.shapes[p].place(material))
     in_front = X_next[:, 2] > NEAR
     target = np.full_like(uv, np.nan)
     target[in_front] = camera.project(K, X_next[in_front])
