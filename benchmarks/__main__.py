@@ -26,7 +26,7 @@ from benchmarks.scores import measure_pair
 from benchmarks.sigma import write_sigma
 from benchmarks.solvers import write_results
 from benchmarks.suites import SUITES, Options, list_suite
-from benchmarks.table import Cell, frame_of, measure
+from benchmarks.table import Cell, Item, frame_of, measure
 from soup_nlp import SoupError
 from soup_nlp.errors import DataError
 from soup_nlp.export.compare import compare as run_solvers
@@ -62,13 +62,9 @@ def numbers(text: str) -> list[int]:
         raise typer.BadParameter(f"{text!r} is no comma-separated list of whole numbers") from None
 
 
-def cells_of(
-    suites: list[str], data: Path | None, wanted: Options, overrides: Words
-) -> dict[str, list[Cell]]:
-    """The available pairs of suites under overrides."""
-    say = partial(print, file=sys.stderr)
-    items = {suite: list_suite(suite, data, wanted, say) for suite in suites}
-    return {suite: [Cell(i, tuple(overrides or ())) for i in own] for suite, own in items.items()}
+def cells_of(items: list[Item], overrides: Words) -> list[Cell]:
+    """Pairs under overrides."""
+    return [Cell(item, tuple(overrides or ())) for item in items]
 
 
 def finish(page: Path, frame: pd.DataFrame, text: str | None = None) -> int:
@@ -95,9 +91,10 @@ def accuracy(
 ) -> int:
     """Depth against truth on suites of pairs; a run that was stopped goes on."""
     wanted = Options(tuple(flow or ()), width, tuple(numbers(seeds)), tuple(only or ()))
-    codes = []
-    for each, cells in cells_of(suite, data, wanted, overrides).items():
-        page = out / f"{name or each}.md"
+    codes, say = [], partial(print, file=sys.stderr)
+    # a suite without data ends the command before anything is measured
+    for each, items in {each: list_suite(each, data, wanted, say) for each in suite}.items():
+        cells, page = cells_of(items, overrides), out / f"{name or each}.md"
         rows = page.with_suffix(".jsonl")
         frame = measure(cells, measure_pair, rows, workers, cluster=cluster)
         write_suite(page, frame, f"Suite `{each}`: {SUITES[each].text}.")
@@ -174,7 +171,7 @@ def chain(
 ) -> int:
     """What one scale costs on rendered sequences, and on kitti_tracking in the --data folder."""
     chosen = [i for i in chains.sequences(data) if not only or any(w in i.name for w in only)]
-    cells, page = [Cell(item, tuple(overrides or ())) for item in chosen], out / "chain.md"
+    cells, page = cells_of(chosen, overrides), out / "chain.md"
     frame = measure(cells, chains.measure_chain, page.with_suffix(".jsonl"))
     return finish(page, frame, chains.chain_page(frame))
 

@@ -81,7 +81,7 @@ def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = F
     open_ends = ", ".join(good["title"][~numbers(good, "good").gt(0)]) or "none"
     verdict = (
         f"{len(good)} of {len(frame)} pairs measured; not converged: {open_ends}. The solution"
-        f" beats every baseline on {int(best(scored).sum())} of {len(scored)} (MRE; the baseline"
+        f" beats every baseline on {int(_best(scored).sum())} of {len(scored)} (MRE; the baseline"
         " `rigid` on the pixels where it has a depth)."
     )
     about = f"{provenance(frame)}; settings {settings} (one a flow source)."
@@ -99,11 +99,8 @@ def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = F
     return page_text(blocks, frame)
 
 
-def best(frame: pd.DataFrame) -> pd.Series:
-    """Whether the solution is better than every baseline that a pair has.
-
-    The baseline `rigid` is compared on the pixels where it has a depth.
-    """
+def _best(frame: pd.DataFrame) -> pd.Series:
+    """Whether the solution is better than every baseline that a pair has."""
     out = pd.Series(True, frame.index)
     for baseline in BASELINES:
         own = "solution_rigid" if baseline == "rigid" else "solution"

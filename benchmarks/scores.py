@@ -39,28 +39,7 @@ PIXELS = 500
 
 
 def measure_pair(cell: Cell) -> Row:
-    """Solve and score one pair, see `solved`."""
-    result = solved(cell)
-    return {**scores(result), "pixels": pixels(result)}
-
-
-def pixels(result: Run) -> Row:
-    """Errors of log depth after the median scale, and terms of sigma, at pixels of one pair."""
-    truth = result.pair.truth
-    assert truth is not None
-    z, gt = (v.ravel() for v in at_truth(truth, result.reconstruction.depth_ref))
-    at = np.flatnonzero(np.isfinite(gt) & np.isfinite(z) & (gt > 0) & (z > 0))
-    at = np.random.default_rng(0).permutation(at)[:PIXELS]
-    error = np.log(z[at] * np.median(gt[at] / z[at]) / gt[at])
-    terms = {k: at_truth(truth, v)[0].ravel()[at] for k, v in result.confidence.terms.items()}
-    return {
-        "error": np.round(error, 5).tolist(),
-        "terms": {k: np.round(np.minimum(v, LARGEST), 5).tolist() for k, v in terms.items()},
-    }
-
-
-def solved(cell: Cell) -> Run:
-    """The run of a pair that can be scored.
+    """Solve and score one pair.
 
     Raises:
         SoupError: the pair cannot be solved, or has no true depth.
@@ -77,7 +56,23 @@ def solved(cell: Cell) -> Run:
             expected=suite.layout or None,
             hint=f"get it from {suite.source}" if suite.source else None,
         )
-    return run(problem, pair=pair)
+    result = run(problem, pair=pair)
+    return {**scores(result), "pixels": pixels(result)}
+
+
+def pixels(result: Run) -> Row:
+    """Errors of log depth after the median scale, and terms of sigma, at pixels of one pair."""
+    truth = result.pair.truth
+    assert truth is not None
+    z, gt = (v.ravel() for v in at_truth(truth, result.reconstruction.depth_ref))
+    at = np.flatnonzero(np.isfinite(gt) & np.isfinite(z) & (gt > 0) & (z > 0))
+    at = np.random.default_rng(0).permutation(at)[:PIXELS]
+    error = np.log(z[at] * np.median(gt[at] / z[at]) / gt[at])
+    terms = {k: at_truth(truth, v)[0].ravel()[at] for k, v in result.confidence.terms.items()}
+    return {
+        "error": np.round(error, 5).tolist(),
+        "terms": {k: np.round(np.minimum(v, LARGEST), 5).tolist() for k, v in terms.items()},
+    }
 
 
 def scores(result: Run) -> Row:
@@ -128,17 +123,9 @@ def has_depth(truth: Truth | None) -> bool:
 def sigma_scores(error: Float, sigma: Float) -> Row:
     """How well sigma (M,) tells the errors of log depth (M,), both at true pixels.
 
-    Returns:
-        "nll": mean negative log likelihood of a normal distribution, without the constant
-            log(2 pi) / 2: mean of (error / sigma)^2 / 2 + log sigma.
-        "flat": the same for the best constant sigma, the root mean square error.
-        "within1", "within2": share of the pixels within one and two sigma.
-        "sure_wrong": of the sure pixels, the share that is wrong.
-        "wrong_sure": of the wrong pixels, the share that is sure.
-        "right_unsure": of the right pixels, the share with a sigma above `MOST_SIGMA`.
-        "ause": area between the sparsification curve and the oracle's, over the MRE.
-        "curve": (kept share, error, error of the oracle) of the sparsification.
-        "reliability": (mean sigma, root mean square error) by tenths of the pixels by sigma.
+    `ABOUT_SIGMA` in benchmarks/accuracy.py explains the scores. "curve" has (kept share, error,
+    error of the oracle) of the sparsification, "reliability" (mean sigma, root mean square error)
+    by tenths of the pixels by sigma.
     """
     relative = np.abs(np.expm1(error))
     measured = sparsification(relative, sigma)
@@ -193,18 +180,10 @@ def split(truth: Truth, depth: Float, part: Mask, scale: float) -> Row:
 
 
 def moving(pair: Pair, depth: Float) -> Row | None:
-    """Errors of independently moving pixels and of all other pixels, under one median scale.
+    """Errors of a depth (H, W) where something moves by itself, see `split`, one median scale.
 
-    Components move independently if their true motion is not that of the static scene; without
-    known motions, all do.
-
-    Args:
-        pair: Its truth must have components (0 is the static scene) and dense depth.
-        depth: (H, W) z.
-
-    Returns:
-        "mre" and "rest", the MRE of moving and of other pixels, and the "share" of the former. None
-        without such a truth or without moving pixels.
+    Components move by themselves if their true motion is not that of the static scene, 0; without
+    known motions, all do. None without such pixels, or without components and dense depth.
     """
     truth = pair.truth
     if truth is None or truth.components is None or truth.depth_ref is None:

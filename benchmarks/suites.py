@@ -263,7 +263,6 @@ def list_suite(
         raise DataError("unknown suite", found=repr(name), expected=", ".join(SUITES))
     suite, o = SUITES[name], options or Options()
     root = Path(os.path.realpath(as_path(data or Path(), "data folder", home=True)))
-    listed: list[Item] = []
     for folder in (".", name):
         listed = list(every_pair(name, Path(os.path.realpath(root / folder)), o))
         here = [i for i in listed if all(is_file(f) for f in i.needs)]

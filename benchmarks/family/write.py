@@ -2,9 +2,10 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 import numpy as np
@@ -33,25 +34,22 @@ REACHED = 1e-4
 INDEX = "index.json"
 
 
-class Best(TypedDict):
-    """The best known point of an instance."""
-
+class _Best(TypedDict):
     objective: float
 
 
-class Named(TypedDict):
-    """An instance."""
-
+class _Named(TypedDict):
     name: str
-    best_known: Best
+    best_known: _Best
 
 
-class Index(TypedDict):
+class _Index(TypedDict):
     """Contents of index.json, as far as they are read back."""
 
-    instances: list[Named]
+    instances: list[_Named]
 
 
+@cache
 def published() -> dict[str, Any]:
     """Published data of this version: checksums, and solvers that reached the best known points."""
     return dict(json.loads((RECORDS / "published.json").read_text(encoding="utf-8")))
@@ -75,49 +73,39 @@ def write_family(
             "folder holds other files", where=folder, expected="a new or empty folder, or a set"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    known, entries = published(), []
-
-    @cache
-    def rendered(scene: str) -> Pair:
-        return load_frozen(scene, chosen[0].size).problem.load_pair()
-
+    entries, pairs = [], dict[str, Pair]()
     members_of = defaultdict(list)
     for instance in chosen:
         members_of[instance.scene, instance.size].append(instance)
     for (scene, size), members in members_of.items():
         record = load_frozen(scene, size)
-        case = case_of(record, rendered(scene))
+        # scenes of all sizes have one pair
+        pairs[scene] = pairs.get(scene) or record.problem.load_pair()
+        case = case_of(record, pairs[scene])
         for instance in members:
             nlp = build_instance(case, record, instance.formulation, instance.start)[0]
             file = write_nl(folder / f"{instance.name}.nl", nlp)
             best = build_instance(case, record, instance.formulation, "best")[0]
-            order = file.variables, file.rows
             message = f"SOUP {VERSION}: best known point of {instance.problem}"
-            r = examine(best, best.x0, None)
-            write_sol(folder / f"{instance.problem}.sol", best.x0, r.lam_g, *order, message)
-            entries.append(_entry(instance, len(case), nlp, best.value(best.x0), r, file, known))
-            changed = "  NOT the published bytes" * (entries[-1]["published"] is False)
+            r, sol = examine(best, best.x0, None), folder / f"{instance.problem}.sol"
+            write_sol(sol, best.x0, r.lam_g, file.variables, file.rows, message)
+            entry = _entry(instance, len(case), nlp, best.value(best.x0), r, file)
+            changed = "  NOT the published bytes" * (entry["published"] is False)
             say(f"{file.path.name:<52} n {nlp.nx:>6}  m {nlp.ng:>6}{changed}")
+            entries.append(entry)
     index = {"set": "SOUP", "version": VERSION, "generator": f"soup_nlp {__version__}"}
     write_json(folder / INDEX, {**index, "instances": entries})
     write_text(folder / "README.md", readme(entries))
-    licence = (RECORDS / "LICENSE.txt").read_text(encoding="utf-8")
-    write_text(folder / "LICENSE.txt", licence)
+    copyfile(RECORDS / "LICENSE.txt", folder / "LICENSE.txt")
     return entries
 
 
 def _entry(
-    instance: Instance,
-    superpixels: int,
-    nlp: NLP,
-    best: float,
-    r: Residuals,
-    file: NLFile,
-    known: Mapping[str, Any],
+    instance: Instance, superpixels: int, nlp: NLP, best: float, r: Residuals, file: NLFile
 ) -> Entry:
     """Entry of an instance in the index."""
-    sha = known["sha256"].get(instance.name)
-    solved = dict(known["solved"].get(instance.problem, {}))
+    sha = published()["sha256"].get(instance.name)
+    solved = dict(published()["solved"].get(instance.problem, {}))
     runs = solved.pop("runs", {}).get(instance.start, {})
     return {
         **{"name": instance.name, "file": file.path.name, "scene": instance.scene},
@@ -208,7 +196,7 @@ def family_tasks(folder: Path) -> Iterator[Labelled]:
     Raises:
         DataError: the index cannot be read.
     """
-    for entry in read_json(folder / INDEX, "index of the family", Index)["instances"]:
+    for entry in read_json(folder / INDEX, "index of the family", _Index)["instances"]:
         instance = parse_name(entry["name"])
         label = {
             "problem": f"{instance.scene} {instance.start}",

@@ -5,14 +5,12 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-from freeze_family import save_frozen
 
 from benchmarks.__main__ import main
-from benchmarks.family.frozen import load_frozen, read_frozen
+from benchmarks.family.frozen import load_frozen
 from benchmarks.family.instances import (
     BITS,
     FORMULATIONS,
@@ -27,9 +25,8 @@ from benchmarks.family.instances import (
     rounded,
     select,
 )
-from benchmarks.family.write import check_sol, published
+from benchmarks.family.write import check_sol, published, write_family
 from soup_nlp.errors import ConfigError
-from soup_nlp.export.nl import write_nl
 from soup_nlp.export.symbolic import make_oracle
 
 pytestmark = pytest.mark.slow
@@ -73,31 +70,41 @@ def test_rounding_takes_last_bits_away():
     assert rounded(np.array([np.inf, -np.inf])).tolist() == [np.inf, -np.inf]
 
 
-BYTES = """import sys
-from pathlib import Path
-from benchmarks.family.frozen import load_frozen
-from benchmarks.family.instances import build_instance, case_of
-from soup_nlp.export.nl import write_nl
+def digests(file: str) -> list[str]:
+    """SHA-256 of two instances that are published, then of other formulations and starts."""
+    from pathlib import Path
 
-record = load_frozen(sys.argv[1], 100)
-nlp = build_instance(case_of(record), record, "unit-offset/smooth", "hard")[0]
-print(write_nl(Path(sys.argv[2]), nlp).sha256)
-"""
+    from benchmarks.family.frozen import load_frozen
+    from benchmarks.family.instances import build_instance, case_of
+    from soup_nlp.export.nl import write_nl
+
+    records = {scene: load_frozen(scene, 100) for scene in ("street", "orbit")}
+    cases = {scene: case_of(record) for scene, record in records.items()}
+    chosen = [
+        *(("street", "unit-offset", "hard"), ("orbit", "unit-offset", "hard")),
+        *(("orbit", "unit-offset", "best"), ("orbit", "unit-translation", "cold")),
+        ("orbit", "tangent", "easy"),
+    ]
+    nlps = (build_instance(cases[s], records[s], f"{f}/smooth", x)[0] for s, f, x in chosen)
+    return [write_nl(Path(file), nlp).sha256 for nlp in nlps]
 
 
-@pytest.mark.parametrize("scene", ["orbit", "street"])
-def test_an_instance_has_the_published_bytes_on_another_processor(scene, tmp_path):
+def test_two_processors_make_the_published_bytes(tmp_path):
+    file = str(tmp_path / "x.nl")
+    here = digests(file)
+    program = f"{inspect.getsource(digests)}\nprint(*digests({file!r}))"
     # numpy's own loops without vector instructions beyond the baseline as well
     old = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4"}
     ended = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", BYTES, scene, str(tmp_path / "x.nl")],
+        [sys.executable, "-W", "ignore", "-c", program],
         env={**os.environ, "OMP_NUM_THREADS": "1", **old},
         capture_output=True,
         text=True,
         check=True,
     )
-    name = Instance(scene, STANDARD, 100, "hard").name
-    assert ended.stdout.strip() == published()["sha256"][name]
+    assert ended.stdout.split() == here
+    names = [Instance(scene, STANDARD, 100, "hard").name for scene in ("street", "orbit")]
+    assert here[:2] == [published()["sha256"][name] for name in names]
 
 
 def test_the_start_does_not_change_the_program():
@@ -114,6 +121,16 @@ def test_the_start_does_not_change_the_program():
 
 
 # --- the folder ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The instances of the smallest record of one scene, and one of another formulation."""
+    out, lines = tmp_path_factory.mktemp("set"), []
+    chosen = select([100], ["orbit"], [STANDARD]) + select([100], ["orbit"], [OTHER], ["hard"])
+    write_family(out, chosen, lines.append)
+    assert len(lines) == len(chosen) == 4
+    return out
 
 
 def test_the_index_says_what_problem_sets_say(folder):
@@ -169,37 +186,3 @@ def test_other_files_are_not_overwritten(name, tmp_path, capsys):
     assert main(["family", str(tmp_path), "--sizes", "100"]) == 2
     assert "holds other files" in capsys.readouterr().err
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
-
-
-def digests(path: Path) -> list[str]:
-    """SHA-256 of instances of a record."""
-    from benchmarks.family.instances import STARTS, build_instance, case_of
-
-    record = read_frozen(path)
-    case = case_of(record)
-    chosen = [("unit-offset/smooth", start) for start in (*STARTS, "best")]
-    nlps = (build_instance(case, record, *one)[0] for one in [*chosen, (OTHER, STARTS[0])])
-    return [write_nl(path.with_suffix(".nl"), nlp).sha256 for nlp in nlps]
-
-
-def test_two_processors_make_the_same_bytes(record, tmp_path):
-    save_frozen(tmp_path / "record.npz", record)
-    here = digests(tmp_path / "record.npz")
-    names = {"pathlib": "Path", "soup_nlp.export.nl": "write_nl"}
-    names["benchmarks.family.frozen"] = "read_frozen"
-    lines = [f"OTHER = {OTHER!r}", *(f"from {k} import {v}" for k, v in names.items())]
-    lines.append(inspect.getsource(digests))
-    program = "\n".join([*lines, f"print(*digests(Path({str(tmp_path / 'record.npz')!r})))"])
-    # numpy's own loops without vector instructions beyond the baseline as well
-    old = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4"}
-    ended = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program],
-        env={**os.environ, "OMP_NUM_THREADS": "1", **old},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    # the record's best point is its proposal, so that easy and hard are one here
-    assert len(here) == 5
-    assert len(set(here)) == 4
-    assert ended.stdout.split() == here

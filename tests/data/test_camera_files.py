@@ -28,27 +28,18 @@ def opencv(name: str, values: str, rows: int) -> str:
 
 READ: dict[str, tuple[str | bytes, list[float]]] = {
     "four numbers": ("256 257 159.5 119.5", []),
-    "commas": ("256,257,159.5,119.5\n", []),
-    "commas and blanks": ("256, 257, 159.5, 119.5", []),
-    "lines": ("256\n257\n159.5\n119.5\n", []),
     "rows": ("# camera\n256 0 159.5\n0 257 119.5\n0 0 1\n", []),
     "columns": (COLUMNS, []),
     "exponents": ("2.56e2 +257 1.595E+02 119.5", []),
     "4x4": ("256 0 159.5 0\n0 257 119.5 0\n0 0 1 0\n0 0 0 1", []),
-    "3x4": ("256 0 159.5 0\n0 257 119.5 0\n0 0 1 0", []),
-    "brackets": ("[[256, 0, 159.5], [0, 257, 119.5], [0, 0, 1]]", []),
     "MATLAB": ("K = [256 0 159.5; 0 257 119.5; 0 0 1];  % pixels", []),
     "with distortion": ("256 257 159.5 119.5 0.1 -0.2 0 0.001 0.3", [0.1, -0.2, 0, 0.001, 0.3]),
     "names": (FOUR, []),
-    "capitals": ("FX 256\nFY 257\nCX 159.5\nCY 119.5", []),
     "equal signs": ("fx=256, fy=257, cx=159.5, cy=119.5", []),
     "one row of names": ("fx 256 fy 257 cx 159.5 cy 119.5", []),
     "head row": ("fx,fy,cx,cy\n256,257,159.5,119.5\n", []),
     "INI": ("[camera]\nfx = 256\nfy = 257\ncx = 159.5\ncy = 119.5\nk1 = -0.3\n", [-0.3]),
     "twice the same": (FOUR + "fx: 256.0", []),
-    "holes": (FOUR + "p1: 0.01", [0, 0, 0.01]),
-    "signs": (FOUR + "k1: +0.1\np1: -.5e-3\nk3: 0", [0.1, 0, -5e-4]),
-    "not octal": ("fx: 0256\nfy: 0257\ncx: 159.5\ncy: 119.5", []),
     "ROS 1": (
         f"image_width: 320\ncamera_name: a\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [{ROWS}]"
         "\ndistortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n"
@@ -57,7 +48,6 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
         "  data: [250, 0, 160, 0, 0, 250, 120, 0, 0, 0, 1, 0]\n",
         [-0.3, 0.1],
     ),
-    "ROS 1 message": (f"K: [{ROWS}]\nD: [0.0, 0.0]\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]", []),
     "ROS 2": (f"header:\n  frame_id: c\nk: [{ROWS}]\nd: [0.1, 0, 0, 0, 0]\np: [250]", [0.1]),
     "ROS 2 messages": (
         2 * "header:\n  stamp:\n    sec: 1\nk:\n- 256.0\n- 0.0\n- 159.5\n- 0.0\n- 257.0\n- 119.5\n"
@@ -75,19 +65,10 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
         + opencv("distortion_coefficients", "0.1, 0., 0., 0., 0.", 5),
         [0.1],
     ),
-    "OpenCV in JSON": (
-        json.dumps({"cameraMatrix": {"type_id": "opencv-matrix", "data": K.ravel().tolist()}}),
-        [],
-    ),
     "ORB-SLAM": (
         '%YAML:1.0\nCamera.type: "PinHole"\nCamera.fx: 256\nCamera.fy: 257\nCamera.cx: 159.5\n'
         "Camera.cy: 119.5\nCamera.k1: 0.\nCamera.fps: 30\nViewer.ViewpointF: 500\nThDepth: 35.0\n",
         [],
-    ),
-    "VINS": (
-        "%YAML:1.0\n---\nmodel_type: PINHOLE\ndistortion_parameters:\n   k1: -0.3\n   k2: 0.1\n"
-        "projection_parameters:\n   fx: 256\n   fy: 257\n   cx: 159.5\n   cy: 119.5\n",
-        [-0.3, 0.1],
     ),
     "EuRoC": (
         "sensor_type: camera\nT_BS:\n  cols: 4\n  rows: 4\n  data: [0, -1, 0, 3, 1, 0, 0, 0, 0, 0,"
@@ -95,7 +76,6 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
         " pinhole\ndistortion_model: radial-tangential\ndistortion_coefficients: [0, 0, 0, 0]\n",
         [],
     ),
-    "Kalibr": ("cam0:\n" + KALIBR.format("pinhole", "radtan", [0.1, 0, 0, 0], LIST), [0.1]),
     "two alike": (
         "".join(f"cam{k}:\n" + KALIBR.format("pinhole", "none", [], LIST) for k in (0, 1)),
         [],
@@ -115,11 +95,6 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
         json.dumps({"width": 320, "intrinsic_matrix": K.T.ravel().tolist()}),
         [],
     ),
-    "Open3D trajectory": (
-        json.dumps({"extrinsic": np.eye(4).ravel().tolist(),
-                    "intrinsic": {"intrinsic_matrix": K.T.ravel().tolist()}}),
-        [],
-    ),
     "twelve coefficients": (FOUR + f"distortion: {[0.1] * 12}", [0.1] * 12),
     "no fisheye": (json.dumps({**GROUP, "is_fisheye": False, "fisheye": {"k1": 0}}), []),
     "no distortion": (FOUR + "focal_length: 4.2 mm\ndistortion: null", []),
@@ -128,9 +103,7 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
                     "model": "distortion.inverse_brown_conrady", "coeffs": [0, 0, 0, 0, 0]}),
         [],
     ),
-    "Record3D": (json.dumps({"K": K.T.ravel().tolist(), "fps": 60, "w": 320}), []),
     "Bouguet": ("fc: [256, 257]\ncc: [159.5, 119.5]\nkc: [0.1, 0, 0, 0, 0]\nalpha_c: 0", [0.1]),
-    "COLMAP PINHOLE": ("# Camera list\n1 PINHOLE 320 240 256 257 160 120\n", []),
     "COLMAP OPENCV": ("1 OPENCV 320 240 256 257 160 120 0.1 0.2 0 0.01", [0.1, 0.2, 0, 0.01]),
     "KITTI odometry": (
         "".join(f"P{k}: 256 0 159.5 {-k} 0 257 119.5 0 0 0 1 0\n" for k in range(4))
@@ -139,8 +112,6 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
     ),
     "UTF-16": (FOUR.encode("utf-16"), []),
     "UTF-8 with a mark": (FOUR.encode("utf-8-sig"), []),
-    "Windows": (FOUR.replace("\n", "\r\n"), []),
-    ".npy matrix": (npy(K), []),
     ".npy numbers": (npy(RIGHT), []),
     ".npz": (npz(mtx=K, dist=np.array([[0.1, 0, 0, 0, 0]]), rvecs=np.ones((5, 3))), [0.1]),
 }  # fmt: skip
@@ -156,7 +127,6 @@ def test_a_camera_is_read(name: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(distortion, lens)
 
 
-TWO = {"left": GROUP, "right": {**GROUP, "fx": 300}}
 REFUSED: dict[str, tuple[str | bytes, str]] = {
     "ORB-SLAM3 stereo": (
         "".join(
@@ -165,7 +135,6 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
         ),
         r"2 cameras[\s\S]*Camera1: 256,256,159.5,119.5; Camera2: 300,[\s\S]*--intrinsics 256,256,",
     ),
-    "two in JSON": (json.dumps(TWO), "2 cameras[\\s\\S]*left: [\\s\\S]*right: "),
     "two in INI": (
         "[LEFT_CAM]\n" + FOUR.replace(":", "=") + "[RIGHT_CAM]\n" + FOUR.replace("256", "300"),
         "2 cameras[\\s\\S]*LEFT_CAM: [\\s\\S]*RIGHT_CAM: ",
@@ -177,13 +146,6 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "two of COLMAP": (
         "1 PINHOLE 320 240 256 257 160 120\n2 SIMPLE_PINHOLE 320 240 256 160 120",
         "2 cameras[\\s\\S]*camera 1: [\\s\\S]*camera 2: ",
-    ),
-    "two Kalibr": (
-        "".join(
-            f"cam{k}:\n" + KALIBR.format("pinhole", "radtan", [0] * 4, [f, f, 160, 120])
-            for k, f in ((0, 256), (1, 300))
-        ),
-        r"2 cameras[\s\S]*cam0\.intrinsics: [\s\S]*cam1\.intrinsics: ",
     ),
     "a frame each": (
         json.dumps({"frames": [{"fl_x": f, "fl_y": f, "cx": 1, "cy": 2} for f in (256, 300)]}),
@@ -197,29 +159,14 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     ),
     "twice": (FOUR + "fx: 300", r"fx is given twice[\s\S]*256 and 300"),
     "twice in JSON": ('{"fx": 256, "fx": 300, "fy": 1, "cx": 1, "cy": 1}', "fx is given twice"),
-    "Kalibr omni": ("cam0:\n" + KALIBR.format("omni", "radtan", [0], [1.2, *RIGHT]), "another mod"),
-    "Kalibr equidistant": (
-        "cam0:\n" + KALIBR.format("pinhole", "equidistant", [0] * 4, LIST),
-        "another model",
-    ),
-    **{
-        f"basalt {kind}": (
-            json.dumps({"intrinsics": [{"camera_type": kind, "intrinsics": GROUP}]}),
-            f"another model[\\s\\S]*{kind}",
-        )
-        for kind in ("ds", "eucm", "ucm", "kb4", "fov")
-    },
     "EUCM parameters": (json.dumps({**GROUP, "alpha": 0.6, "beta": 1.1}), "another model"),
-    "double sphere parameters": (FOUR + "xi: -0.2\nalpha: 0.6", "another model"),
     "ORB-SLAM3 fisheye": (FOUR + 'Camera.type: "KannalaBrandt8"', "another model"),
     "OpenSfM": (json.dumps({"v2": {"projection_type": "spherical", **GROUP}}), "another model"),
     "COLMAP fisheye": ("1 OPENCV_FISHEYE 320 240 256 257 160 120 0 0 0 0", "another model"),
     "COLMAP of other length": ("1 OPENCV 320 240 256 257 160 120 0.1", "5 parameters"),
     "instant-ngp fisheye": (json.dumps({**GROUP, "is_fisheye": True}), "another model"),
-    "fisheye group": (json.dumps({**GROUP, "fisheye": {"k1": 0.1}}), "another model"),
     "Mei": ("model_type: MEI\nmirror_parameters:\n  xi: 0.9\n" + FOUR, "another model"),
     "other distortion model": (FOUR + "distortion_model: division\nk1: 0.1", "another model"),
-    "radial list": (json.dumps({**GROUP, "radial_distortion": [0.1, 0.2]}), "of another model"),
     "k of two": (json.dumps({**GROUP, "k": [0.1, 0.2]}), "of another model"),
     "D1": ("M1: [256, 0, 1, 0, 256, 1, 0, 0, 1]\nD1: [.1, 0, 0, 0]\nD2: [.2, 0, 0, 0]", "unclear"),
     "k0": (FOUR + "k0: 0.1", "of another model"),
@@ -228,21 +175,13 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
         json.dumps({**GROUP, "model": "inverse_brown_conrady", "coeffs": [0.1, 0, 0, 0, 0]}),
         "of another model",
     ),
-    "decimal commas": (FOUR.replace("256", "256,5"), r"'256,5'[\s\S]*decimal comma"),
     "decimal commas without names": ("256,5 256,5 59,5 19,5", r"'256,5'[\s\S]*decimal comma"),
-    "decimal commas in lines": ("fx = 256,5\nfy = 256,5\ncx=9\ncy=9", "decimal comma"),
-    "decimal commas in JSON": (json.dumps({**GROUP, "fx": "256,5"}), "decimal comma"),
-    "no number": ("fx ...\nfy 1\ncx 1\ncy 1", r"not a number[\s\S]*'\.\.\.'"),
     "empty": ("fx:\nfy: 1\ncx: 1\ncy: 1", "fx is not one number"),
-    "a word": (FOUR.replace("256", "wide"), "not a number"),
     "two points": (FOUR.replace("256", "1.2.3"), r"'1\.2\.3'"),
-    "a unit": (FOUR.replace("256", "4.2 mm"), "not one|not a number"),
     "a unit in lines": ("fx = 4.2 mm\nfy = 4.2 mm\ncx = 1\ncy = 1", "not one|not a number"),
-    "underscores": (FOUR.replace("256", "25_6"), "'25_6'"),
     "two numbers": (FOUR.replace("256", "[256, 257]"), "fx is not one number"),
     "NaN distortion": (FOUR + "k1: .nan", "distortion k1 is unclear"),
     "NaN distortion without names": ("256 257 159.5 119.5 0.1 nan", "wrong number of values"),
-    "NaN": (FOUR.replace("256", ".nan"), "no camera matrix"),
     "infinite": (json.dumps({**GROUP, "fx": float("inf")}), "no camera matrix"),
     "negative": (json.dumps({**GROUP, "fx": -1}), "no camera matrix"),
     "half a camera": ("fx: 256\ncx: 1", "lacks fy and cy"),
@@ -250,17 +189,10 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "no camera": ("width: 320\nheight: 240", r"no camera[\s\S]*width, height"),
     "damaged JSON": ('{"fx": 256, "fy": 257, "cx": 159.5, "cy"', "damaged JSON"),
     "nested deeply": ("[" * 100_000, "kind"),
-    "nested in names": (
-        '{"a":' * 300 + "[" * 300 + "]" * 300 + "}" * 300,
-        "nested too deeply|no camera",
-    ),
     "XML": ("<?xml version='1.0'?><opencv_storage></opencv_storage>", "XML"),
     "empty file": ("", "is empty"),
     "binary": (b"\x80\x04\x95\x00\x00", "not text"),
-    "odd UTF-16": (FOUR.encode("utf-16")[:-1], "not text"),
-    "objects": (npy(np.array([None])), "no readable array"),
     "other .npy": (npy(np.ones(3)), "wrong number of values"),
-    "damaged .npy": (npy(K)[:-5], "no readable array"),
     "prose": ("the camera of my phone", "no camera"),
 }
 

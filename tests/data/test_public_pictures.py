@@ -98,25 +98,18 @@ def test_a_plausible_focal_length_of_exif_is_taken(
 # --- pictures that are not what they seem --------------------------------------------------------
 
 
-def tiff(path: Path, tags: dict[int, int], size: tuple[int, int] = (96, 64)) -> Path:
-    Image.fromarray(texture(*size)).save(path, "TIFF", tiffinfo=tags)
-    return path
-
-
 @pytest.mark.parametrize(
     ("name", "tags"),
-    [
-        ("a.dng", {50706: 1}),
-        ("a.tif", {50706: 1}),
-        ("a.NEF", {}),
-        ("a.cr3", {}),
-        ("a.tiff", {254: 1}),
-        ("a.arw", {254: 1}),
-    ],
+    [("a.tif", {50706: 1}), ("a.NEF", {}), ("a.tiff", {254: 1}), ("a.hdr", {})],
 )
 def test_a_raw_photo_is_refused(name: str, tags: dict[int, int], tmp_path: Path) -> None:
+    path = tmp_path / name
+    if path.suffix == ".hdr":
+        cv2.imwrite(str(path), texture().astype(np.float32))
+    else:
+        Image.fromarray(texture()).save(path, "TIFF", tiffinfo=tags)
     with pytest.raises(DataError, match=r"raw or HDR photo[\s\S]*expected: [\s\S]*try: develop it"):
-        read_image(tiff(tmp_path / name, tags))
+        read_image(path)
 
 
 @pytest.mark.parametrize("kind", ["gif", "tif", "webp", "png"])
@@ -244,12 +237,7 @@ def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
         ((80, 80, -3, 31.5), True, "a crop, or a wrong file", "80,80,47.5,31.5"),
         ((80, 80, 47.5, 60), False, "a crop, or a wrong file", "80,80,47.5,31.5"),
         # in millimetres
-        (
-            (5, 5, 47.5, 31.5),
-            False,
-            "a focal length that is not in pixels",
-            "115.2,115.2,47.5,31.5",
-        ),
+        ((5, 5, 47.5, 31.5), False, "a focal length that is not in", "115.2,115.2,47.5,31.5"),
     ],
 )
 def test_implausible_intrinsics_name_their_cause(
@@ -306,12 +294,6 @@ def test_an_assumed_scale_of_depth_gives_a_warning(kind: str, folder: Path) -> N
         assert truth.depth_ref[0, 0] == depth
         words = ["assumed: 1000 values per unit" in str(w.message) for w in caught]
         assert words == [True] * (scale is None)
-
-
-def test_a_photo_of_high_range_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "a.hdr"), texture().astype(np.float32))
-    with pytest.raises(DataError, match=r"HDR photo[\s\S]*expected: [\s\S]*try: develop it"):
-        read_image(tmp_path / "a.hdr")
 
 
 @pytest.mark.parametrize("factor", [257, 16])

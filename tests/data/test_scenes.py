@@ -12,13 +12,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes import catalogue
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, render
-from soup_nlp.data.scenes.surfaces import (
-    Box,
-    Ellipsoid,
-    Plane,
-    Sheet,
-    Texture,
-)
+from soup_nlp.data.scenes.surfaces import Box, Ellipsoid, Plane, Sheet, Texture
 from soup_nlp.data.scenes.things import placed
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera
@@ -44,10 +38,6 @@ def pair(name: str, seed: int = 0, size: tuple[int, int] | None = None) -> Pair:
 def points(p: Pair) -> np.ndarray:
     uv = camera.pixel_grid(*p.size)
     return p.truth.depth_ref[..., None] * camera.rays(p.K_ref, uv)
-
-
-def sample(image: np.ndarray, uv: np.ndarray, order: int = 1) -> np.ndarray:
-    return ndimage.map_coordinates(image, [uv[:, 1], uv[:, 0]], order=order, mode="nearest")
 
 
 # --- exactness of the truth -------------------------------------------------------------------
@@ -83,7 +73,9 @@ def test_moved_points_are_seen_or_hidden_or_outside(name):
     target = camera.pixel_grid(*p.size) + T.flow
     z = (points(p) + T.scene_flow)[..., 2]
     seen = ~T.occluded
-    got = 1 / sample(1 / T.depth_next, target[seen])  # inverse depth is linear on a plane
+    # inverse depth is linear on a plane
+    at = target[seen].T[::-1]
+    got = 1 / ndimage.map_coordinates(1 / T.depth_next, at, order=1, mode="nearest")
     # the other pixels straddle an edge, where interpolation mixes two surfaces
     assert np.mean(abs(got - z[seen]) < 2e-3 * z[seen]) > 0.95
     size = np.array(p.size[::-1])
@@ -115,9 +107,6 @@ def test_still_background_does_not_move():
     same = (T.components == 0) & (T.depth_ref == T.depth_next)
     change = np.abs(p.image_ref.astype(int) - p.image_next).max(axis=-1)
     assert np.mean(change[same] == 0) > 0.95  # the others are edge pixels of the moving body
-
-
-# --- images carry the truth -------------------------------------------------------------------
 
 
 # --- shapes -----------------------------------------------------------------------------------
@@ -167,12 +156,6 @@ def test_points_that_pass_the_camera_have_no_flow():
     assert np.isnan(T.flow[T.components == 1]).all()
     assert T.occluded[T.components == 1].all()
     assert np.isfinite(T.flow[T.components == 0]).all()
-
-
-# --- textures ---------------------------------------------------------------------------------
-
-
-# --- use --------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
