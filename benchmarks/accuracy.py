@@ -100,7 +100,6 @@ def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = F
 
 
 def _best(frame: pd.DataFrame) -> pd.Series:
-    """Whether the solution is better than every baseline that a pair has."""
     out = pd.Series(True, frame.index)
     for baseline in BASELINES:
         own = "solution_rigid" if baseline == "rigid" else "solution"
@@ -118,7 +117,6 @@ def _by_pair(frame: pd.DataFrame) -> str:
 
 
 def _by_family(frame: pd.DataFrame) -> str:
-    """Table of mean errors over the pairs of every family and flow."""
     table = pd.DataFrame({title: numbers(frame, c) for c, title in ERROR_COLUMNS.items()})
     groups = table.dropna(axis=1, how="all").groupby([frame["family"], frame["flow"]], sort=False)
     means = groups.mean()

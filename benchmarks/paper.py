@@ -256,7 +256,6 @@ def _pivot(rows: pd.DataFrame, index: str, columns: str) -> pd.DataFrame:
 
 
 def _comparison(rows: pd.DataFrame) -> list[str]:
-    """Tables by dataset and by pair."""
     groups = rows.groupby(["dataset", "method"])["mre"].mean()
     table = PUBLISHED.add_suffix(" (published)").join(groups.unstack())
     constant = metric(rows, "constant").groupby(rows["dataset"]).mean()
@@ -275,7 +274,6 @@ def _comparison(rows: pd.DataFrame) -> list[str]:
 
 
 def _departures(rows: pd.DataFrame) -> list[str]:
-    """Table of the departures, each undone alone."""
     mre = _pivot(rows, "change", "name").dropna(axis=1, how="all")
     ratios = (mre / mre.loc[BASE]).drop(BASE)
     counts = zip((ratios > 1.01).sum(axis=1), (ratios < 0.99).sum(axis=1), strict=True)

@@ -128,7 +128,6 @@ def _sintel(root: Path, o: Options) -> Items:
 
 
 def _kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Items:
-    """Training pairs of KITTI 2012 or 2015."""
     base = root / "training" if is_folder(root / "training") else root
     for index in (f"{k:06d}" for k in range(count)):
         needs = [base / camera / f"{index}_{frame}.png" for frame in (10, 11)]
@@ -152,7 +151,6 @@ def _vkitti(root: Path, o: Options) -> Items:
 
 
 def _kinect(root: Path, o: Options) -> Items:
-    """Every folder pair_*."""
     for pair in sorted(root.glob("pair_*")):
         raw = {"kind": "folder", "path": str(pair), "unit": "mm", "depth_scale": 1.0}
         yield _item("", pair.name, raw, [pair / "frame_0.png"])

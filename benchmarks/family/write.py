@@ -103,7 +103,6 @@ def write_family(
 def _entry(
     instance: Instance, superpixels: int, nlp: NLP, best: float, r: Residuals, file: NLFile
 ) -> Entry:
-    """Entry of an instance in the index."""
     sha = published()["sha256"].get(instance.name)
     solved = dict(published()["solved"].get(instance.problem, {}))
     runs = solved.pop("runs", {}).get(instance.start, {})

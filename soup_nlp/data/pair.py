@@ -275,7 +275,6 @@ class Pair:
         self._check_sizes()
 
     def _check_sizes(self) -> None:
-        """Raise DataError unless every map has the size of its image."""
         size = self.image_ref.shape
         if self.depth_prior is not None:
             check_size("depth prior and reference image", self.depth_prior.shape, size, "prior")
@@ -313,7 +312,6 @@ class Pair:
 
 
 def _check_focal(K: Float, image: Image, where: str) -> None:
-    """Raise DataError for a focal length that is too short for the size of the image."""
     for focal, side, name in ((K[0, 0], image.shape[1], "fx"), (K[1, 1], image.shape[0], "fy")):
         if focal < SHORTEST * side:
             raise DataError(

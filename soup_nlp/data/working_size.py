@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap, Labels
 from soup_nlp.data.pair import Flow, Pair, Truth
-from soup_nlp.geometry.camera import rays
+from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import LEAST_FACING
 
 SAME_SHAPE = 1.1
@@ -61,13 +61,11 @@ def resized_flow(flow: Flow, pair: Pair, other: Pair) -> Flow:
     confidence = resized(flow.confidence, size)
     weight = np.maximum(confidence, np.finfo(np.float32).tiny)
     mean = resized(flow.uv * flow.confidence[..., None], size) / weight[..., None]
-    uv = np.empty((*size, 2), np.float32)
-    at = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float32)[::-1]
-    for k in range(2):
-        ref_scale = pair.size[1 - k] / size[1 - k]
-        next_scale = other.image_next.shape[1 - k] / pair.image_next.shape[1 - k]
-        # target of the centre of a pixel, in pixels of the resized next image
-        uv[..., k] = ((at[k] + 0.5) * ref_scale + mean[..., k]) * next_scale - 0.5 - at[k]
+    at = pixel_grid(*size).astype(np.float32)
+    ref_scale = np.float32(np.divide(pair.size[::-1], size[::-1]))
+    next_scale = np.divide(other.image_next.shape[1::-1], pair.image_next.shape[1::-1])
+    # target of the centre of a pixel, in pixels of the resized next image
+    uv = ((at + np.float32(0.5)) * ref_scale + mean) * np.float32(next_scale) - 0.5 - at
     uv[confidence == 0] = 0
     return Flow(uv, np.clip(confidence, 0, 1), flow.source)
 
@@ -87,7 +85,6 @@ def _nearest(values: NDArray[Any], size: Sequence[int]) -> NDArray[Any]:
 
 
 def _truth(truth: Truth, pair: Pair, small: Pair) -> Truth:
-    """The truth at the sizes of the smaller images."""
     ref = np.divide(small.image_ref.shape[1::-1], pair.image_ref.shape[1::-1])
     following = np.divide(small.image_next.shape[1::-1], pair.image_next.shape[1::-1])
     changed: dict[str, Any] = {}

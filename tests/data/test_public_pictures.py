@@ -14,7 +14,6 @@ import pytest
 from helpers_photos import load, photo, said, texture
 from PIL import Image
 
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.formats.images import DataWarning, read_image, read_images
 from soup_nlp.data.pair import Pair
@@ -276,24 +275,13 @@ def test_distortion_is_named_or_removed(folder: Path) -> None:
 # --- depth ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["files", "folder"])
-def test_an_assumed_scale_of_depth_gives_a_warning(kind: str, folder: Path) -> None:
-    for k, name in enumerate("ab"):
-        (folder / f"{name}.png").rename(folder / f"frame_{k}.png")
-    (folder / "K.txt").write_text("80 80 47.5 31.5")
-    cv2.imwrite(str(folder / "depth_0.png"), np.full((64, 96), 2000, np.uint16))
-    source = {"kind": kind, "path": str(folder)}
-    if kind == "files":
-        names = {"ref": "frame_0.png", "next": "frame_1.png", "depth": "depth_0.png"}
-        source = {"kind": kind, "intrinsics": "K.txt", **names}
+def test_an_assumed_scale_of_depth_gives_a_warning(folder: Path) -> None:
+    cv2.imwrite(str(folder / "d.png"), np.full((64, 96), 2000, np.uint16))
+    camera = [80.0, 80.0, 47.5, 31.5]
     for scale, depth in ((None, 2.0), (1000.0, 2.0), (256.0, 2000 / 256)):
-        problem = make_problem({"input": {**source, "depth_scale": scale}, "base": str(folder)})
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            truth = problem.load_pair().truth
-        assert truth.depth_ref[0, 0] == depth
-        words = ["assumed: 1000 values per unit" in str(w.message) for w in caught]
-        assert words == [True] * (scale is None)
+        pair, text = said(folder, intrinsics=camera, depth="d.png", depth_scale=scale)
+        assert pair.truth.depth_ref[0, 0] == depth
+        assert ("assumed: 1000 values per unit" in text) == (scale is None)
 
 
 @pytest.mark.parametrize("factor", [257, 16])

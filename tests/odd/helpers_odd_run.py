@@ -25,18 +25,12 @@ ANY = (0, 1, 2)
 
 @dataclass(frozen=True)
 class Case:
-    """An odd input.
-
-    Attributes:
-        name: Unique name of the case.
-        do: Prepares the input and returns the words of a command line.
-        codes: Exit codes that are right for a command line.
-        solves: Whether it may get as far as a solve, which takes a second.
-    """
+    """An odd input: `do` prepares it and returns a command line, of which `codes` are right."""
 
     name: str
     do: Callable[[World, Path], list[str]]
     codes: tuple[int, ...] = (2,)
+    # it may get as far as a solve, which takes a second
     solves: bool = False
 
 
@@ -55,16 +49,10 @@ def cases(
     other: Mapping[str, tuple[int, ...]] | None = None,
     solves: bool | Collection[str] = False,
 ) -> Iterator[Case]:
-    """A case for every value.
+    """A case for every value, by name or by its text, for which {} stands in the title.
 
-    Args:
-        title: Name of a case; {} stands for the name of its value.
-        do: Command line (see `words`) or function; None if the values are lines or functions.
-        values: Values by name, or values whose names are their texts.
-        codes: Exit codes that are right.
-        make: Prepares the input.
-        other: Exit codes of single values, by name.
-        solves: Whether the cases may solve, or the names of the values that may.
+    `do` is a command line (see `words`) or a function; None if the values are. `other` are exit
+    codes of single values, `solves` may be the names of the values that may solve.
     """
     named = values if isinstance(values, Mapping) else {str(v): v for v in values}
     for name, value in named.items():
@@ -152,14 +140,7 @@ def _alarm(*_: object) -> None:
 
 
 def fault(case: Case, world: World, folder: Path, seconds: int = 60) -> str | None:
-    """The fault of the program's answer to an odd input; None for a correct answer.
-
-    Args:
-        case: The input.
-        world: Good files.
-        folder: Empty folder of the case.
-        seconds: After which the case counts as endless.
-    """
+    """The fault of the program's answer to an odd input, in an empty folder; None without."""
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", "strict", write_through=True) for _ in "12")
     err.reconfigure(errors="backslashreplace")
     # the time limit includes the preparation of the case
@@ -169,10 +150,6 @@ def fault(case: Case, world: World, folder: Path, seconds: int = 60) -> str | No
         with redirect_stdout(out), redirect_stderr(err), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             code = main(case.do(world, folder))
-    except EndlessError:
-        return "endless"
-    except MemoryError:
-        return "memory"
     except BaseException as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         origin = f"{Path(where.filename).name}:{where.lineno}"
@@ -185,15 +162,11 @@ def fault(case: Case, world: World, folder: Path, seconds: int = 60) -> str | No
         return f"exit {code}, expected {case.codes}: {complaint[-200:]!r}"
     if code == 2 and "error: " not in complaint:
         return f"exit 2 without a message: {complaint[-200:]!r}"
-    return _text_fault(complaint) or _text_fault(said, longest=100_000)
-
-
-def _text_fault(text: str, longest: int = LONGEST) -> str | None:
-    if "Traceback (most recent call last)" in text:
-        return "traceback printed"
-    bad = {c for c in text if c not in "\n\t" and not c.isprintable()}
-    if bad:
-        return f"control characters {sorted(bad)[:3]!r}"
-    if len(text) > longest:
-        return f"{len(text)} characters of message"
+    for text, longest in ((complaint, LONGEST), (said, 100_000)):
+        if "Traceback (most recent call last)" in text:
+            return "traceback printed"
+        if bad := {c for c in text if c not in "\n\t" and not c.isprintable()}:
+            return f"control characters {sorted(bad)[:3]!r}"
+        if len(text) > longest:
+            return f"{len(text)} characters of message"
     return None

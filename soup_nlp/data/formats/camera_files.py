@@ -173,7 +173,6 @@ def read_camera(path: PathLike) -> tuple[Float, Float]:
 
 
 def _plain(values: list[float], where: PathLike) -> tuple[Float, Float]:
-    """Intrinsics and distortion of numbers without names."""
     K = _matrix_of(values)
     if K is not None:
         return check_intrinsics(K, where), np.zeros(0)
@@ -290,7 +289,6 @@ def _of_other_model(name: str, meaning: str, value: str) -> bool:
 
 
 def _grouped(group: str, values: dict[str, list[float]], where: PathLike) -> Float:
-    """Intrinsics of parameters with the same names before them."""
     # both may have one name, f or c
     parts = {n: values.get(n) or values.get(n[0], []) for n in ("fx", "fy", "cx", "cy")}
     missing = [name for name, found in parts.items() if not found]

@@ -235,7 +235,6 @@ def read_images(
 
 
 def _colours(path: PathLike, turn: bool) -> NDArray[Any]:
-    """(H, W, 3) RGB of 8 or 16 bits, see `read_images`."""
     image = decode(path, "image")
     orientation = exif_tags(path).get(ExifTags.Base.Orientation, 1)
     orientation = orientation if orientation in range(1, 9) else 1
