@@ -12,7 +12,7 @@ import resource
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, suppress
@@ -31,7 +31,10 @@ Row = dict[str, Any]
 Work = Callable[[], Row]
 Say = Callable[[int, int, Row], None]
 Job = tuple[Mapping[str, Any], Work]
-"""Entries of a row that identify it together with the code version, and what measures the row."""
+"""Entries of a row that identify it together with the code version, and what measures the row.
+
+All jobs have entries of the same names.
+"""
 
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
@@ -280,14 +283,14 @@ def measure_all(
     `say` is called with (done, total, row) after every new row, and `after` with all rows so far,
     in the order of the jobs, after every new row and at the end.
     """
-    code = code_version()
-    job_of = {_identity(entries, entries): (entries, work) for entries, work in jobs}
-    row_of: dict[str, Row] = {}
+    code, keys = code_version(), list(jobs[0][0]) if jobs else []
+
+    def identity(row: Mapping[str, Any]) -> str:
+        return json.dumps(plain({k: row.get(k) for k in keys}), sort_keys=True)
+
+    job_of = {identity(entries): (entries, work) for entries, work in jobs}
     stored = [r for r in read_rows(path) if r.get("code") == code and not failed(r)]
-    for name, (entries, _) in job_of.items():
-        for row in stored:
-            if _identity(row, entries) == name:
-                row_of[name] = row
+    row_of = {name: row for row in stored if (name := identity(row)) in job_of}
     todo = {name: work for name, (_, work) in job_of.items() if name not in row_of}
 
     def so_far() -> list[Row]:
@@ -304,7 +307,3 @@ def measure_all(
     if after and not todo:
         after(so_far())
     return so_far()
-
-
-def _identity(row: Mapping[str, Any], keys: Iterable[str]) -> str:
-    return json.dumps(plain({k: row.get(k) for k in keys}), sort_keys=True)
