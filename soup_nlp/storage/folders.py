@@ -84,11 +84,9 @@ def digest_of(path: Path) -> str:
 
 
 def _state(folder: Path, name: str, made: dict[str, str]) -> str:
-    """What a folder holds under a name: nothing, made (by the program), foreign, or blocked.
-
-    A name is blocked by a folder, or by a file or link above it.
-    """
+    """What is under a name: nothing, made (by the program), foreign, or blocked by a folder."""
     path, above = folder / name, [folder / p for p in PurePosixPath(name).parents[:-1]]
+    # a file or link above it blocks a name as well
     if any(p.is_symlink() or (p.exists() and not p.is_dir()) for p in above):
         return "blocked"
     if path.is_file() and not path.is_symlink():
@@ -124,8 +122,8 @@ def claim(
     with _named_errors(folder):
         target = Path(os.path.realpath(as_path(folder, "output folder")))
         if os.path.ismount(target):
-            hint = "choose a folder below it"
-            raise DataError("output folder is a mount point", where=folder, hint=hint)
+            what = "output folder is a mount point"
+            raise DataError(what, where=folder, hint="choose a folder below it")
         for place in (target, next(p for p in target.parents if os.path.lexists(p))):
             if os.path.lexists(place):
                 # fails where nothing can be written
@@ -151,9 +149,9 @@ def claim(
                 expected="a new or empty folder, or that of an earlier result",
                 hint=f"move them away, {hint}",
             )
-        for name in (name for name in foreign if states[name] == "blocked"):
+        if blocked := [name for name in foreign if states[name] == "blocked"]:
             what = "cannot write over a folder, below a file or link, or into another one's file"
-            raise DataError(what, where=target / name, hint="choose another --out")
+            raise DataError(what, where=target / blocked[0], hint="choose another --out")
     return Path(folder)
 
 
@@ -230,10 +228,7 @@ def _commit(new: Path, target: Path, whole: bool, subject: str) -> None:
 
 
 def _exchange(new: Path, target: Path, replaced: Set[str]) -> None:
-    """Put a folder in the place of another one, whose other files it gets.
-
-    A kill in between leaves the other folder beside the target.
-    """
+    """Put a folder in the place of another one, whose files that are not replaced it gets."""
     shared = {parent for name in replaced for parent in PurePosixPath(name).parents}
     kept = set()
     for name in set(files_in(target)) - replaced:
@@ -241,6 +236,7 @@ def _exchange(new: Path, target: Path, replaced: Set[str]) -> None:
         # a folder with nothing but the user's files moves at once
         kept.add(next(p for p in (*reversed(path.parents), path) if p not in shared))
     old = new.with_name("old")
+    # a kill from here on leaves the other folder beside the target
     os.rename(target, old)
     try:
         os.rename(new, target)

@@ -37,9 +37,6 @@ def heard():
     signal.signal(signal.SIGINT, before)
 
 
-OWNER = {"batch": "batches.run", "chain": "sequence.solve"}
-
-
 def solve(out: Path) -> int:
     return cli.main(["solve", "orbit", "--out", str(out), "-q", *SMALL])
 
@@ -82,12 +79,13 @@ def test_before_a_start_it_ends_at_once(owner, stage, tmp_path, monkeypatch, cap
     assert "interrupted" in (tmp_path / "out" / folders.FAILED).read_text()
 
 
-@pytest.mark.parametrize("command", ["batch", "chain"])
-def test_an_interrupt_says_what_is_kept(command, tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(f"soup_nlp.{OWNER[command]}.each", lambda *_, **__: ctrl_c())
-    source = {"batch": "problems/orbit.yaml", "chain": "scene:orbit"}[command]
-    words = [command, source, "-o", str(tmp_path / "out"), "-q", *SMALL[4:]]
-    assert cli.main(words) == 130
+@pytest.mark.parametrize(
+    ("words", "owner"),
+    [("batch problems/orbit.yaml", "batches.run"), ("chain scene:orbit", "sequence.solve")],
+)
+def test_an_interrupt_says_what_is_kept(words, owner, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(f"soup_nlp.{owner}.each", lambda *_, **__: ctrl_c())
+    assert cli.main([*words.split(), "-o", str(tmp_path / "out"), "-q", *SMALL[4:]]) == 130
     error = capfd.readouterr().err
     assert "are kept" in error
     assert "the same command goes on" in error
