@@ -43,21 +43,11 @@ class SoupError(Exception):
         expected: object = None,
         hint: str | None = None,
     ) -> None:
-        self.what = what
-        self.where = where
-        self.found = found
-        self.expected = expected
-        self.hint = hint
-        parts = [printable(what)]
-        for label, value in (
-            ("where", where),
-            ("found", found),
-            ("expected", expected),
-            ("try", hint),
-        ):
-            if value is not None:
-                parts.append(f"  {label}: {printable(value)}")
-        super().__init__("\n".join(parts))
+        self.what, self.where = what, where
+        self.found, self.expected, self.hint = found, expected, hint
+        facts = {"where": where, "found": found, "expected": expected, "try": hint}
+        lines = [f"  {k}: {printable(fact)}" for k, fact in facts.items() if fact is not None]
+        super().__init__("\n".join([printable(what), *lines]))
 
 
 class ConfigError(SoupError, ValueError):
