@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.epipolar import Motion
+from soup_nlp.start.epipolar import MOTION_STEP, Motion
 from soup_nlp.start.labelling import (
     IN_NOISE,
     LEAST_GAP_PX,
@@ -35,10 +35,8 @@ with the diameter of the superpixel."""
 AT_REST, TURN_SHARE = 0.8, 9e-5
 """Least ratio of what a turn explains to what the main rigid motion explains, if the camera rests,
 and the error up to which it explains the flow, as a share of the longer side of a small image."""
-MATRIX_STEP, LEAST_MOVED_DEPTH = 1e-5, 1e-3
-"""Step by which matrices of motions are differentiated, and least depth of a moved point."""
-LEAST_SCALE = 0.02
-"""Least scale of the refinement of a motion, pixels."""
+LEAST_MOVED_DEPTH, LEAST_SCALE = 1e-3, 0.02
+"""Least depth of a moved point, and least scale of the refinement of a motion, pixels."""
 
 
 def least_gap(noise: float) -> float:
@@ -125,8 +123,8 @@ def fit_robustly(
         return (scale * (moved(x)[0] - target)).ravel()
 
     def slope(x: Float) -> Float:
-        (at, depth), step = moved(x), MATRIX_STEP * free
-        change = (matrix(x @ free + step) - matrix(x @ free - step)) @ point / (2 * MATRIX_STEP)
+        (at, depth), step = moved(x), MOTION_STEP * free
+        change = (matrix(x @ free + step) - matrix(x @ free - step)) @ point / (2 * MOTION_STEP)
         return (scale / depth * (change[:, :2] - at * change[:, 2:])).reshape(size, -1).T
 
     x = np.zeros(size)

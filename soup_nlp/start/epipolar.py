@@ -32,8 +32,8 @@ the translation."""
 RELIEF, MOST_RELIEF = 0.5, 3.0
 """Standard deviation of log depth within a scene, and limit of a log depth relative to the median:
 points at infinity or behind the camera."""
-MOTION_CHANGE = np.array([0.01] * 3 + [0.1] * 2)
-"""Usual change of a motion by `most_probable`."""
+MOTION_CHANGE, MOTION_STEP = np.array([0.01] * 3 + [0.1] * 2), 1e-5
+"""Usual change of a motion by `most_probable`, and step by which motions are differentiated."""
 EPIPOLAR_PX = 0.3
 """Scale of the Cauchy loss of epipolar distances, pixels."""
 
@@ -283,13 +283,16 @@ def most_probable(
     error: float,
     expected: Float | float = 0.0,
     spread: float = RELIEF,
-) -> Motion:
+) -> tuple[Motion, Float]:
     """The motion that minimises the mean squared epipolar distance and the relief.
 
     `mean rho(e, EPIPOLAR_PX) / error^2 + mean rho(log(z / median z), spread) / spread^2`, with e
     the Sampson distance and rho(x, c) = c^2 log(1 + x^2 / c^2) the Cauchy loss. It begins at each
     of the motions; `error` is the systematic one of the flow, pixels. Relief, whose standard
     deviation is `spread`, is counted from the `expected` log depth (M,) of a depth prior.
+
+    Returns:
+        The motion, and the (5, 5) covariance of the parameters of `around` it.
     """
     root, results = np.sqrt(matches.weight / matches.weight.sum()), []
 
@@ -305,8 +308,23 @@ def most_probable(
             x_scale=MOTION_CHANGE,
             max_nfev=EVALUATIONS,
         )
-        results.append((float(end.cost), moved(end.x)))
-    return min(results, key=lambda result: result[0])[1]
+        results.append((float(end.cost), moved(end.x), np.linalg.pinv(end.jac.T @ end.jac)))
+    return min(results, key=lambda result: result[0])[1:]
+
+
+def relief_spread(motion: Motion, covariance: Float, ray: Float, target: Float) -> Float:
+    """(M,) standard deviation of log depth, its median left out, by the error of a motion.
+
+    Args:
+        motion: A motion with the (5, 5) covariance of the parameters of `around` it.
+        covariance: See there.
+        ray: (M, 3) rays.
+        target: (M, 3) rays of the next frame.
+    """
+    moved, steps = around(motion), MOTION_STEP * np.eye(5)
+    ends = [[relief(moved(x), ray, target) for x in (step, -step)] for step in steps]
+    slope = np.array([more - less for more, less in ends]) / (2 * MOTION_STEP)
+    return np.sqrt(np.einsum("kn,kl,ln->n", slope, covariance, slope))
 
 
 def cauchy(x: Float, scale: float) -> Float:

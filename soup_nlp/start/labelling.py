@@ -25,6 +25,7 @@ from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.epipolar import (
+    MOTION_CHANGE,
     SIDEWAYS,
     Motion,
     estimate,
@@ -226,21 +227,26 @@ def smooth(flow: FlowFit, cost: Float) -> Int:
     return solve_trws(cost, seg.pairs, weight[:, None, None] * (1 - np.eye(m)), max_iter=30).labels
 
 
-def settle(flow: FlowFit, choice: Labelling) -> Labelling:
+def settle(flow: FlowFit, choice: Labelling) -> tuple[Labelling, Float]:
     """The labelling with the most probable motion of every rigid component (`most_probable`).
 
     The error that the flow of a component shares follows from what its motion leaves unexplained,
-    across the epipolar lines: along them, depth would explain it.
+    across the epipolar lines: along them, depth would explain it. An exact flow leaves none.
+
+    Returns:
+        The labelling, and (M, 5, 5) covariances of its motions by that error.
     """
     motions = list(choice.motions)
+    covariance = np.tile(np.diag(MOTION_CHANGE**2), (len(motions), 1, 1))
     for c, motion in enumerate(motions):
         at = np.flatnonzero((choice.label == c) & flow.views.usable)
         if len(at) < PIECE_SIZE:
             continue
         error = IN_NOISE * float(np.median(choice.excess[at]))
+        covariance[c] = 0.0
         if error > EXACT_PX:
-            motions[c] = most_probable([motion], flow.anchor_matches(at), error)
-    return Labelling.of(flow, motions, choice.label, choice.shared)
+            motions[c], covariance[c] = most_probable([motion], flow.anchor_matches(at), error)
+    return Labelling.of(flow, motions, choice.label, choice.shared), covariance
 
 
 # --- regions that stand still in the image of a moving camera -------------------------------------

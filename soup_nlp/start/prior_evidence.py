@@ -158,7 +158,7 @@ class Seen(NamedTuple):
         motions = [Motion(R, T / np.linalg.norm(T)) for R, T in tried if np.any(T)]
         matches = self.flow.anchor_matches(use)
         error = min(COMMON_NOISES * start.noise, MOST_COMMON_PX)
-        best = most_probable(motions, matches, error, prior[use], sigma)
+        best, _ = most_probable(motions, matches, error, prior[use], sigma)
         planes = views.fit([best])
         mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
         strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP_PX)

@@ -60,7 +60,8 @@ class Start:
         component: (N,) index of the rigid component, which shares one scale: the superpixels of a
             dominant motion, or a connected piece of superpixels with their own motions; `SCENE`.
         part: (N,) group that moves as one: its component; at rest each piece that moves.
-        motions: The motions that superpixels share.
+        motions: The M motions that superpixels share.
+        covariance: (M, 5, 5) covariances by the error that a flow shares, see `relief_spread`.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside.
         tie: (N,) origin of the scale of every superpixel's component, an index of `TIES`.
         bends: (N,) True where the energy for bending surfaces is used. Its connected regions are
@@ -85,6 +86,7 @@ class Start:
     component: Int
     part: Int
     motions: list[Motion]
+    covariance: Float
     surface: Int
     tie: Int
     bends: Mask
@@ -121,6 +123,7 @@ class Start:
             component=zero,
             part=zero,
             motions=[],
+            covariance=np.zeros((0, 5, 5)),
             surface=zero,
             tie=zero,
             bends=none,
@@ -192,7 +195,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         )
         part = _scene_first(surface) if turn is None else moving_pieces(flow)
         return _ordered(flow, start, part, contrast)
-    choice = settle(rigid, choice)
+    choice, covariance = settle(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
     soup, weak = _with_depth(rigid, choice, wrong)
     label = component = choice.label
@@ -225,6 +228,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         component=component,
         part=component,
         motions=choice.motions,
+        covariance=covariance,
         surface=surface,
         tie=tie,
         bends=bends,

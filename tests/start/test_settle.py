@@ -37,7 +37,7 @@ def relief_error(motion: Motion, matches: Matches, log_z: np.ndarray) -> float:
 
 
 def test_a_motion_that_parallax_determines_is_kept():
-    found = most_probable([TRUE], flow(0.3)[0], 0.05)
+    found, _ = most_probable([TRUE], flow(0.3)[0], 0.05)
     np.testing.assert_allclose(found.R, TRUE.R, atol=2e-4)
     np.testing.assert_allclose(found.t, TRUE.t, atol=5e-3)
 
@@ -45,8 +45,8 @@ def test_a_motion_that_parallax_determines_is_kept():
 def test_depth_survives_little_parallax_and_biased_flow():
     """The motion of the least residual follows the bias, and distant points recede."""
     matches, log_z = flow(0.006, bias=0.4)
-    least = most_probable([TRUE], matches, 1e-4)
-    found = most_probable([least], matches, 0.15)
+    least, _ = most_probable([TRUE], matches, 1e-4)
+    found, _ = most_probable([least], matches, 0.15)
     assert relief_error(found, matches, log_z) < 0.7 * relief_error(least, matches, log_z)
 
 
