@@ -12,7 +12,6 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticKnownError
 
 from soup_nlp.arrays import Float
-from soup_nlp.data.accept import prior_of
 from soup_nlp.data.datasets.benchmarks import KittiInput, SintelInput, TumInput, VkittiInput
 from soup_nlp.data.datasets.folders import (
     FolderInput,
@@ -24,7 +23,7 @@ from soup_nlp.data.datasets.folders import (
 )
 from soup_nlp.data.flow.sources import is_network
 from soup_nlp.data.formats.camera_files import read_camera, read_intrinsics
-from soup_nlp.data.formats.map_files import read_depth
+from soup_nlp.data.formats.map_files import prior_of, read_depth
 from soup_nlp.data.network import learned_map
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.data.scenes.catalogue import LAYOUTS, render_scene

@@ -10,19 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap, Image, Mask
-from soup_nlp.data.accept import (
-    CameraLike,
-    FlowLike,
-    ImageLike,
-    array_of,
-    camera_of,
-    image_of,
-    is_path,
-    prior_of,
-)
+from soup_nlp.data.formats.camera_files import CameraLike, camera_of
 from soup_nlp.data.formats.cameras import estimated_cameras
-from soup_nlp.data.formats.images import read_images
-from soup_nlp.data.formats.map_files import UNKNOWN_FLOW, flow_layout, read_flow
+from soup_nlp.data.formats.images import ImageLike, array_of, image_of, is_path, read_images
+from soup_nlp.data.formats.map_files import UNKNOWN_FLOW, FlowLike, flow_layout, prior_of, read_flow
 from soup_nlp.errors import DataError, expect, one_line, printable, repr_of
 
 SHORTEST = 0.05

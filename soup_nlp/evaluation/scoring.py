@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.arrays import Float, Mask
-from soup_nlp.data.accept import array_of
-from soup_nlp.data.formats.images import read_image
+from soup_nlp.data.formats.images import array_of, read_image
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Pair, Truth
 from soup_nlp.errors import DataError

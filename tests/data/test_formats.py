@@ -192,18 +192,18 @@ def test_a_prior_is_read_from_more_files_than_a_depth(tmp_path: Path) -> None:
     np.savez(tmp_path / "b.npz", depth)
     for name in ("a.npz", "b.npz"):
         np.testing.assert_array_equal(fmt.read_depth(tmp_path / name), known)
-        np.testing.assert_array_equal(fmt.read_prior(tmp_path / name), known)
+        np.testing.assert_array_equal(fmt.prior_of(tmp_path / name), known)
     grey = depth.astype(np.uint8)
     for name, image in (("a.png", grey), ("b.png", np.dstack([grey] * 3))):
         with pytest.warns(DataWarning, match=r"8 bits has 4 different values; assumed: its grey"):
-            out = fmt.read_prior(stored(tmp_path / name, image))
+            out = fmt.prior_of(stored(tmp_path / name, image))
         np.testing.assert_array_equal(out, known)
     deep = stored(tmp_path / "c.png", depth.astype(np.uint16))
-    np.testing.assert_array_equal(fmt.read_prior(deep), known)
+    np.testing.assert_array_equal(fmt.prior_of(deep), known)
     colour = stored(tmp_path / "d.png", np.dstack([grey, grey, grey + 1]))
     for path, match in ((colour, "16-bit PNG with 1 channel"), (tmp_path / "none.png", "missing")):
         with raises(match):
-            fmt.read_prior(path)
+            fmt.prior_of(path)
 
 
 def test_kitti_disparity_and_vkitti_depth(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ twice with other values are refused.
 import math
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -18,12 +18,14 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, Image
 from soup_nlp.data.formats.camera_text import Named, named_words
 from soup_nlp.data.formats.cameras import written
-from soup_nlp.data.formats.images import check_body
+from soup_nlp.data.formats.images import array_of, check_body, is_path
 from soup_nlp.data.formats.map_files import MAGIC, after_magic
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.storage.files import PathLike, read_bytes
 
+CameraLike: TypeAlias = Any
+"""A 3x3 matrix, four numbers (fx, fy, cx, cy) in pixels, or a file with one of these."""
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of distortion in OpenCV's order; up to six more have no common names."""
 
@@ -111,6 +113,14 @@ def check_intrinsics(matrix: NDArray[Any], where: object) -> Float:
             hint="give fy without its sign, if the y axis points up (ICL-NUIM)" if up else _FOUR,
         )
     return K
+
+
+def camera_of(source: CameraLike, where: str) -> Float:
+    """(3, 3) intrinsics from a matrix, from (fx, fy, cx, cy), or from a file."""
+    if is_path(source):
+        return read_intrinsics(source)
+    numbers = array_of(source, "intrinsics", where, "(3, 3), or fx, fy, cx, cy")
+    return check_intrinsics(intrinsics(*numbers) if numbers.shape == (4,) else numbers, where)
 
 
 def read_intrinsics(path: PathLike) -> Float:

@@ -1,4 +1,4 @@
-"""Reading of images, and checks that the readers of all formats share.
+"""Reading of images, and checks that the readers of all formats and arrays share.
 
 Every reader raises `DataError` for a file that is missing, empty, truncated or of another kind.
 """
@@ -12,7 +12,7 @@ import threading
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -20,10 +20,13 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
 
 from soup_nlp.arrays import Mask
-from soup_nlp.errors import DataError
+from soup_nlp.errors import DataError, printable, repr_of
 from soup_nlp.schema.section import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, read_bytes
 
+ImageLike: TypeAlias = Any
+"""An array (H, W), (H, W, C) or (C, H, W) with 1, 3 or 4 channels, of 8 bits or of floats from 0 to
+1, a file, or a PIL image."""
 OUTER = (0.5, 99.5)
 """Percentiles of the values of 16-bit pictures that become black and white."""
 
@@ -32,6 +35,8 @@ RAW = (
     ".orf", ".pef", ".srw", ".3fr", ".fff", ".iiq", ".kdc", ".dcr", ".mrw", ".x3f", ".erf", ".gpr",
 )  # fmt: skip
 """Suffixes of raw photos."""
+_PICTURES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
+"""Modes of PIL images of 8 bits or fewer a channel."""
 COMB, COMBED = 10, 0.01
 """Difference of rows, grey levels, that counts as a comb; least share of interlaced frames."""
 _RAW_TAGS = {"DNGVersion": 50706, "SubIFDs": 330}
@@ -48,6 +53,42 @@ class DataWarning(UserWarning):
 def warn(where: object, text: str) -> None:
     """Warn of an input, from the place that called the caller."""
     warnings.warn(f"{where}: {text}", DataWarning, stacklevel=3)
+
+
+def is_path(value: object) -> bool:
+    """Whether the argument is the path of a file."""
+    return isinstance(value, str | os.PathLike)
+
+
+def array_of(
+    value: object,
+    what: str,
+    where: str,
+    expected: str,
+    kinds: str = "fiu",
+    axes: str = "",
+    hint: str | None = None,
+) -> NDArray[Any]:
+    """An object as NumPy array; DataError if it is none, or of another kind of numbers or shape.
+
+    `kinds` are the accepted kinds of NumPy's data types, a letter each; `axes` is the shape, such
+    as "(H, W, 2)", any if empty. The other arguments are for the message.
+    """
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        array = np.empty(0, object)
+    sizes = axes.strip("()").split(", ") if axes else [str(size) for size in array.shape]
+    fits = array.ndim == len(sizes) and all(
+        str(size) == wanted for size, wanted in zip(array.shape, sizes) if wanted.isdigit()
+    )
+    if array.dtype.kind not in kinds or not fits:
+        shown = f"{type(value).__name__} {printable(repr_of(value), 60)}"
+        if array.dtype.kind in "fiub":
+            shown = f"{array.dtype} {array.shape}"
+        what = f"{what} is no array of its kind"
+        raise DataError(what, where=where, found=shown, expected=expected, hint=hint)
+    return array
 
 
 def check_body(count: int, expected: int, path: PathLike, what: str) -> None:
@@ -232,6 +273,34 @@ def read_images(
             warn(paths[k], "looks interlaced; separate its fields, for example by ffmpeg's yadif")
         images[k] = image
     return images
+
+
+def image_of(source: ImageLike, where: str) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB of an array, a file or a PIL image; grey is repeated, alpha dropped."""
+    if is_path(source):
+        return read_image(Path(source))
+    if hasattr(source, "convert") and getattr(source, "mode", None) in _PICTURES:
+        source = source.convert("RGB")
+    expected = "uint8 (H, W, 3) array, path or PIL image"
+    image = array_of(source, "image", where, expected, kinds="fiub")
+    if image.ndim == 2:
+        image = image[:, :, None]
+    elif image.ndim == 3 and image.shape[0] in (1, 3, 4) and image.shape[2] not in (1, 3, 4):
+        image = np.moveaxis(image, 0, 2)
+    if image.dtype.kind == "f" and image.size and image.min() >= 0 and image.max() <= 1:
+        image = np.rint(255 * image.astype(np.float64)).astype(np.uint8)
+    if image.ndim != 3 or image.shape[2] not in (1, 3, 4) or image.dtype != np.uint8:
+        floats = image.dtype.kind == "f"
+        raise DataError(
+            "image must be 8-bit RGB, or floats from 0 to 1",
+            where=where,
+            found=f"{image.dtype} {np.shape(source)}",
+            expected="uint8 (H, W, 3)",
+            hint="image / 255, if its values are 0 to 255" if floats else None,
+        )
+    check_image_size(image.shape[1], image.shape[0], "image", where)
+    image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[:, :, :3]
+    return np.ascontiguousarray(image)
 
 
 def _colours(path: PathLike, turn: bool) -> NDArray[Any]:

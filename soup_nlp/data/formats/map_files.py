@@ -15,18 +15,27 @@ import zipfile
 from collections.abc import Callable, Mapping
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap
-from soup_nlp.data.formats.images import check_body, decode, decode_png16, warn
+from soup_nlp.data.formats.images import (
+    array_of,
+    check_body,
+    decode,
+    decode_png16,
+    is_path,
+    warn,
+)
 from soup_nlp.errors import DataError, repr_of
 from soup_nlp.schema.section import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, as_path, read_bytes
 
+FlowLike: TypeAlias = Any
+"""Displacements in pixels, (H, W, 2) or (2, H, W), or a file (.flo, KITTI .png, .npy)."""
 Reader = Callable[[PathLike], NDArray[Any]]
 
 MAGIC = b"PIEH"
@@ -297,8 +306,15 @@ def _one_map(path: PathLike) -> NDArray[Any]:
     return arrays["depth"] if "depth" in arrays else maps.popitem()[1]
 
 
-def read_prior(path: PathLike) -> Float:
-    """The values of a depth prior: a depth file of any scale, or an 8-bit grey picture."""
+def prior_of(source: Any) -> Float:
+    """(H, W) values of a depth prior, NaN where they are not positive and finite.
+
+    It is an array, a depth file of any scale, or an 8-bit grey picture.
+    """
+    if not is_path(source):
+        values = array_of(source, "depth prior", "prior", "numbers (H, W), or a path")
+        return known_depth(values, "prior")
+    path = str(source)
     image = decode(path, "depth prior") if Path(path).suffix.lower() == ".png" else np.empty(0)
     # a grey picture may be stored in colour
     grey = image[:, :, 0] if image.ndim == 3 else image
