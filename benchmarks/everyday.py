@@ -9,9 +9,7 @@ from numpy.typing import ArrayLike
 
 from soup_nlp.arrays import Float
 from soup_nlp.data.scenes import catalogue
-from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse
-from soup_nlp.data.scenes.surfaces import Box, Colour, Ellipsoid, Panels, Plane
-from soup_nlp.data.scenes.things import (
+from soup_nlp.data.scenes.catalogue import (
     ASPHALT,
     BACK,
     DARK,
@@ -29,6 +27,8 @@ from soup_nlp.data.scenes.things import (
     views,
     windows,
 )
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, inverse
+from soup_nlp.data.scenes.surfaces import Box, Colour, Ellipsoid, Panels, Plane
 
 GRASS: tuple[Colour, Colour] = ((0.34, 0.46, 0.20), (0.24, 0.36, 0.14))
 SKIN: tuple[Colour, Colour] = ((0.80, 0.60, 0.48), (0.66, 0.46, 0.36))

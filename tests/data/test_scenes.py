@@ -10,10 +10,9 @@ from benchmarks.everyday import LAYOUTS
 from soup_nlp.data.inputs import SceneInput
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes import catalogue
-from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.data.scenes.catalogue import placed, render_scene
 from soup_nlp.data.scenes.raycast import Body, Part, Scene, render
 from soup_nlp.data.scenes.surfaces import Box, Ellipsoid, Plane, Sheet, Texture
-from soup_nlp.data.scenes.things import placed
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.geometry import camera
 

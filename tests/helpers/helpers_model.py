@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.scenes.catalogue import about, placed
 from soup_nlp.data.scenes.raycast import Body, Frame, Part, Scene, render
 from soup_nlp.data.scenes.surfaces import Box, Plane, Texture
-from soup_nlp.data.scenes.things import about, placed
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup, reconstruct
