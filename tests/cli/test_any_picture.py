@@ -5,8 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from helpers_files import sets, write_flo, write_pair
-from helpers_photos import photo
+from helpers_files import photo, sets, write_flo, write_pair
 from PIL import Image
 
 from soup_nlp.cli.main import main

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers_photos import load, photo, said, texture
+from helpers_files import load, photo, said, texture
 from PIL import Image
 
 from soup_nlp.data.formats.cameras import GUESS_SIGMA

@@ -1,14 +1,18 @@
-"""Files that readers are tested with, written by hand; overrides."""
+"""Files that readers are tested with, written by hand; pictures with metadata; overrides."""
 
 import io
 import struct
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.data.formats.map_files import MAGIC
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import DataError
@@ -78,3 +82,36 @@ def put(path: Path, content: bytes) -> Path:
 def raises(match: str):
     """Expect a DataError with a message that matches."""
     return pytest.raises(DataError, match=match)
+
+
+# --- photos ---------------------------------------------------------------------------------------
+
+
+def texture(width: int = 96, height: int = 64, seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).integers(0, 256, (height, width, 3)).astype(np.uint8)
+    return np.asarray(cv2.GaussianBlur(noise, (0, 0), 1.5))
+
+
+def photo(path: Path, image: np.ndarray | None = None, turned: int = 1, **tags: float) -> Path:
+    """A picture with EXIF; `tags` are those of the camera."""
+    picture = Image.fromarray(texture() if image is None else image)
+    exif = picture.getexif()
+    exif[ExifTags.Base.Orientation] = turned
+    own = {ExifTags.Base[name]: value for name, value in tags.items()}
+    exif.get_ifd(ExifTags.IFD.Exif).update(own)
+    picture.save(path, exif=exif)
+    return path
+
+
+def load(folder: Path, ref: str = "a.png", following: str = "b.png", **keys: object) -> Pair:
+    source = {"kind": "files", "ref": ref, "next": following, **keys}
+    return make_problem({"input": source, "base": str(folder)}).load_pair()
+
+
+def said(*args: object, **keys: object) -> tuple[Pair, str]:
+    """A loaded pair and its warnings, all of which are about data."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        pair = load(*args, **keys)
+    assert {w.category for w in caught} <= {DataWarning}
+    return pair, "\n".join(str(w.message) for w in caught)
