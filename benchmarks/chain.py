@@ -35,11 +35,11 @@ COLUMNS = {
 def sequences(data: Path | None) -> list[Item]:
     """Rendered sequences, and kitti_tracking where its folder is there."""
     scenes = ("street", "room", "orbit")
-    out = [Item("rendered", s, s, "dis", {"kind": "scene", "scene": s}) for s in scenes]
+    out = [Item(s, s, {"kind": "scene", "scene": s}) for s in scenes]
     folder = (data or Path()).resolve() / "kitti_tracking"
     if data is not None and folder.is_dir():
         source = {"kind": "folder", "path": str(folder)}
-        out.append(Item("shared", folder.name, folder.name, "dis", source))
+        out.append(Item(folder.name, folder.name, source, suite="shared"))
     return out
 
 

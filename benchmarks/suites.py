@@ -14,7 +14,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.storage.files import as_path, is_file, is_folder
 
 RENDERED = ("street", "room", "sheet", "orbit", "still", "banner")
-MOTORCYCLE = Item("shared", "motorcycle", "motorcycle", "dis", {"kind": "motorcycle"})
+MOTORCYCLE = Item("motorcycle", "motorcycle", {"kind": "motorcycle"}, suite="shared")
 """The real pair that needs no data; it comes with scikit-image."""
 SINGLE = (
     *("kraw_jam_030", "omd_occlusion_161", "sun3d_lounge", "s7_kitchen_150", "sinus_15_19"),
@@ -55,20 +55,13 @@ def spread(count: int, wanted: int, first: int = 0) -> list[int]:
 Items = Iterator[Item]
 
 
-def _item(
-    family: str, name: str, raw: Mapping[str, Any], needs: Sequence[Path] = (), **fields: Any
-) -> Item:
-    """A pair whose suite and flow `every_pair` adds."""
-    return Item("", family, name, "", raw, **fields, needs=tuple(needs))
-
-
 def _scenes(scenes: Sequence[str], columns: float, rows: float, root: Path, o: Options) -> Items:
     """Rendered scenes with all seeds, of `columns` x `rows` times the width of the options."""
     width, height = max(64, int(o.width * columns)), max(48, round(o.width * rows))
     for seed in o.seeds:
         for scene in scenes:
             raw = {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height}
-            yield _item(scene, f"{scene}-s{seed}-{width}x{height}", raw)
+            yield Item(scene, f"{scene}-s{seed}-{width}x{height}", raw)
 
 
 def _folder(path: Path, family: str, **entries: Any) -> Item:
@@ -76,8 +69,7 @@ def _folder(path: Path, family: str, **entries: Any) -> Item:
     name = " ".join(dict.fromkeys([family, path.name.removeprefix("pair_")]))
     true_flow = family in ("kitti2015", "driving_synthetic", "tartan_hospital_066")
     raw = {"kind": "folder", "path": str(path), **entries}
-    needs = [path / "frame_0.png"]
-    return _item(family, name, raw, needs, true_flow=true_flow)
+    return Item(family, name, raw, [path / "frame_0.png"], true_flow)
 
 
 def _shared(root: Path, o: Options) -> Items:
@@ -87,14 +79,14 @@ def _shared(root: Path, o: Options) -> Items:
         raw = {"kind": "kitti2012", "root": str(root / "kitti2012"), "index": index}
         image = root / "kitti2012" / "training" / "image_0" / f"{index}_10.png"
         family = "kitti2012_074" if index == "000074" else "kitti2012"
-        yield _item(family, f"kitti2012 {index}", raw, [image])
+        yield Item(family, f"kitti2012 {index}", raw, [image])
     yield _folder(root / "driving_synthetic", "driving_synthetic")
     for path in sorted((root / "kinect_paper").glob("pair_*")):
         yield _folder(path, "kinect_paper", unit="mm")
     raw = {"kind": "sintel", "root": str(root / "sintel"), "scene": "alley_1"}
     image = root / "sintel" / "training" / "clean" / "alley_1" / "frame_0020.png"
     alley = {**raw, "frame": 20, "step": 5}
-    yield _item("sintel", "sintel alley_1-0020+5", alley, [image], true_flow=False)
+    yield Item("sintel", "sintel alley_1-0020+5", alley, [image], true_flow=False)
     yield _folder(root / "tum_fr1", "tum_fr1", depth_scale=5000.0)
     for path in sorted((root / "kitti2015").glob("pair_*")):
         yield _folder(path, "kitti2015")
@@ -105,7 +97,7 @@ def _shared(root: Path, o: Options) -> Items:
         files = {key: str(track / name) for key, name in names.items()}
         source = {"kind": "files", **files, "depth_scale": 256.0}
         needs = [track / names["next"]]
-        yield _item("kitti_tracking", f"kitti_tracking {k}", source, needs, true_flow=False)
+        yield Item("kitti_tracking", f"kitti_tracking {k}", source, needs, true_flow=False)
     for family, pattern, scale in (("rgbd", "*", 5000.0), ("deepdeform", "pair_*", 1000.0)):
         for path in sorted((root / family).glob(pattern)):
             yield _folder(path, family, depth_scale=scale)
@@ -124,14 +116,14 @@ def _sintel(root: Path, o: Options) -> Items:
             if scene != DEFAULT_SCENE:
                 # the loader has a default camera for one scene only
                 needs += [base / "camdata_left" / f"{name}.cam" for name in names]
-            yield _item(scene, f"{scene}-{frame:04d}", raw, needs)
+            yield Item(scene, f"{scene}-{frame:04d}", raw, needs)
 
 
 def _kitti(kind: str, camera: str, count: int, root: Path, o: Options) -> Items:
     base = root / "training" if is_folder(root / "training") else root
     for index in (f"{k:06d}" for k in range(count)):
         needs = [base / camera / f"{index}_{frame}.png" for frame in (10, 11)]
-        yield _item(kind, index, {"kind": kind, "root": str(root), "index": index}, needs)
+        yield Item(kind, index, {"kind": kind, "root": str(root), "index": index}, needs)
 
 
 def _vkitti(root: Path, o: Options) -> Items:
@@ -147,13 +139,13 @@ def _vkitti(root: Path, o: Options) -> Items:
         for frame in spread(frames - 1, 30):
             needs = [folder / name.format(frame + k) for k in (0, 1)]
             source = {**raw, "scene": scene, "frame": frame}
-            yield _item(f"{world}_morning", f"{world}_morning-{frame:05d}", source, needs)
+            yield Item(f"{world}_morning", f"{world}_morning-{frame:05d}", source, needs)
 
 
 def _kinect(root: Path, o: Options) -> Items:
     for pair in sorted(root.glob("pair_*")):
         raw = {"kind": "folder", "path": str(pair), "unit": "mm", "depth_scale": 1.0}
-        yield _item("", pair.name, raw, [pair / "frame_0.png"])
+        yield Item("", pair.name, raw, [pair / "frame_0.png"])
 
 
 # --- suites ---------------------------------------------------------------------------------------

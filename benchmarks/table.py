@@ -38,22 +38,22 @@ class Item:
     """A pair of a suite with one flow source.
 
     Attributes:
-        suite: Name of the suite.
         family: Kind of pairs, over which tables average first.
         name: Name, unique in the suite.
-        flow: Flow source.
         input: Section `input` of the problem.
         needs: Files that must exist.
         true_flow: Whether the pair has a true flow that it may be solved with.
+        suite: Name of the suite, which `every_pair` of benchmarks/suites.py sets.
+        flow: Flow source, set likewise.
     """
 
-    suite: str
     family: str
     name: str
-    flow: str
     input: Mapping[str, Any] = field(repr=False)
-    needs: tuple[Path, ...] = field(default=(), repr=False)
+    needs: Sequence[Path] = field(default=(), repr=False)
     true_flow: bool = True
+    suite: str = "rendered"
+    flow: str = "dis"
 
     @property
     def key(self) -> str:

@@ -68,7 +68,7 @@ K = np.array([[100.0, 0, 32], [0, 100.0, 24], [0, 0, 1]])
 
 def item(scene: str = "orbit", flow: str = "truth", seed: int = 0) -> Item:
     raw = {"kind": "scene", "scene": scene, "seed": seed, "width": 128, "height": 64}
-    return Item("rendered", scene, f"{scene}-{seed}", flow, raw)
+    return Item(scene, f"{scene}-{seed}", raw, flow=flow)
 
 
 def row_of(item: Item, overrides: tuple[str, ...] = QUICK) -> Row:
@@ -88,7 +88,7 @@ def test_a_pair_that_cannot_be_measured_has_a_reason(tmp_path):
         cv2.imwrite(str(tmp_path / f"frame_{k}.png"), np.zeros((48, 64, 3), np.uint8))
     np.savetxt(tmp_path / "K.txt", K)
     raw = {"kind": "folder", "path": str(tmp_path)}
-    row = row_of(Item("kinect_paper", "s", "p", "dis", raw))
+    row = row_of(Item("s", "p", raw, suite="kinect_paper"))
     assert not row["ok"]
     suite = SUITES["kinect_paper"]
     for words in ("pair has no true depth", suite.layout, suite.source):

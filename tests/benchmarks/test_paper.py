@@ -19,7 +19,7 @@ RAW = {"input": {"kind": "motorcycle"}}
 
 def item(scene: str = "street") -> Item:
     raw = {"kind": "scene", "scene": scene, "width": 128, "height": 64}
-    return Item("rendered", scene, f"{scene}-tiny", "truth", raw)
+    return Item(scene, f"{scene}-tiny", raw, flow="truth")
 
 
 @pytest.mark.parametrize("name", STUDIES)

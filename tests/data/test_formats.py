@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import npy, npz, put, raises, write_cam, write_dpt, write_kitti_flow
+from helpers_files import npy, npz, put, raises, write_cam, write_dpt
 from PIL import Image
 
 from soup_nlp.data.datasets import benchmarks
@@ -262,22 +262,3 @@ def test_image_kinds(tmp_path: Path) -> None:
 def test_mask(tmp_path: Path) -> None:
     path = stored(tmp_path / "m.png", np.array([[0, 127, 128, 255]], np.uint8))
     assert read_mask(path).tolist() == [[False, False, True, True]]
-
-
-@pytest.mark.shared
-def test_real_files(shared_data: Path, tmp_path: Path) -> None:
-    """A header of 1024 x 436 and the values that are read are the bytes of the file."""
-    header, sintel = struct.pack("<4sii", b"PIEH", 1024, 436), shared_data / "sintel" / "training"
-    for path, read in (
-        (sintel / "flow" / "alley_1" / "frame_0002.flo", fmt.read_flow),
-        (sintel / "depth" / "alley_1" / "frame_0020.dpt", fmt.read_depth),
-    ):
-        values = read(path)
-        assert values.shape[:2] == (436, 1024)
-        assert path.read_bytes() == header + values.astype("<f4").tobytes()
-    folder = shared_data / "kitti2012" / "training"
-    flow = fmt.read_flow(folder / "flow_occ" / "000027_10.png")
-    write_kitti_flow(tmp_path / "a.png", flow)
-    np.testing.assert_array_equal(fmt.read_flow(tmp_path / "a.png"), flow)
-    calibration = folder / "calib" / "000027.txt"
-    assert benchmarks.read_rows(calibration, ["P1:"], 12)[0, 3] == -386.1448
