@@ -55,16 +55,11 @@ def test_bytes_behind_a_picture_do_not_matter(kind: str, tmp_path: Path) -> None
 # --- metadata never ends a run -------------------------------------------------------------------
 
 
-def with_chunk(png: bytes, kind: bytes, data: bytes) -> bytes:
-    """A PNG with a further chunk behind its header."""
-    chunk = struct.pack(">I", len(data)) + kind + data
-    return png[:33] + chunk + struct.pack(">I", zlib.crc32(kind + data)) + png[33:]
-
-
 @pytest.mark.parametrize("data", [b"\0\0\x11\0no TIFF", b"II*\0\xff\xff\xff\x7f", b""])
 def test_malformed_exif_is_a_warning(data: bytes, folder: Path) -> None:
-    png = (folder / "a.png").read_bytes()
-    (folder / "a.png").write_bytes(with_chunk(png, b"eXIf", data))
+    png, checked = (folder / "a.png").read_bytes(), b"eXIf" + data
+    chunk = struct.pack(">I", len(data)) + checked + struct.pack(">I", zlib.crc32(checked))
+    (folder / "a.png").write_bytes(png[:33] + chunk + png[33:])
     pair, text = said(folder)
     assert "EXIF is malformed" in text or data != b"\0\0\x11\0no TIFF"
     assert pair.K_ref[0, 0] == pytest.approx(1.2 * 96)

@@ -260,8 +260,7 @@ def _interpreted(named: Named, where: PathLike) -> tuple[list[tuple[str, Float]]
     for group, found in groups.items():
         if {"fx", "fy"} & found.keys() or ("f" in found and {"cx", "cy", "c"} & found.keys()):
             cameras.append((group, _grouped(group, found, where)))
-    last = max((k + 1 for k, x in lens.items() if x), default=0)
-    return cameras, np.array([lens.get(k, 0.0) for k in range(last)])
+    return cameras, np.trim_zeros(np.array([lens.get(k, 0.0) for k in range(14)]), "b")
 
 
 def _meaning(name: str, words: Sequence[str]) -> tuple[str, str]:
