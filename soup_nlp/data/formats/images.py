@@ -279,7 +279,7 @@ def image_of(source: ImageLike, where: str) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 RGB of an array, a file or a PIL image; grey is repeated, alpha dropped."""
     if is_path(source):
         return read_image(Path(source))
-    if hasattr(source, "convert") and getattr(source, "mode", None) in _PICTURES:
+    if isinstance(source, Image.Image) and source.mode in _PICTURES:
         source = source.convert("RGB")
     expected = "uint8 (H, W, 3) array, path or PIL image"
     image = array_of(source, "image", where, expected, kinds="fiub")

@@ -22,14 +22,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap
-from soup_nlp.data.formats.images import (
-    array_of,
-    check_body,
-    decode,
-    decode_png16,
-    is_path,
-    warn,
-)
+from soup_nlp.data.formats.images import array_of, check_body, decode, decode_png16, is_path, warn
 from soup_nlp.errors import DataError, repr_of
 from soup_nlp.schema.section import MAX_PIXELS, check_image_size
 from soup_nlp.storage.files import PathLike, as_path, read_bytes
