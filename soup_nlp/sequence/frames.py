@@ -19,8 +19,7 @@ from PIL import ImageSequence
 
 from soup_nlp.arrays import Image
 from soup_nlp.config.problem import Problem, make_problem, title
-from soup_nlp.data.formats.images import ImageLike, image_of, is_path
-from soup_nlp.data.formats.images import RAW, read_image
+from soup_nlp.data.formats.images import RAW, ImageLike, image_of, is_path, read_image
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.report.figures import write_png
 from soup_nlp.storage.files import as_path, is_folder, require_file
