@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import npy, npz, put, raises, write_cam, write_dpt
+from helpers_files import npy, npz, put, raises, write_dpt
 from PIL import Image
 
 from soup_nlp.data.datasets import benchmarks
@@ -15,9 +15,6 @@ from soup_nlp.data.formats import camera_files
 from soup_nlp.data.formats import map_files as fmt
 from soup_nlp.data.formats.images import DataWarning, read_image, read_mask
 from soup_nlp.data.pair import Pair
-
-K = np.array([[688.0, 0.0, 511.5], [0.0, 688.5, 217.5], [0.0, 0.0, 1.0]])
-
 
 # --- malformed files ----------------------------------------------------------------------------
 
@@ -216,28 +213,9 @@ def test_kitti_disparity_and_vkitti_depth(tmp_path: Path) -> None:
 # --- cameras ------------------------------------------------------------------------------------
 
 
-def test_cameras(tmp_path: Path) -> None:
-    write_cam(tmp_path / "a.cam", K)
-    np.testing.assert_array_equal(camera_files.read_cam(tmp_path / "a.cam"), K)
+def test_zero_distortion_is_none(tmp_path: Path) -> None:
     path = put(tmp_path / "K.txt", b"80 80 47.5 31.5 0 0 0 0 0")
     assert camera_files.read_intrinsics(path)[0, 0] == 80
-
-
-def test_rows_of_numbers(tmp_path: Path) -> None:
-    kitti = (
-        "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.950000e-02\n"
-        "K_00: 1 2 3 4 5 6 7 8 9\n\nP_rect_00: 1 2 3 4 5 6 7 8 9 10 11 12\nT_00: 1 2 3\n"
-    )
-    path = put(tmp_path / "calib.txt", kitti.encode())
-    rows = benchmarks.read_rows(path, ["P_rect_00:"], 12)
-    np.testing.assert_array_equal(rows, [np.arange(1, 13)])
-    vkitti = f"{COLUMNS}\n0 0 725 726 620.5 187\n0 1 7 7 6 1\n1 0 730 730 6 1\n\n2 0 725\n"
-    put(path, vkitti.encode())
-    rows = benchmarks.read_rows(path, ["1 0", "0 0"], 4)
-    np.testing.assert_array_equal(rows, [[730, 730, 6, 1], [725, 726, 620.5, 187]])
-    for missing in ("2 0", "3 0"):
-        with raises(rf"lacks the numbers of {missing}"):
-            benchmarks.read_rows(path, ["0 0", missing], 4)
 
 
 # --- images -------------------------------------------------------------------------------------
