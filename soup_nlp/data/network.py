@@ -94,8 +94,7 @@ class Network:
         # displacements are in pixels of the images that the network saw
         target = (width, height) if self.size else (cols, rows)
         scale = np.array([target[0] / cols, target[1] / rows], np.float32)
-        if flow.shape[1::-1] != target:
-            flow = cv2.resize(flow, target, interpolation=cv2.INTER_LINEAR)
+        flow = cv2.resize(flow, target, interpolation=cv2.INTER_LINEAR)
         return np.ascontiguousarray(flow[:height, :width] * scale, dtype=np.float32)
 
 

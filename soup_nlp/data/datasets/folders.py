@@ -77,9 +77,7 @@ class Folder:
         if file is not None:
             return file
         path = self.path / names[0]
-        folder = path.parent
-        while not is_folder(folder) and folder != folder.parent:
-            folder = folder.parent
+        folder = next(folder for folder in path.parents if is_folder(folder))
         raise DataError(
             "file of the dataset is missing",
             where=path,
