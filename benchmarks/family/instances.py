@@ -155,6 +155,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
         component=record.component,
         part=record.component,
         motions=[],
+        covariance=np.zeros((0, 5, 5)),
         surface=record.surface,
         tie=none,
         bends=np.full(len(seg), record.bending),

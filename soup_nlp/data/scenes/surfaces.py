@@ -257,8 +257,8 @@ def fractal_noise(
     return total * np.float32(1.6)
 
 
-def pulse_coverage(x: Float, duty: float, width: Float) -> Float:
-    """Box-filtered pulse train: share (N,) of [x - width/2, x + width/2] where frac(x) < duty."""
+def pulse_coverage(x: Float, duty: Float, width: Float) -> Float:
+    """Box-filtered pulse trains (N, 2): share of [x - width/2, x + width/2] with frac(x) < duty."""
     width = np.maximum(width, 1e-6)
 
     def integral(y: Float) -> Float:
@@ -289,12 +289,11 @@ class Panels:
 
     def blend(self, colour: FloatMap, chart: Float, footprint: Float, seed: int) -> FloatMap:
         """Paint the panels over `colour` (N, 3) at chart positions (N, 2), anti-aliased."""
-        grid = (chart - np.asarray(self.offset)) / np.asarray(self.period)
-        width = footprint[:, None] / np.asarray(self.period)
-        share = pulse_coverage(grid[:, 0], self.duty[0], width[:, 0])
-        share = share * pulse_coverage(grid[:, 1], self.duty[1], width[:, 1])
+        period, duty = np.array(self.period), np.array(self.duty)
+        grid = (chart - self.offset) / period
+        share = pulse_coverage(grid, duty, footprint[:, None] / period).prod(axis=1)
         # each rectangle has one brightness; its jumps lie in the gaps between rectangles
-        node = np.floor(grid + 0.5 * (1 - np.asarray(self.duty))).astype(np.int64) & (PERIOD - 1)
+        node = np.floor(grid + 0.5 * (1 - duty)).astype(np.int64) & (PERIOD - 1)
         tone = 1 + self.variation * _lattice(seed)[node[:, 0] + PERIOD * node[:, 1]]
         paint = np.asarray(self.colour, np.float32) * tone[:, None].astype(np.float32)
         return colour + share[:, None].astype(np.float32) * (paint - colour)
