@@ -4,9 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
-from helpers_nl import ReadBack, close
 from test_export import problem_of, write
 
 from benchmarks.family.sol import write_sol
@@ -14,8 +12,6 @@ from soup_nlp.cli.main import main
 from soup_nlp.errors import ExportError
 from soup_nlp.export.foreign import import_sol
 from soup_nlp.export.program import file_orders
-from soup_nlp.model import oracle
-from soup_nlp.model.layout import TangentLayout
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.folders import SUMS
 
@@ -77,29 +73,11 @@ def exported(tmp_path_factory):
     return out
 
 
-def test_the_file_has_nine_coordinates(exported):
-    case, nlp, layout, (v, r), manifest = problem_of(exported)
-    assert isinstance(layout, TangentLayout)
-    assert manifest["coordinates"] == "tangent"
-    n = len(case)
-    # eight rim rays a superpixel and the length unit; SO(3) and unit normals hold by construction
-    assert (nlp.nx, nlp.ng) == (9 * n, 8 * n + 1)
-    back = ReadBack(exported / "soup.nl")
-    close(back.x0, nlp.x0[v])
-    rng = np.random.default_rng(0)
-    x = nlp.x0 + 0.01 * rng.standard_normal(nlp.nx)
-    here, rows, *_ = back.values(x[v])
-    close(here, nlp.value(x))
-    close(np.asarray(rows).ravel(), nlp.constraints(x)[r])
-    # up to the smoothing, f is E of the soup that the vector stands for
-    sharp, _ = case.nlp(case.formulation(coordinates="tangent", eps=1e-9, eps_pixel=1e-9))
-    value = sharp.value(sharp.x0)
-    E = oracle.energy(layout.unpack(sharp.x0), case.data, case.weights)["total"]
-    assert value == pytest.approx(E, rel=0.05)
-
-
 def test_an_answer_in_tangent_coordinates_becomes_a_result(exported, tmp_path, capsys):
-    case, _nlp, layout, order, _ = problem_of(exported)
+    case, nlp, layout, order, manifest = problem_of(exported)
+    assert manifest["coordinates"] == "tangent"
+    # eight rim rays a superpixel and the length unit; SO(3) and unit normals hold by construction
+    assert (nlp.nx, nlp.ng) == (9 * len(case), 8 * len(case) + 1)
     energy = case.data, case.weights, case.formulation()
     solved = solve_soup(case.start.soup, *energy, case.options)
     path = tmp_path / "good.sol"
@@ -114,7 +92,6 @@ def test_an_answer_in_tangent_coordinates_becomes_a_result(exported, tmp_path, c
     lifted = tmp_path / "lifted"
     words = ["--superpixels", "16", "--coordinates", "tangent", "--lift"]
     assert write(lifted, *words) == 0
-    _, nlp, *_ = problem_of(exported)
     write_sol(path, layout.pack(solved.soup), None, *file_orders(nlp, lift=True), "elsewhere", 0)
     lines, more = path.read_text().splitlines(), problem_of(lifted)[-1]["lifted"]
     at = lines.index("Options") + 5

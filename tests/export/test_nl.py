@@ -3,7 +3,6 @@
 import json
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +10,14 @@ import pytest
 from helpers_model import GAUGES, PAPER, TRUNCATED, tiny, wiggle
 from helpers_nl import ReadBack, close, defined_variables
 
-from soup_nlp.config.problem import make_problem
-from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ExportError
 from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.export.sol import read_sol
-from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.programs import build_matrix_nlp
-from soup_nlp.pipeline.case import prepare
-from soup_nlp.pipeline.record import Case
+from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp
 
-FORMS = [Formulation(gauge=gauge) for gauge in GAUGES]
+FORMS = [*(Formulation(gauge=gauge) for gauge in GAUGES), Formulation(coordinates="tangent")]
 
 
 def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> None:
@@ -50,9 +44,11 @@ def agrees(nlp: NLP, file: NLFile, back: ReadBack, x: np.ndarray, seed: int) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", FORMS, ids=GAUGES)
+@pytest.mark.parametrize("form", FORMS, ids=(*GAUGES, "tangent"))
 def test_casadi_reads_back_every_formulation(form, tmp_path):
-    nlp, _ = tiny().nlp(PAPER if form == FORMS[0] else TRUNCATED, form)
+    build = build_tangent_nlp if form == FORMS[-1] else build_matrix_nlp
+    weights = PAPER if form == FORMS[0] else TRUNCATED
+    nlp, _ = build(tiny().soup, tiny().data, weights, form)
     file = write_nl(tmp_path / "soup.nl", nlp)
     back = ReadBack(file.path)
     for seed, size in ((0, 0.02), (1, 0.2)):
@@ -98,7 +94,7 @@ def test_variables_and_rows_are_ordered_by_class(tmp_path):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    nlp, layout = tiny().nlp(TRUNCATED, FORMS[-1])
+    nlp, layout = tiny().nlp(TRUNCATED, FORMS[1])
     folder = tmp_path_factory.mktemp("foreign")
     lam_g = np.full(nlp.ng, -1.0)
     return nlp, layout, write_nl(folder / "soup.nl", nlp, lam_g)
@@ -193,22 +189,6 @@ def _section(tree: dict, name: str) -> dict:
     raise KeyError(name)
 
 
-@pytest.fixture(scope="module")
-def swinging(tmp_path_factory) -> Case:
-    """A box that swings before a room: occlusion shows its order, and its true depth is given."""
-    folder = tmp_path_factory.mktemp("swing")
-    scene = {"kind": "scene", "scene": "swing", "width": 160, "height": 120}
-    np.save(folder / "depth.npy", render_scene("swing", 0, 160, 120).truth.depth_ref)
-    raw = {
-        "input": scene,
-        "flow": {"source": "truth"},
-        "segmentation": {"superpixels": 32, "neighbours": 2, "boundary_samples": 1},
-        "energy": {"pixel_samples": 1},
-        "depth_prior": {"source": str(folder / "depth.npy")},
-    }
-    return prepare(make_problem(raw))
-
-
 def test_ampls_own_library_agrees(written):
     """ASL, the reader behind most solvers, through gjh_asl_json: derivatives at the start."""
     tool = shutil.which("gjh_asl_json")
@@ -266,25 +246,3 @@ def test_scip_reads_it(written):
     at = file.variables.tolist().index(0)
     name = file.path.with_suffix(".col").read_text().split()[at]
     assert named[name].getLbOriginal() == pytest.approx(nlp.lbx[0])
-
-
-@pytest.mark.slow
-def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, tmp_path):
-    data, eps = swinging.data, 2e-5
-    form = swinging.formulation(hessian="exact", eps=eps, eps_pixel=eps)
-    nlp, _ = swinging.nlp(form)
-    file = write_nl(tmp_path / "soup.nl", nlp)
-    back = ReadBack(file.path)
-    x = wiggle(nlp, 0, 0.02)
-    agrees(nlp, file, back, x, 0)
-    pounce_agrees(nlp, file, x)
-    # at the start the file has both terms, up to their smoothing
-    exact = oracle.energy(swinging.soup, data, swinging.weights)
-    f = float(back.values(nlp.x0[file.variables])[0])
-    for term in ("depth", "order"):
-        weight = getattr(data, f"{term}_weight")
-        less = replace(data, **{f"{term}_weight": np.zeros_like(weight)})
-        other = build_matrix_nlp(swinging.soup, less, swinging.weights, form)[0]
-        within = eps * getattr(swinging.weights, term) * np.abs(weight).sum()
-        assert exact[term] - within <= f - other.value(other.x0) <= exact[term] + 1e-9
-        assert exact[term] > 2 * within

@@ -49,9 +49,9 @@ def test_sums_of_every_size_have_the_values_of_their_formula(elements, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("gauge", GAUGES)
-def test_the_functions_that_ipopt_takes_are_casadis_derivatives(small_room, gauge):
-    nlp, _ = small_room.nlp(small_room.formulation(gauge=gauge))
+@pytest.mark.parametrize("variables", [*({"gauge": g} for g in GAUGES), {"coordinates": "tangent"}])
+def test_the_functions_that_ipopt_takes_are_casadis_derivatives(small_room, variables):
+    nlp, _ = small_room.nlp(small_room.formulation(**variables))
     at, lam_f, lam_g = nlp.x0, 0.7, np.random.default_rng(3).normal(size=nlp.ng)
     oracle, values = make_oracle(nlp)
     theta = nlp.thetas(eps=0.05)
