@@ -47,12 +47,7 @@ class NLFile:
     lifted: int
 
 
-def write_nl(
-    path: str | Path,
-    nlp: NLP,
-    lam_g: Float | None = None,
-    lift: bool = False,
-) -> NLFile:
+def write_nl(path: str | Path, nlp: NLP, lam_g: Float | None = None, lift: bool = False) -> NLFile:
     """Write an NLP of kernels and tables; names go to `.col` and `.row` beside the file.
 
     Args:

@@ -78,10 +78,7 @@ class Segmentation:
 
 
 def build_segmentation(
-    labels: NDArray[np.int32],
-    image: Image,
-    neighbours: int = 15,
-    boundary_samples: int | None = 3,
+    labels: NDArray[np.int32], image: Image, neighbours: int = 15, boundary_samples: int | None = 3
 ) -> Segmentation:
     """Graphs and weights of superpixels 0..N-1, labels (H, W), of an RGB image.
 

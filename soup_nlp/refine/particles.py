@@ -22,11 +22,7 @@ from soup_nlp.model.energy_data import EnergyData
 
 WALKS: Mapping[str, float] = {"walk_plane": 3, "walk_motion": 3, "walk_all": 2}
 """Kinds of random walks around the current belief, and their relative numbers."""
-NEIGHBOURS: Mapping[str, float] = {
-    "neighbour_plane": 3,
-    "neighbour_motion": 4,
-    "neighbour_both": 5,
-}
+NEIGHBOURS: Mapping[str, float] = {"neighbour_plane": 3, "neighbour_motion": 4, "neighbour_both": 5}
 """Kinds that take over the plane, the motion or both of a neighbour."""
 KINDS = ("current", "swept", *WALKS, *NEIGHBOURS)
 """Kinds of particles by number."""

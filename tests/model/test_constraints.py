@@ -20,17 +20,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_model import (
-    GAUGES,
-    PAPER,
-    UNITS,
-    disturbed,
-    form,
-    tiny,
-    weights_for,
-    wiggle,
-    world,
-)
+from helpers_model import GAUGES, PAPER, UNITS, disturbed, form, tiny, weights_for, wiggle, world
 
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.formulation import Formulation
@@ -98,11 +88,9 @@ def bodies(nlp: NLP, x: np.ndarray, data: EnergyData, depth_ratio: float) -> dic
 
 def limits(kind: str, min_facing: float) -> tuple[float, float]:
     """Bounds of the rows of a kind."""
-    return {
-        "visible": (min_facing, np.inf),
-        "simplex": (1.0, 1.0),
-        "unit": (1.0, 1.0),
-    }.get(kind, (0.0, 0.0))
+    return {"visible": (min_facing, np.inf), "simplex": (1.0, 1.0), "unit": (1.0, 1.0)}.get(
+        kind, (0.0, 0.0)
+    )
 
 
 def rows(nlp: NLP, kind: str) -> np.ndarray:

@@ -27,12 +27,7 @@ from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
 from soup_nlp.model.elements import present
-from soup_nlp.model.energy_data import (
-    HINGE,
-    EnergyData,
-    build_energy_data,
-    sample_pixels,
-)
+from soup_nlp.model.energy_data import HINGE, EnergyData, build_energy_data, sample_pixels
 from soup_nlp.model.energy_options import BENDING, GAP, EnergyOptions, Weights
 from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.reweighting import HELD, Known, in_pixels, weighted

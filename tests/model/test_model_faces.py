@@ -2,16 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers_model import (
-    GAUGES,
-    K_NEXT,
-    UNITS,
-    exact_terms,
-    random_soup,
-    tiny,
-    weights_for,
-    wiggle,
-)
+from helpers_model import GAUGES, K_NEXT, UNITS, exact_terms, random_soup, tiny, weights_for, wiggle
 
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
