@@ -1,9 +1,8 @@
 """Solvers on the same NLPs: each run in a process of its own, its answer verified, one table."""
 
-import os
 import resource
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import chdir, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -120,12 +119,8 @@ def run_row(make: Callable[[Limits], Task], label: Label, solver: str, limits: L
     begin = cpu_seconds()
     limit_process(limits, begin)
     solve = find_solver(solver)
-    with scratch() as folder:
-        os.chdir(folder)
-        try:
-            answer = solve(task)
-        finally:
-            os.chdir("/")
+    with scratch() as folder, chdir(folder):
+        answer = solve(task)
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     row["peak_bytes"] = max(peak_bytes(), children)
     return row | verified(task, answer, cpu_seconds() - begin, float(label["energy_limit"]))

@@ -88,9 +88,8 @@ def write_nl(path: str | Path, nlp: NLP, lam_g: Float | None = None, lift: bool 
         in_objective=after(True, program.in_objective, variables),
         curved=after(True, program.curved, last),
     )
-    longest = [max(map(len, n), default=0) for n in (g_names, x_names)]
     lines = chain(
-        header(program, (lbg, ubg), longest, body.classes),
+        header(program, (lbg, ubg), (g_names, x_names), body.classes),
         body.segments(),
         # AMPL's multipliers have the other sign
         [] if lam_g is None else start(-after(0.0, lam_g, rows), "d"),
@@ -104,8 +103,8 @@ def write_nl(path: str | Path, nlp: NLP, lam_g: Float | None = None, lift: bool 
     write_text(path.with_suffix(".col"), "".join(f"{name}\n" for name in x_names))
     # the objective's name follows those of the rows
     write_text(path.with_suffix(".row"), "".join(f"{name}\n" for name in [*g_names, "E"]))
-    in_rows, in_objective = program.in_rows, program.in_objective
-    nonlinear = {"rows": in_rows, "objective": in_objective, "both": in_rows & in_objective}
+    nonlinear = {"rows": program.in_rows, "objective": program.in_objective}
+    nonlinear["both"] = program.in_rows & program.in_objective
     return NLFile(
         path=path,
         sha256=hashlib.sha256(data).hexdigest(),
@@ -124,13 +123,14 @@ def write_nl(path: str | Path, nlp: NLP, lam_g: Float | None = None, lift: bool 
 
 
 def header(
-    program: Program, bounds: tuple[Float, Float], longest: Sequence[int], defined: Sequence[int]
+    program: Program,
+    bounds: tuple[Float, Float],
+    names: Sequence[Sequence[str]],
+    defined: Sequence[int],
 ) -> list[str]:
-    """The ten lines of counts.
-
-    `bounds` (ng,) are those of the rows, `longest` has the length of the longest name of a row and
-    of a variable, and `defined` are `NlBody.classes`.
-    """
+    """The ten lines of counts; `bounds` (ng,) are those of the rows, `names` those of rows and of
+    variables, and `defined` are `NlBody.classes`."""
+    longest = [max(map(len, every), default=0) for every in names]
     lower, upper = bounds
     equations = lower == upper
     ranges = np.isfinite(lower) & np.isfinite(upper) & ~equations

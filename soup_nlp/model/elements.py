@@ -1,8 +1,8 @@
 """The terms of the energy: one object each, by which program, oracle and refinement find it."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -48,13 +48,6 @@ class Element:
         """Width of every data column."""
         return {k: int(np.prod(v.shape[1:], dtype=int)) for k, v in self.columns.items()}
 
-    def viewed(self, layout: Layout) -> Self:
-        """The element with the columns that a layout's views need."""
-        columns = dict(self.columns)
-        for a, i in enumerate(self.superpixels.T):
-            columns |= {f"{k}_{a}": v for k, v in layout.columns(i).items()}
-        return replace(self, columns=columns)
-
 
 @dataclass(frozen=True)
 class Term:
@@ -88,7 +81,11 @@ def elements(data: EnergyData, w: Weights, layout: Layout) -> dict[str, Element]
     """The elements of the paper's terms, and of others that are present and have a factor, with the
     columns that the layout's views need."""
     used = [TERMS[k] for k in present(data) if not TERMS[k].optional or getattr(w, k) > 0]
-    return {term.name: term.table(data, w).viewed(layout) for term in used}
+    out = {term.name: term.table(data, w) for term in used}
+    for element in out.values():
+        for a, i in enumerate(element.superpixels.T):
+            element.columns.update({f"{k}_{a}": v for k, v in layout.columns(i).items()})
+    return out
 
 
 def _truncations(count: int, **sigma: float) -> dict[str, Float]:

@@ -34,11 +34,6 @@ class Operation(NamedTuple):
     operands: int = 1
 
 
-def _if_else_zero(a: Any, b: Any, out: Any = None) -> Any:
-    # not a product: what is left out may be infinite
-    return np.copyto(out, np.where(a != 0, b, 0.0))
-
-
 _ONE = np.array(1.0)
 OPERATIONS: Mapping[int, Operation] = {
     ca.OP_ADD: Operation(np.add, "o0 {0} {1}", 2),
@@ -56,7 +51,8 @@ OPERATIONS: Mapping[int, Operation] = {
     ca.OP_LT: Operation(np.less, operands=2),
     ca.OP_LE: Operation(np.less_equal, operands=2),
     ca.OP_NOT: Operation(lambda a, out=None: np.equal(a, 0.0, out)),
-    ca.OP_IF_ELSE_ZERO: Operation(_if_else_zero, operands=2),
+    # not a product: what is left out may be infinite
+    ca.OP_IF_ELSE_ZERO: Operation(lambda a, b, out: np.copyto(out, np.where(a, b, 0.0)), "", 2),
     ca.OP_SQRT: Operation(np.sqrt, "o39 {0}"),
     ca.OP_POW: Operation(np.power, "o5 {0} {1}", 2),
     ca.OP_CONSTPOW: Operation(np.power, "o5 {0} {1}", 2),
