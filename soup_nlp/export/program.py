@@ -45,7 +45,8 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
     for group in groups:
         nonlinear, row, column, is_linear, coefficient = split(group, theta)
         template = make_template(nonlinear, group, theta)
-        for values in (*template.graph.number.values(), coefficient):
+        graph, zero = template.graph, np.zeros(())
+        for values in (*graph.number.values(), coefficient):
             if not np.isfinite(values).all():
                 raise ExportError(
                     "number of an expression is not finite",
@@ -62,7 +63,7 @@ def make_program(groups: Sequence[Group], nx: int, ng: int, theta: Float) -> Pro
         for k in range(nonlinear.numel()):
             variables = group.index[:, column[(row == k) & ~is_linear]]
             curved[goal[:, k]] |= template.roots[k] is not None
-            values = np.broadcast_to(template.constants[k], len(group))
+            values = np.broadcast_to(graph.number.get(graph.roots[k], zero), len(group))
             if objective and k == 0:
                 in_objective[variables] = True
                 constant[ng] += values.sum()

@@ -58,10 +58,10 @@ class _Graph:
             self.args.append(args)
         return self.known[key]
 
-    def constant(self, key: object, value: Float) -> int:
+    def constant(self, key: object, value: Float | float) -> int:
         """Node of a number."""
         node = self.node(key)
-        self.number[node] = value
+        self.number[node] = np.asarray(value)
         return node
 
     def apply(self, op: int, args: tuple[int, ...]) -> int:
@@ -93,13 +93,13 @@ def trace(outputs: ca.SX, group: Group, theta: Float) -> _Graph:
         if op == ca.OP_OUTPUT:
             graph.roots[place[0]] = work[inputs[0]]
         elif op == ca.OP_CONST:
-            work[target] = graph.constant(("const", value), np.asarray(value, float))
+            work[target] = graph.constant(("const", value), value)
         elif op == ca.OP_INPUT and inputs[0] == 0:
             work[target] = graph.node((0, inputs[1]))
             graph.variable[work[target]] = inputs[1]
         elif op == ca.OP_INPUT:
             column, nonzero = inputs[0] == 1, inputs[1]
-            values = group.data[:, nonzero] if column else np.asarray(theta[nonzero])
+            values = group.data[:, nonzero] if column else theta[nonzero]
             work[target] = graph.constant(tuple(inputs), values)
         elif op in OPERATIONS and OPERATIONS[op].nl:
             work[target] = graph.apply(op, tuple(work[a] for a in inputs))
@@ -119,13 +119,11 @@ class Template:
     Attributes:
         defined: Node and text of every defined variable, dependencies first.
         roots: Text of every output; None for a number.
-        constants: Value of every output that is a number, scalar or (E,); 0 for the others.
         graph: What the texts are made from; its numbers are scalars or (E,) by node.
     """
 
     defined: tuple[tuple[int, Text], ...]
     roots: tuple[Text | None, ...]
-    constants: tuple[Float, ...]
     graph: _Graph
 
 
@@ -134,16 +132,13 @@ def make_template(outputs: ca.SX, group: Group, theta: Float) -> Template:
     graph = trace(outputs, group, theta)
     names = _defined(graph, group)
     defined = tuple((n, _emit(graph, n, names)) for n in sorted(names))
-    roots: list[Text | None] = []
-    constants: list[Float] = []
-    for root in graph.roots:
-        # an output without an instruction is a structural zero
-        value = np.float64(0.0) if root < 0 else graph.number.get(root)
-        roots.append(_emit(graph, root, names, root=True) if value is None else None)
-        constants.append(np.asarray(0.0 if value is None else value))
-    for node, values in graph.number.items():
-        graph.number[node] = np.asarray(values)
-    return Template(defined, tuple(roots), tuple(constants), graph)
+    # an output without an instruction is a structural zero
+    numbers = [root < 0 or root in graph.number for root in graph.roots]
+    roots = (
+        None if number else _emit(graph, root, names, root=True)
+        for root, number in zip(graph.roots, numbers)
+    )
+    return Template(defined, tuple(roots), graph)
 
 
 def _defined(graph: _Graph, group: Group) -> set[int]:
