@@ -29,15 +29,17 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.mrf.trws import solve_trws
-from soup_nlp.refine.costs import PairCosts, feasible, unary_costs
 from soup_nlp.refine.particles import (
     KINDS,
     NEIGHBOURS,
     WALKS,
+    PairCosts,
     Particles,
     Proposer,
     counts,
+    feasible,
     neighbours,
+    unary_costs,
 )
 from soup_nlp.refine.photometric import Photometric, swept
 from soup_nlp.refine.records import Refined, RefineOptions, Round

@@ -26,8 +26,7 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.refine.costs import unary_costs
-from soup_nlp.refine.particles import Particles
+from soup_nlp.refine.particles import Particles, unary_costs
 from soup_nlp.refine.records import RefineOptions
 
 TAU = 0.25

@@ -12,8 +12,7 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.norms import Norm
 from soup_nlp.model.programs import build_matrix_nlp
-from soup_nlp.refine.costs import PairCosts
-from soup_nlp.refine.particles import Particles
+from soup_nlp.refine.particles import PairCosts, Particles
 from soup_nlp.schema.section import NonNegative
 
 

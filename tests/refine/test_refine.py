@@ -19,16 +19,18 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.refine import mppbp, particles
-from soup_nlp.refine.costs import PairCosts, feasible, unary_costs
 from soup_nlp.refine.mppbp import length_slope, refine_soup
 from soup_nlp.refine.particles import (
     KINDS,
     NEIGHBOURS,
     WALKS,
+    PairCosts,
     Particles,
     Proposer,
     counts,
+    feasible,
     neighbours,
+    unary_costs,
 )
 from soup_nlp.refine.records import RefineOptions
 from soup_nlp.storage.progress import Watch
@@ -87,8 +89,8 @@ def test_blocks_change_no_digit_that_matters(monkeypatch):
     costs = PairCosts(tiny.data, weights)
     p = cloud(tiny, 5)
     whole, (unary, ahead) = costs.tables(p), unary_costs(p, tiny.data, weights)
-    monkeypatch.setattr("soup_nlp.refine.costs.BLOCK_BYTES", 1)
-    monkeypatch.setattr("soup_nlp.refine.costs.UNARY_BYTES", 1)
+    monkeypatch.setattr("soup_nlp.refine.particles.BLOCK_BYTES", 1)
+    monkeypatch.setattr("soup_nlp.refine.particles.UNARY_BYTES", 1)
     np.testing.assert_allclose(costs.tables(p), whole, rtol=1e-12, atol=1e-13 * whole.max())
     in_blocks = unary_costs(p, tiny.data, weights)
     np.testing.assert_allclose(in_blocks[0], unary, rtol=1e-12)
