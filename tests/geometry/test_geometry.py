@@ -126,9 +126,12 @@ def test_depth_and_motion_by_hand():
     # plane z = 2 seen at 45 degrees: depth is z, not the distance along the ray
     normal, quarter = np.array([[0, 0, -1.0]]), np.array([[[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]])
     soup = Soup(np.array([0.5]), normal, np.array([4.0]), quarter, np.array([[2.0, 0, 0]]))
-    np.testing.assert_allclose(soup.depth_at(np.array([[1.0, 0, 1]])), [2.0])
-    np.testing.assert_allclose(soup.points(np.array([[1.0, 0, 1]])), [[2.0, 0, 2]])
-    np.testing.assert_allclose(soup.moved(np.array([[2.0, 0, 2]])), [[1.0, 2, 2]])
+    ray, X, Y = np.array([[[1.0, 0, 1]], [[2.0, 0, 2]], [[1.0, 2, 2]]])
+    # also of several rays each
+    for several in (np.s_[:], np.s_[:, None]):
+        np.testing.assert_allclose(soup.depth_at(ray[several]), X[several][..., 2])
+        np.testing.assert_allclose(soup.points(ray[several]), X[several])
+        np.testing.assert_allclose(soup.moved(X[several]), Y[several])
 
 
 @given(st.integers(0, 10_000), st.floats(1e-3, 1e3))

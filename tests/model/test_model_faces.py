@@ -120,3 +120,14 @@ def test_the_ridge_is_its_factor_times_a_natural_step():
     np.testing.assert_allclose(metric[:, -12:-3], 1, rtol=1e-6)
     step = layout.unpack(nlp.x0).depth_at(tiny("pixels").data.anchor_ray) / own[:, 0]
     np.testing.assert_allclose(metric[:, -3:] * step[:, None] ** 2, 1, rtol=1e-6)
+
+
+def test_theta_is_the_share_of_curvature_left_out():
+    nlp, _ = program("tangent", "pixels", hessian="gauss-newton")
+    thetas = [nlp.thetas(ridge=0.0, theta=theta) for theta in (0.0, 0.45, 0.9)]
+    found = [nlp.hessian(nlp.x0, np.zeros(nlp.ng), theta=theta).toarray() for theta in thetas]
+    whole, half, less = found
+    scale = np.abs(whole).max()
+    assert np.abs(whole - less).max() > 1e-3 * scale
+    np.testing.assert_allclose(half, (whole + less) / 2, atol=1e-12 * scale)
+    assert np.linalg.eigvalsh(whole - less)[0] >= -1e-12 * scale
