@@ -22,36 +22,19 @@ def seg():
     return squares(H // TILE, W // TILE, TILE, neighbours=6)
 
 
-def scene_flow(turn=TURN, shift=AHEAD):
+def scene_flow(turn=TURN):
     """Flow of a camera above the ground, before blocks at 4 to 9 and a sky at 1000."""
     uv = camera.pixel_grid(H, W)
     ray = camera.rays(K, uv)
-    block = 4.0 + 5.0 * np.random.default_rng(1).random((H // 20, W // 20)).repeat(20, 0).repeat(
-        20, 1
-    )
-    depth = np.where(
-        ray[..., 1] > 0.1, np.minimum(1.0 / np.maximum(ray[..., 1], 0.1), block), block
-    )
+    block = np.kron(np.random.default_rng(1).random((H // 20, W // 20)), np.ones((20, 20)))
+    depth = np.minimum(4.0 + 5.0 * block, 1.0 / np.maximum(ray[..., 1], 0.1))
     depth[:20] = 1000.0
-    X = depth[..., None] * ray @ rotation.exp(turn).T + shift
+    X = depth[..., None] * ray @ rotation.exp(turn).T + AHEAD
     return (camera.project(K, X) - uv).astype(np.float32)
 
 
 def start_of(seg, flow):
     return propose(FlowFit.of(seg, Flow(flow), K, K))
-
-
-def share(start, seg, mask):
-    """Shares of a mask's pixels and of the others that are fixed in the image."""
-    fixed = (start.tie == FIXED)[seg.labels]
-    return fixed[mask].mean(), fixed[~mask].mean()
-
-
-STILL = {
-    "middle": (np.s_[40:70, 60:100], TURN),
-    "bottom": (np.s_[90:, :], TURN),
-    "corner": (np.s_[:30, 120:], TURN),
-}
 
 
 @pytest.fixture(scope="module")
@@ -60,24 +43,21 @@ def clean(seg):
     return start_of(seg, scene_flow())
 
 
-@pytest.mark.parametrize("name", STILL)
-def test_a_still_region_before_a_moving_camera_is_fixed(seg, clean, name):
-    where, turn = STILL[name]
-    flow, mask = scene_flow(turn), np.zeros((H, W), bool)
+@pytest.mark.parametrize("where", [np.s_[40:70, 60:100], np.s_[90:, :], np.s_[:30, 120:]])
+def test_a_still_region_before_a_moving_camera_is_fixed(seg, clean, where):
+    flow, mask = scene_flow(), np.zeros((H, W), bool)
     mask[where] = True
     flow[mask] = 0.0
     start = start_of(seg, flow)
-    fixed_share, false = share(start, seg, mask)
-    assert fixed_share > 0.9
-    assert false < 0.02
     at = start.tie == FIXED
+    assert at[seg.labels][mask].mean() > 0.9
+    assert at[seg.labels][~mask].mean() < 0.02
     np.testing.assert_array_equal(start.soup.t[at], 0.0)
     assert not set(start.component[at]) & set(start.component[~at])
-    if turn.any():
-        # other superpixels are as without the region
-        ray = camera.rays(K, seg.anchors)
-        log = np.log(start.soup.depth_at(ray) / clean.soup.depth_at(ray))[~at & ~clean.borrowed]
-        assert np.median(np.abs(log - np.median(log))) < 0.02
+    # other superpixels are as without the region
+    ray = camera.rays(K, seg.anchors)
+    log = np.log(start.soup.depth_at(ray) / clean.soup.depth_at(ray))[~at & ~clean.borrowed]
+    assert np.median(np.abs(log - np.median(log))) < 0.02
 
 
 @pytest.mark.parametrize("what", ["far region", "resting camera", "mover"])

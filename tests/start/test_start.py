@@ -154,19 +154,47 @@ def test_two_motions_are_told_apart():
 
 
 @pytest.mark.slow
-def test_confident_pixels_decide(room):
-    """Wrong flow with confidence 0 has no effect."""
+@pytest.mark.parametrize(
+    ("change", "turn", "depth", "worst"),
+    [
+        # wrong flow with confidence 0 has no effect
+        ("no confidence", 1e-5, 2e-3, 2e-3),
+        ("other intrinsics", 1e-5, 2e-3, 2e-3),
+        # half a pixel of noise raises the errors, but to a limit
+        ("noise", 1.0, 0.05, np.inf),
+        ("outliers", 0.1, 0.02, np.inf),
+        ("random", np.inf, np.inf, np.inf),
+    ],
+)
+def test_flow_that_is_wrong_in_parts(room, change, turn, depth, worst):
     pair, seg, pure = room
-    rng = np.random.default_rng(99)
-    bad = rng.random(pair.size) < 0.4
-    uv = np.where(bad[..., None], rng.normal(0, 50, pair.flow.uv.shape), pair.flow.uv)
-    start = propose(fitted(with_uv(pair, uv, ~bad), seg))
+    rng, shape = np.random.default_rng(99), pair.flow.uv.shape
+    uv, confidence, K_next = pair.flow.uv, np.ones(pair.size), CORNER_K
+    if change == "no confidence":
+        bad = rng.random(pair.size) < 0.4
+        uv, confidence = np.where(bad[..., None], rng.normal(0, 50, shape), uv), ~bad
+    elif change == "outliers":
+        bad = rng.random(pair.size) < 0.1
+        uv = uv + np.where(bad[..., None], rng.normal(0, 20, shape), 0)
+    elif change == "other intrinsics":
+        K_next = camera.intrinsics(230.0, 210.0, 80.0, 60.0)
+        grid = camera.pixel_grid(*pair.size)
+        uv = camera.project(K_next, camera.rays(CORNER_K, grid + uv)) - grid
+    else:
+        uv = uv + rng.normal(0, 0.5, shape) if change == "noise" else rng.normal(0, 30, shape)
+    flow = Flow(uv, confidence.astype(float), "test")
+    start = propose(FlowFit.of(seg, flow, CORNER_K, K_next))
+    assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
-    assert e.rotation.max() < 1e-5
-    assert e.depth().max() < 2e-3
-
-
-# --- same seed, same start -----------------------------------------------------------------------
+    assert np.median(e.rotation) < turn
+    assert np.median(e.depth()) < depth
+    assert e.depth().max() < worst
+    if worst < np.inf:
+        assert e.rotation.max() < 1e-5
+    if change == "noise":
+        assert np.median(e.depth()) > 1e-3
+        assert 0.01 < np.median(e.direction) < 5
+        assert 0.3 < np.median(start.error) < 1.0
 
 
 # --- degenerate input ----------------------------------------------------------------------------
@@ -241,11 +269,9 @@ def test_pure_rotation_is_finite_explains_the_flow_and_is_flagged(turn):
 
 PLANE_LABELS = {
     "columns": lambda image: np.tile(np.arange(64, dtype=np.int32), (48, 1)),
-    "rows": lambda image: np.tile(np.arange(48, dtype=np.int32)[:, None], (1, 64)),
     "four pixels": lambda image: segment(image, 768, "grid"),
     # the homography of one plane has two rigid explanations; either is a start
     "grid": lambda image: segment(image, 40, "grid"),
-    "two": lambda image: segment(image, 2, "grid"),
     "one": lambda image: np.zeros((48, 64), np.int32),
 }
 
@@ -263,13 +289,6 @@ def test_one_plane_in_superpixels_of_any_shape_is_finite(name):
         assert np.median(start.error) < 0.05
 
 
-@pytest.mark.slow
-def test_random_flow_is_finite(room):
-    pair, seg, _ = room
-    uv = np.random.default_rng(99).normal(0, 30, (*pair.size, 2))
-    assert_usable(propose(fitted(with_uv(pair, uv), seg)), seg)
-
-
 @pytest.mark.parametrize("usable", [0, 7])
 def test_too_few_usable_pixels_are_an_error(room, usable):
     pair, seg, _ = room
@@ -281,46 +300,6 @@ def test_too_few_usable_pixels_are_an_error(room, usable):
     assert str(usable) in str(caught.value)
     # what a user of two frames can do: with the default flow there is no file to look at
     assert "try: two frames of one scene" in str(caught.value)
-
-
-@pytest.mark.slow
-def test_noise_makes_it_worse_but_not_wild(room):
-    """Half a pixel of noise raises the errors, but to a limit."""
-    pair, seg, pure = room
-    noise = np.random.default_rng(99).normal(0, 0.5, pair.flow.uv.shape)
-    start = propose(fitted(with_uv(pair, pair.flow.uv + noise), seg))
-    assert_usable(start, seg)
-    e = compare(start, pair, seg, pure)
-    assert 1e-3 < np.median(e.depth()) < 0.05
-    assert 0.01 < np.median(e.direction) < 5
-    assert 0.3 < np.median(start.error) < 1.0
-
-
-@pytest.mark.slow
-def test_outliers_of_full_confidence_are_outvoted(room):
-    pair, seg, pure = room
-    rng = np.random.default_rng(99)
-    bad = rng.random(pair.size) < 0.1
-    uv = np.where(
-        bad[..., None], pair.flow.uv + rng.normal(0, 20, pair.flow.uv.shape), pair.flow.uv
-    )
-    start = propose(fitted(with_uv(pair, uv), seg))
-    assert_usable(start, seg)
-    e = compare(start, pair, seg, pure)
-    assert np.median(e.rotation) < 0.1
-    assert np.median(e.depth()) < 0.02
-
-
-@pytest.mark.slow
-def test_two_cameras_with_different_intrinsics(room):
-    pair, seg, pure = room
-    K_next = camera.intrinsics(230.0, 210.0, 80.0, 60.0)
-    grid = camera.pixel_grid(*pair.size)
-    target = camera.project(K_next, camera.rays(CORNER_K, grid + pair.flow.uv))
-    start = propose(FlowFit.of(seg, Flow(target - grid), CORNER_K, K_next))
-    e = compare(start, pair, seg, pure)
-    assert e.rotation.max() < 1e-5
-    assert e.depth().max() < 2e-3
 
 
 @pytest.mark.slow
