@@ -14,7 +14,14 @@ from scipy import special
 
 from soup_nlp.arrays import Float
 from soup_nlp.geometry.camera import intrinsics
-from soup_nlp.start.epipolar import Matches, Motion, essential_motion, refine_near, triangulate
+from soup_nlp.start.epipolar import (
+    FITS,
+    Matches,
+    Motion,
+    essential_motion,
+    refine_near,
+    triangulate,
+)
 from soup_nlp.start.labelling import EXACT_PX, LEAST_NOISE
 
 ERROR_KINDS = {
@@ -34,9 +41,8 @@ MEASUREMENTS = 80
 image, so that its pixels are no independent ones."""
 LEAST_ODDS = 3.0
 """Log odds at which there is an error, and, against it, none that counts: twenty to one."""
-ERROR_PIXELS, ERROR_FITS = 2000, 4
-"""Largest number of correspondences, and the rounds of a fit that begins at that of the error
-before."""
+ERROR_PIXELS = 2000
+"""Largest number of correspondences."""
 MOST_CHANGE = 2.5
 """Largest log ratio of a depth to the median: what is behind the camera is farther away."""
 
@@ -133,8 +139,8 @@ def _explained(matches: Matches, kind: str, deviation: float) -> tuple[Float, tu
     """The best motion with every error, and its Sampson distances (len(TRIED_ERRORS), M), pixels;
     no motions where the flow determines none.
 
-    Motions change little from one error to the next. That of a focal length changes much from one
-    end to the other, and is sought from the ends as well.
+    Motions change little from one error to the next, so that half the rounds of a fit do. That of a
+    focal length changes much from one end to the other, and is sought from the ends as well.
     """
     of_focal = kind == "focal length"
     errors, tried = deviation * TRIED_ERRORS, []
@@ -152,7 +158,7 @@ def _explained(matches: Matches, kind: str, deviation: float) -> tuple[Float, tu
         if motion is None:
             continue
         for k in way:
-            motion = refine_near(motion, tried[k], LEAST_NOISE, ERROR_FITS)
+            motion = refine_near(motion, tried[k], LEAST_NOISE, FITS // 2)
             distance = _distance(tried[k], motion, kind, errors[k], matches)
             error = float(np.mean(np.log1p((distance / LEAST_NOISE) ** 2)))
             if error < least[k]:

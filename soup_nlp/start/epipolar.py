@@ -21,9 +21,9 @@ from soup_nlp.geometry import rotation
 
 LEAST_MATCHES = 8
 """Least number of correspondences that determine a motion, or tell anything of a depth."""
-REFINEMENTS, EVALUATIONS, TRANSLATION_FITS = 5, 30, 6
-"""Largest number of robust fits of a motion, each with the noise estimated by the last, of
-evaluations of a fit, and of re-weighted fits of a translation."""
+REFINEMENTS, EVALUATIONS, TRANSLATION_FITS, FITS = 5, 30, 6, 8
+"""Largest number of robust fits of a motion, each with the noise estimated by the last, and of
+evaluations of a fit; re-weighted fits of a translation, and of anything else."""
 LEAST_WIDTH = 0.01
 """Smallest scale of the robust loss, pixels."""
 MOTION_SIGMA = np.array([0.02] * 3 + [0.3] * 2)
@@ -195,7 +195,7 @@ def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
     return moved(x)
 
 
-def refine_near(motion: Motion, matches: Matches, noise: float, rounds: int = 8) -> Motion:
+def refine_near(motion: Motion, matches: Matches, noise: float, rounds: int = FITS) -> Motion:
     """Motion near a given one that lowers the robust Sampson distance; `noise` is in pixels.
 
     Re-weighted Gauss-Newton steps. A prior (`MOTION_SIGMA`) holds the directions that a small patch

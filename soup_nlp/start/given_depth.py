@@ -16,12 +16,19 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import least_gap
 from soup_nlp.start.epipolar import LEAST_MATCHES
-from soup_nlp.start.prior_evidence import LEAST_SIGMA, PriorEvidence, Seen, without_gaps
+from soup_nlp.start.labelling import PIECE_SIZE
+from soup_nlp.start.prior_evidence import (
+    JUDGED_PIECES,
+    LEAST_SIGMA,
+    PriorEvidence,
+    Seen,
+    without_gaps,
+)
 from soup_nlp.start.propose import Start
 from soup_nlp.start.regions import FIXED, SCENE, TIES
 from soup_nlp.start.views import FlowFit
 
-HELD_SHARE, NEAR_SHARE = 4 / 300, 0.1
+HELD_SHARE, NEAR_SHARE = PIECE_SIZE / JUDGED_PIECES, 0.1
 """Weight of the whole image's error beside residuals, as a share of its area; standard deviation of
 the distance up to which a residual counts, relative to the square root of that area."""
 SLOPE_REACH = 4

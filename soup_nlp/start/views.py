@@ -16,7 +16,7 @@ from soup_nlp.geometry.plane import PlaneFit, about_anchor, fit_planes, normal_a
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
 from soup_nlp.schema.section import Section, Seed
-from soup_nlp.start.epipolar import LEAST_MATCHES, Matches, Motion, stacked
+from soup_nlp.start.epipolar import FITS, LEAST_MATCHES, Matches, Motion, stacked
 
 
 class StartOptions(Section):
@@ -233,8 +233,8 @@ class FlowFit(NamedTuple):
         return Matches(v.anchor[at], self.centre[at], np.ones(len(at)), v.focal[0])
 
 
-QUADRATIC_PX, AFFINE_FITS = 0.1, 8
-"""Error of an affine flow below which its loss is quadratic, pixels, and re-weighted fits."""
+QUADRATIC_PX = 0.1
+"""Error of an affine flow below which its loss is quadratic, pixels."""
 
 
 def affine_flow(views: Views) -> tuple[Float, Float]:
@@ -250,7 +250,7 @@ def affine_flow(views: Views) -> tuple[Float, Float]:
     # without confident pixels any affine map will do; the ridge keeps the system regular
     w = confidence = views.weight + 1e-6
     fit = np.zeros((len(basis), 3, 2))
-    for _ in range(AFFINE_FITS):
+    for _ in range(FITS):
         right = (basis * w[..., None]).transpose(0, 2, 1)
         fit = np.linalg.solve(right @ basis + 1e-9 * np.eye(3), right @ target)
         error = np.linalg.norm(basis @ fit - target, axis=2)
