@@ -110,8 +110,7 @@ def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
     the motion of the surface that they continue. Connected pieces that save less than the price of
     a motion take the most frequent one.
     """
-    views, rows = flow.views, np.arange(len(flow.seg))
-    seen = views.usable & ~flow.poor
+    views, seen, rows = flow.views, flow.trusted, np.arange(len(flow.seg))
     if not seen.any():
         return Labelling.of(flow, motions[:1], 0 * rows, LEAST_SHARED)
     groups: list[tuple[Mask, list[Motion]]]

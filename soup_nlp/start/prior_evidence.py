@@ -23,7 +23,7 @@ from soup_nlp.start.bending import CLIP_PX, displaced, fit_robustly, least_gap, 
 from soup_nlp.start.epipolar import LEAST_MATCHES, RELIEF, Motion, most_probable
 from soup_nlp.start.propose import Start
 from soup_nlp.start.regions import SCENE
-from soup_nlp.start.views import LEAST_PARALLAX_PX, FlowFit
+from soup_nlp.start.views import FlowFit, determined
 
 Kind = Literal["metric", "relative", "inverse", "ordinal"]
 
@@ -114,7 +114,7 @@ class Seen(NamedTuple):
     def usable(self) -> Mask:
         """(N,) True where the flow is known and the surface does not bend."""
         start, flow = self
-        return flow.views.usable & ~start.wrong & ~start.bends & ~flow.poor
+        return flow.trusted & ~start.wrong & ~start.bends
 
     def members(self, c: int) -> Int:
         """Superpixels of a rigid component whose flow is known."""
@@ -160,11 +160,10 @@ class Seen(NamedTuple):
         error = min(COMMON_NOISES * start.noise, MOST_COMMON_PX)
         best, _ = most_probable(motions, matches, error, prior[use], sigma)
         planes = views.fit([best])
-        mu, cost = planes.inverse_depth[:, 0], planes.cost[:, 0]
-        strong = (mu > 0) & (planes.parallax[:, 0] * mu > LEAST_PARALLAX_PX) & (cost < CLIP_PX)
-        strong &= self.usable & mask
+        strong = determined(planes)[:, 0] & (planes.cost[:, 0] < CLIP_PX) & self.usable & mask
         slope = np.where(strong[:, None], planes.slope[:, 0], 0.0)
-        by_flow = views.soup(np.where(strong, mu, 1.0), slope, best.R, best.t)
+        mu = np.where(strong, planes.inverse_depth[:, 0], 1.0)
+        by_flow = views.soup(mu, slope, best.R, best.t)
         return soup.taking(by_flow, mask), strong
 
 

@@ -44,7 +44,7 @@ from soup_nlp.start.regions import (
     vote,
 )
 from soup_nlp.start.scales import ground, held, on_ground, scaled
-from soup_nlp.start.views import JUMP_PX, LEAST_PARALLAX_PX, LEAST_SEEN, FlowFit, Views
+from soup_nlp.start.views import JUMP_PX, LEAST_SEEN, FlowFit, Views, determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,10 +262,9 @@ def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Ma
     """Planes under the chosen motions, and (N,) True where they are borrowed from neighbours, also
     where the motion does not explain the flow, `wrong` (N,).
     """
-    fit, parallax, views = choice.fit, choice.parallax, flow.views
+    fit, views = choice.fit, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
-    weak = (mu <= 0) | (parallax < LEAST_PARALLAX_PX) | flow.poor | wrong
-    weak |= flow.seen < LEAST_SEEN
+    weak = ~determined(fit)[:, 0] | flow.poor | wrong | (flow.seen < LEAST_SEEN)
     if weak.all():
         # no depth is known: all depths are one, with translations that move the image as before
         length = np.where(mu > 0, mu, 0.0)

@@ -217,6 +217,11 @@ class FlowFit(NamedTuple):
         return np.asarray(moved)
 
     @property
+    def trusted(self) -> Mask:
+        """(N,) True where the flow counts, and is that of the superpixel itself."""
+        return self.views.usable & ~self.poor
+
+    @property
     def middle(self) -> Float:
         """(P, 3) rays of the middles of the boundaries between neighbours."""
         return rays(self.K_ref, self.seg.boundary.mean(axis=1))
@@ -231,6 +236,12 @@ class FlowFit(NamedTuple):
         """Correspondences of the anchors of superpixels `at`, all with the same weight."""
         v = self.views
         return Matches(v.anchor[at], self.centre[at], np.ones(len(at)), v.focal[0])
+
+
+def determined(fit: PlaneFit) -> Mask:
+    """(N, M) True where planes are ahead, and parallax determines their depth."""
+    near = fit.parallax * fit.inverse_depth >= LEAST_PARALLAX_PX
+    return (fit.inverse_depth > 0) & near
 
 
 QUADRATIC_PX = 0.1
