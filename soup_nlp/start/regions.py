@@ -156,9 +156,8 @@ def covering(pair: Pair, flow: FlowFit) -> Float:
     for e, side in ((0, -1.0), (1, 1.0)):
         at = edge[:, :, None] + side * normal[:, None, None] * step[:, None]
         u, v = np.moveaxis(np.rint(at).astype(int), -1, 0)
-        members = inside & (
-            seg.labels.take(v * seg.labels.shape[1] + u, mode="clip") == ends[:, e, None, None]
-        )
+        owner = seg.labels.take(v * seg.labels.shape[1] + u, mode="clip")
+        members = inside & (owner == ends[:, e, None, None])
         strip = np.where(members.reshape(len(members), -1, 1), _colours(before, at), np.nan)
         covered[:, e] = _cost(np.abs(strip - _colours(after, target(ends[:, e], at))).mean(axis=-1))
         off = np.abs(gap[:, :, None] - strip[:, None]).mean(axis=-1)
@@ -190,9 +189,8 @@ def _colours(image: Image, at: Float) -> Float:
 
 def _cost(change: Float) -> Float:
     """(M,) mean of limited changes (M, T), which are NaN where unknown; NaN for too few."""
-    valid = np.isfinite(change)
-    count = valid.sum(axis=1)
-    total = np.where(valid, np.minimum(change, MOST_GREY), 0.0).sum(axis=1)
+    count = np.isfinite(change).sum(axis=1)
+    total = np.nansum(np.minimum(change, MOST_GREY), axis=1)
     return np.where(count >= LEAST_STRIP, total / np.maximum(count, 1), np.nan)
 
 
