@@ -11,11 +11,12 @@ from soup_nlp.report.result import PAGE
 from soup_nlp.storage.each import failed, reason
 
 HEADS = ("", "pair", "MRE", "constant", "drawn", "seconds", "MB", "exit", "reason")
+NUMBERS = {"mre": ".4f", "constant": ".4f", "drawn": ".0%", "seconds": ".0f"}
 DRAWS = 2000
 """Draws of the bootstrap."""
 HTML = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>{title}</title>
+<title>Batch</title>
 <style>
 body {{ font: 15px/1.4 system-ui, sans-serif; margin: 1.5em; color: #222; background: #fff }}
 table {{ border-collapse: collapse }}
@@ -25,7 +26,7 @@ td:nth-child(2), td:last-child {{ text-align: left }}
 img {{ height: 60px; display: block }}
 .bad {{ color: #a00 }}
 </style>
-<h1>{title}</h1>
+<h1>Batch</h1>
 <p>{summary}</p>
 <table><thead><tr>{heads}</tr></thead><tbody>
 {rows}
@@ -63,7 +64,7 @@ def summary(rows: Sequence[Mapping[str, Any]], total: int) -> str:
     return "; ".join(parts)
 
 
-def page(rows: Sequence[Mapping[str, Any]], total: int, title: str = "Batch") -> str:
+def page(rows: Sequence[Mapping[str, Any]], total: int) -> str:
     """The page of the rows so far, of `total` pairs."""
     lines = []
     for row in rows:
@@ -72,10 +73,7 @@ def page(rows: Sequence[Mapping[str, Any]], total: int, title: str = "Batch") ->
         shown = "" if bad else f'<img loading="lazy" alt="" src="{place}/depth_ref_colour.png">'
         size = row.get("peak_bytes")
         cells = [
-            _number(row.get("mre"), ".4f"),
-            _number(row.get("constant"), ".4f"),
-            _number(row.get("drawn"), ".0%"),
-            _number(row.get("seconds"), ".0f"),
+            *(_number(row.get(name), form) for name, form in NUMBERS.items()),
             _number(size and size / 2**20, ".0f"),
             f"<td>{2 if bad else row.get('exit_code')}</td>",
             f"<td>{escape(reason(row) if bad else str(row.get('reason')))}</td>",
@@ -84,8 +82,7 @@ def page(rows: Sequence[Mapping[str, Any]], total: int, title: str = "Batch") ->
         first = f'<tr class="{"bad" if bad else ""}"><td>{shown}</td>'
         lines.append("".join([first, f'<td data-value="{name}">{label}</td>', *cells, "</tr>"]))
     heads = "".join(f"<th>{head}</th>" for head in HEADS)
-    text = escape(summary(rows, total))
-    return HTML.format(title=escape(title), summary=text, heads=heads, rows="\n".join(lines))
+    return HTML.format(summary=escape(summary(rows, total)), heads=heads, rows="\n".join(lines))
 
 
 def _number(value: float | None, form: str) -> str:

@@ -25,12 +25,10 @@ from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.storage.each import each, read_rows
 
 TINY = [
-    "segmentation.superpixels=12",
-    "segmentation.neighbours=4",
-    "energy.pixel_samples=4",
-    "refine.enabled=false",
-    "output.page=false",
+    *("segmentation.superpixels=12", "segmentation.neighbours=4", "energy.pixel_samples=4"),
+    *("refine.enabled=false", "output.page=false"),
 ]
+TINY_SET = [word for key in TINY for word in ("--set", key)]
 
 
 def write_folder(folder: Path, scene: str, seed: int = 0) -> None:
@@ -52,9 +50,6 @@ def pairs(tmp_path_factory) -> Path:
     for name in ("frame_0.png", "frame_1.png", "K.txt"):
         (root / "2_bad" / name).write_text("not an image")
     return root
-
-
-# --- sources -------------------------------------------------------------------------------------
 
 
 def test_a_folder_a_pattern_and_a_list_name_the_same_pairs(pairs):
@@ -107,25 +102,19 @@ def test_a_data_set_has_every_pair_whose_frames_are_there(tmp_path):
     assert (problem.name, problem.input.index) == ("000001", "000001")
 
 
-# --- identity ------------------------------------------------------------------------------------
-
-
 def test_the_same_input_has_the_same_contents(pairs, tmp_path):
-    place = tmp_path / "moved"
-    shutil.copytree(pairs / "0_orbit", place)
+    place = Path(shutil.copytree(pairs / "0_orbit", tmp_path / "moved"))
 
-    def named(folder: Path, **keys: object) -> str:
-        (problem,) = problems_of(
-            [{"input": {"kind": "folder", "path": str(folder)}, **keys}]
-        ).values()
-        return problem.identity()
+    def of_folder(folder: Path, **keys: object) -> str:
+        raw = {"input": {"kind": "folder", "path": str(folder)}, **keys}
+        return make_problem(raw).identity()
 
-    before = named(place)
-    assert before == named(pairs / "0_orbit", name="other")
-    assert before != named(place, seed=3)
+    before = of_folder(place)
+    assert before == of_folder(pairs / "0_orbit", name="other")
+    assert before != of_folder(place, seed=3)
     # other bytes under the same name
     shutil.copy(place / "frame_0.png", place / "frame_1.png")
-    assert named(place) != before
+    assert of_folder(place) != before
 
     def files(**keys: object) -> str:
         names = {"ref": "frame_0.png", "next": "frame_1.png", "intrinsics": "K.txt"}
@@ -133,23 +122,18 @@ def test_the_same_input_has_the_same_contents(pairs, tmp_path):
         return make_problem(raw).identity()
 
     np.save(place / "flow.npy", np.zeros((64, 96, 2)))
-    more = {"flow": {"source": "flow.npy"}, "depth_prior": {"source": "depth.npy"}}
     first = files()
-    for (section, keys), name in zip(more.items(), ("flow", "depth"), strict=True):
-        path = place / f"{name}.npy"
-        given = files(**{section: keys})
-        assert given != first
-        np.save(path, np.load(path) + 1)
-        assert files(**{section: keys}) != given
+    for section, name in (("flow", "flow.npy"), ("depth_prior", "depth.npy")):
+        keys = {section: {"source": name}}
+        given = files(**keys)
+        np.save(place / name, np.load(place / name) + 1)
+        assert len({first, given, files(**keys)}) == 3
     assert files() == first
     np.savetxt(place / "K.txt", 1.1 * np.loadtxt(place / "K.txt"))
     assert files() != first
     (place / "K.txt").unlink()
     with pytest.raises(DataError, match=r"K\.txt"):
         files()
-
-
-# --- the batch -----------------------------------------------------------------------------------
 
 
 def rows_of(out: Path) -> dict[str, dict[str, str]]:
@@ -161,8 +145,7 @@ def rows_of(out: Path) -> dict[str, dict[str, str]]:
 def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys):
     root, out = tmp_path / "in", tmp_path / "out"
     shutil.copytree(pairs, root)
-    words = ["batch", str(root), "-o", str(out), "--workers", "2"]
-    words += [word for key in TINY for word in ("--set", key)]
+    words = ["batch", str(root), "-o", str(out), "--workers", "2", *TINY_SET]
     assert main(words) == 1
     rows = rows_of(out)
     assert [row["exit_code"] for row in rows.values()][2] == "2"
@@ -188,8 +171,7 @@ def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys):
 
 
 def command(pairs: Path, out: Path) -> list[str]:
-    words = [sys.executable, "-m", "soup_nlp", "batch", str(pairs), "-o", str(out), "-q"]
-    return words + [word for key in TINY for word in ("--set", key)]
+    return [sys.executable, "-m", "soup_nlp", "batch", str(pairs), "-o", str(out), "-q", *TINY_SET]
 
 
 @pytest.fixture(scope="module")
@@ -244,9 +226,6 @@ def test_a_table_and_a_page_of_rows():
     assert low < mean == 49.5 < high
     # 1.96 standard errors
     assert (high - low) / 2 == pytest.approx(1.96 * np.arange(100).std() / 10, rel=0.1)
-
-
-# --- a cluster -----------------------------------------------------------------------------------
 
 
 QUIET: dict[str, int] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
