@@ -20,7 +20,7 @@ from soup_nlp.pipeline.record import Run
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import shown, write_depth_png16, write_png
 from soup_nlp.report.formats import check_formats, write_formats
-from soup_nlp.report.layout import rows_in_file
+from soup_nlp.report.layout import LAYOUT
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import overview, pictures
 from soup_nlp.report.result import PAGE, result_of
@@ -112,7 +112,9 @@ def write_folder(
             write_text(new / PAGE, page(chain, drawn))
         write_json(new / "summary.json", {**contents, "depth_png_scale": scales})
         about = {"name": run.problem.name, "config": config}
-        write_h5(new / "result.h5", result.tree, about, rows_in_file(result.metre_unit))
+        unit = {"truth": result.metre_unit}
+        rows = {k: row._replace(unit=unit.get(row.unit, row.unit)) for k, row in LAYOUT.items()}
+        write_h5(new / "result.h5", result.tree, about, rows)
         names = {path.name for path in new.iterdir()} | {"log.txt"}
         files = [name for name in FILES if name in names] + sorted(names.difference(FILES))
         write_text(new / "log.txt", log if isinstance(log, str) else log(files))

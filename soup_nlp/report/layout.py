@@ -15,7 +15,7 @@ from soup_nlp.evaluation.metrics import DepthMetrics
 from soup_nlp.evaluation.scoring import DEPTHS
 from soup_nlp.pipeline.record import Run
 from soup_nlp.storage.files import as_path, read_json
-from soup_nlp.storage.store import ReadTree, Row, parse_table, read_h5, require, row_of
+from soup_nlp.storage.store import ReadTree, parse_table, read_h5, require, row_of
 
 TABLE = """
 input/image_ref           1     H,W,3   reference image, 8-bit RGB
@@ -145,12 +145,6 @@ SHARED = ("N", "E", "P", "H", "W")
 """Axes with one size in all arrays: superpixels, edges, pairs, rows and columns."""
 FREE = ("depth/next", "depth/sigma_next", "input/image_next", "truth/depth_next")
 """Maps of the next frame, whose size may differ."""
-
-
-def rows_in_file(truth_unit: str = "") -> dict[str, Row]:
-    """The rows of `TABLE` as a file has them, with the unit of length of the truth."""
-    unit = {"truth": truth_unit}
-    return {k: row._replace(unit=unit.get(row.unit, row.unit)) for k, row in LAYOUT.items()}
 
 
 def _listed(values: Mapping[str, Any], prefix: str = "") -> ReadTree:

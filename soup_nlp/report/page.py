@@ -144,7 +144,7 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
     z = z[np.isfinite(z)] if np.isfinite(z).any() else np.ones(1)
     # sky and horizon may be orders of magnitude behind the rest; a wall at one depth is shown
     far = 1.001 * min(float(np.percentile(z, 99.5)), 4.0 * float(np.percentile(z, 70)))
-    still = chain.single and chain.pairs[0].bending
+    still = chain.single and chain.pairs[0].bends.all()
     poses = [STILL] * len(chain) if still else chain.world_from_camera
     cameras = [replace(pose, t=metre * pose.t).matrix for pose in poses]
     names = [str(x).rpartition("/")[2] for x in chain.summary.get("sources", ())]
@@ -200,7 +200,7 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
     step = int(np.ceil(np.sqrt(max(rec.labels.size / most, 1.0))))
     every = np.s_[::step, ::step]
     R, T = nearest(soup.R), scale * soup.translation
-    camera = STILL if result.bending else result.components.camera.inverse
+    camera = STILL if result.bends.all() else result.components.camera.inverse
     home = T @ camera.R.T + scale * camera.t
     pivot = _pivots(result, scale)
     labels, sigma, known = rec.labels[every], result.sigma[every], np.isfinite(rec.depth_ref)

@@ -174,13 +174,8 @@ class Result:
 
     @property
     def bends(self) -> Mask:
-        """(N,) True for the superpixels of regions that bend."""
+        """(N,) True for the superpixels of regions that bend; if all do, no component is rigid."""
         return np.asarray(self.tree["start"]["bends"], bool)
-
-    @property
-    def bending(self) -> bool:
-        """Whether the whole image bends; then no component is rigid."""
-        return bool(self.bends.all())
 
     @property
     def constraints(self) -> Constraints:

@@ -19,17 +19,19 @@ from soup_nlp.storage.versions import versions
 STATUS = {
     "Solve_Succeeded": "converged to the tolerance",
     "Solved_To_Acceptable_Level": "converged to Ipopt's acceptable level",
-    "Maximum_Iterations_Exceeded": "not converged: iteration limit, best iterate kept",
-    "Time_Limit": "not converged: limit of CPU time, best iterate kept",
     "Constraints_Violated": "not converged: the answer breaks its constraints",
     "Skipped": "refined from the start, no NLP",
     "Interrupted": "interrupted, best iterate kept",
-    "Infeasible_Problem_Detected": "not converged: no feasible point nearby, best iterate kept",
-    "Error_In_Step_Computation": "not converged: no further step is found, best iterate kept",
-    "Search_Direction_Becomes_Too_Small": "not converged: steps are of rounding size, best iterate"
-    " kept",
-    "Restoration_Failed": "not converged: feasibility could not be restored, best iterate kept",
 }
+CAUSES = {
+    "Maximum_Iterations_Exceeded": "iteration limit",
+    "Time_Limit": "limit of CPU time",
+    "Infeasible_Problem_Detected": "no feasible point nearby",
+    "Error_In_Step_Computation": "no further step is found",
+    "Search_Direction_Becomes_Too_Small": "steps are of rounding size",
+    "Restoration_Failed": "feasibility could not be restored",
+}
+"""Words for other statuses, whose best iterate is kept."""
 TITLES = {
     **{name: f"surest {share:.0%}" for name, share in SURE.items()},
     "nlp": "NLP alone",
@@ -93,11 +95,11 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
     whole = {k: v for k, v in run.seconds.items() if not k.startswith("nlp_")}
     inner = {k[4:]: v for k, v in run.seconds.items() if k.startswith("nlp_")}
     status, expected = run.solution.status, list[str]()
-    words = STATUS.get(status, f"not converged: {status}, best iterate kept")
+    cause = f"not converged: {CAUSES.get(status, status)}, best iterate kept"
     if limit is not None and "solution" in run.metrics:
         expected = [f"MRE at most {limit:g}: {'missed' if missed(run, limit) else 'met'}"]
     sections = {
-        "status": [f"{words} ({status})"],
+        "status": [f"{STATUS.get(status, cause)} ({status})"],
         "found": found_words(run),
         "certainty": certainty_lines(certainty(run)),
         "try": hints(run),
