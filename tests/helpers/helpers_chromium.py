@@ -46,13 +46,9 @@ class Chromium:
             os.dup2(a, 3)
             os.dup2(b, 4)
 
+        words = [path, *FLAGS, f"--window-size={width},{height}"]
         self.process = subprocess.Popen(
-            [
-                path,
-                *FLAGS,
-                f"--window-size={width},{height}",
-                f"--user-data-dir={self.folder.name}",
-            ],
+            [*words, f"--user-data-dir={self.folder.name}"],
             preexec_fn=give,
             close_fds=False,
             stdout=subprocess.DEVNULL,
@@ -107,22 +103,18 @@ class Chromium:
             raise RuntimeError(f"{expression}: {answer['exceptionDetails']}")
         return answer["result"].get("value")
 
-    def screenshot(self, whole: bool = False) -> np.ndarray:
-        """(H, W, 3) uint8 RGB of the window, or of the whole page."""
+    def screenshot(self) -> np.ndarray:
+        """(H, W, 3) uint8 RGB of the window."""
         # two frames later, all requested changes are drawn
         self.value("new Promise(d => requestAnimationFrame(() => requestAnimationFrame(d)))")
-        data = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
+        data = self.call("Page.captureScreenshot", format="png")
         raw = np.frombuffer(base64.b64decode(data["data"]), np.uint8)
         return np.asarray(cv2.imdecode(raw, cv2.IMREAD_COLOR)[..., ::-1])
 
     def close(self) -> None:
         """End the browser."""
-        self.process.terminate()
-        try:
-            self.process.wait(10)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        self.process.kill()
+        self.process.wait()
         self.write.close()
         self.read.close()
         self.folder.cleanup()
@@ -140,12 +132,11 @@ class Chromium:
 
     def _event(self, event: dict[str, Any]) -> None:
         method, params = event.get("method"), event.get("params", {})
-        if method == "Runtime.exceptionThrown":
-            self.log.append(str(params["exceptionDetails"]))
-        elif method == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert"):
-            self.log.append(str(params["args"]))
-        elif method == "Log.entryAdded" and params["entry"]["level"] == "error":
-            self.log.append(str(params["entry"]))
+        thrown = method == "Runtime.exceptionThrown"
+        said = method == "Runtime.consoleAPICalled" and params["type"] in ("error", "assert")
+        logged = method == "Log.entryAdded" and params["entry"]["level"] == "error"
+        if thrown or said or logged:
+            self.log.append(str(params))
         elif method == "Network.requestWillBeSent":
             address = params["request"]["url"]
             if not address.startswith(("data:", "blob:")):
