@@ -72,37 +72,30 @@ def drawn_line(shares: Mapping[str, float], of: str = "the image") -> str:
 def found_words(run: Run) -> list[str]:
     """Motion of the camera and of the large components, bending, size, depth prior."""
     start, parts, labels = run.start, run.components, run.segmentation.labels
-    assert run.pair.flow is not None
     turn = f"by {parts.camera.angle:.2f} degrees"
     if unmatched(run):
         turn += " (hardly any flow is usable)"
-
-    def shift(label: int, vector: Float) -> str:
-        sigma = float(np.median(run.confidence.sigma[parts.of_pixel == label]))
-        words = f" (right to {sigma:.0%}, as its distance is)" if sigma > MOST_SIGMA else ""
-        return f"by {_shift(run, vector)}{words}"
 
     if start.at_rest:
         lines = [f"the camera stands still or only turns, {turn}"]
     elif start.bends.all():
         lines = ["surfaces bend: their relief is weakly determined"]
     else:
-        lines = [f"the camera moves {shift(0, parts.camera.centre)} and turns {turn}"]
+        lines = [f"the camera moves {_shift(run, 0, parts.camera.centre)} and turns {turn}"]
         if start.bending:
             share = float(start.bends[labels].mean())
             lines.append(f"{share:.0%} of the image bends: its relief is weakly determined")
     shares = {part.label: part.pixels / labels.size for part in parts.members[1:]}
-    large = [label for label, share in shares.items() if share >= SHARE / 5]
-    for label in large[:LISTED]:
+    large = [label for label, share in shares.items() if share >= SHARE / 5][:LISTED]
+    for label in large:
         centre = parts[label].centre
-        moved = shift(label, parts.own_motion(label)(centre) - centre)
+        moved = _shift(run, label, parts.own_motion(label)(centre) - centre)
         lines.append(f"{shares[label]:.0%} of the image moves by itself, {moved}")
-    rest = len(shares) - len(large[:LISTED])
+    rest = [share for label, share in shares.items() if label not in large]
     if rest:
-        most = max(share for label, share in shares.items() if label not in large[:LISTED])
-        size = "below 1%" if most < SHARE / 5 else f"at most {most:.0%}"
+        size = "below 1%" if max(rest) < SHARE / 5 else f"at most {max(rest):.0%}"
         kind = "more components" if large else "components that move by themselves"
-        lines.append(f"{kind}: {rest} ({size} of the image{' each' * (rest > 1)})")
+        lines.append(f"{kind}: {len(rest)} ({size} of the image{' each' * (len(rest) > 1)})")
     camera = run.confidence.evidence.camera
     if camera is not None and shares:
         lines.append(f"the flow suggests an error of {camera}, which may look like such motion")
@@ -125,20 +118,20 @@ def unmatched(run: Run) -> bool:
     return run.pair.flow.usable < MATCHED and run.confidence.share("drawn") > 0.5
 
 
-def _shift(run: Run, shift: Float) -> str:
-    """Length and main direction of a displacement (3,) in the reference camera's axes.
+def _shift(run: Run, label: int, shift: Float) -> str:
+    """Length, main direction and certainty of a component's displacement (3,).
 
     The length is in the unit of the truth, or relative to the median depth without a truth.
     """
     axis = int(np.argmax(np.abs(shift)))
     length, score = float(np.linalg.norm(shift)), run.metrics.get("solution")
+    share = length / float(np.nanmedian(run.reconstruction.depth_ref))
+    size = f"{share:.1%} of the median depth"
     if score is not None and np.isfinite(score.scale) and run.pair.truth is not None:
         size = f"{score.scale * length:.3g} {run.pair.truth.unit}"
-    else:
-        size = (
-            f"{length / float(np.nanmedian(run.reconstruction.depth_ref)):.1%} of the median depth"
-        )
-    return f"{size} {WAYS[axis][int(shift[axis] < 0)]}"
+    sigma = float(np.median(run.confidence.sigma[run.components.of_pixel == label]))
+    sure = f" (right to {sigma:.0%}, as its distance is)" if sigma > MOST_SIGMA else ""
+    return f"by {size} {WAYS[axis][int(shift[axis] < 0)]}{sure}"
 
 
 def flow_words(run: Run) -> list[str]:
@@ -164,7 +157,7 @@ def hints(run: Run) -> list[str]:
     unsure = sure.sigma > MOST_SIGMA
 
     def share(part: Mask) -> float:
-        """Share of the image that is unsure and of a part (N,) of the superpixels."""
+        # of the image that is unsure, and of a part (N,) of the superpixels
         return float(np.mean(unsure & part[labels]))
 
     if unmatched(run):
