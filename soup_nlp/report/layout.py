@@ -1,6 +1,7 @@
 """Layout of a stored result: one table of the arrays of result.h5, from which it is written, read
 and checked, and the entries of summary.json that are read back."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -164,23 +165,20 @@ def result_tree(run: Run) -> ReadTree:
     """Every array of a run that `TABLE` names."""
     pair, rec, sure = run.pair, run.reconstruction, run.confidence
     form, parts = run.formulation(), run.components
+    limits = {"min_facing": form.min_facing, "depth_ratio": form.depth_ratio}
     assert pair.flow is not None
     arrays = {
         "input": {**vars(pair), "flow": pair.flow.uv, "confidence": pair.flow.confidence},
         "segmentation": vars(run.segmentation),
         "energy": run.data.arrays(),
-        "weights": {
-            **vars(run.weights),
-            "min_facing": form.min_facing,
-            "depth_ratio": form.depth_ratio,
-        },
+        "weights": {**vars(run.weights), **limits},
         "start": {**vars(run.start.soup), **vars(run.start), "bending": run.start.bending},
         "solution": vars(run.soup),
         "nlp": vars(run.solution.soup),
         "answer": vars(run.answer),
-        "multipliers": dict(run.solution.multipliers),
+        "multipliers": run.solution.multipliers,
         "iterations": {
-            f"{k:02d}_{stage.name.replace(' ', '_').replace('/', '_')}": dict(stage.history)
+            f"{k:02d}_{re.sub('[ /]', '_', stage.name)}": stage.history
             for k, stage in enumerate(run.solution.stages)
         },
         "depth": {
@@ -193,9 +191,9 @@ def result_tree(run: Run) -> ReadTree:
         "confidence": {**vars(sure), "plane": sure.marginals.plane},
         "components": {
             "of_superpixel": parts.of_superpixel,
-            "motion": np.stack([c.motion.matrix for c in parts]),
-            "residual_px": np.array([c.residual_px for c in parts]),
-            "borrowed": np.array([c.borrowed for c in parts]),
+            "motion": [c.motion.matrix for c in parts],
+            "residual_px": [c.residual_px for c in parts],
+            "borrowed": [c.borrowed for c in parts],
         },
         "truth": {} if pair.truth is None else vars(pair.truth),
     }
@@ -229,11 +227,8 @@ def require_layout(tree: ReadTree) -> None:
     last = sizes.get("N", 0) - 1
     for path in INDICES:
         group, name = path.split("/")
-        if (index := tree.get(group, {}).get(name)) is None:
-            continue
-        if index.dtype.kind not in "iu" or (
-            index.size and not 0 <= index.min() <= index.max() <= last
-        ):
+        index = tree.get(group, {}).get(name, np.zeros(0, int))
+        if index.dtype.kind not in "iu" or ((index < 0) | (index > last)).any():
             raise _wrong(path, "other values", f"whole numbers from 0 to {last}")
 
 

@@ -53,11 +53,7 @@ ROUND = (
 
 
 def verdict(
-    run: Run,
-    folder: Path,
-    files: Sequence[str],
-    limit: float | None = None,
-    details: bool = True,
+    run: Run, folder: Path, files: Sequence[str], limit: float | None = None, details: bool = True
 ) -> str:
     """Facts, files, next command and exit code; see `facts`."""
     # the commands can be pasted into a shell
@@ -193,18 +189,15 @@ def summary(run: Run) -> dict[str, Any]:
     facing = run.problem.formulation.min_facing
     components: dict[str, Any] = {"count": len(run.components)}
     if truth is not None and truth.components is not None:
-        overlaps = component_overlaps(run.components.of_pixel, truth.components)
-        components["truth"] = {
-            str(k): {"component": c, "iou": iou} for k, (c, iou) in overlaps.items()
-        }
+        overlaps = component_overlaps(run.components.of_pixel, truth.components).items()
+        components["truth"] = {str(k): {"component": c, "iou": iou} for k, (c, iou) in overlaps}
     return {
         "name": run.problem.name,
         "problem_hash": run.problem.digest(),
         "status": s.status,
         "converged": s.converged,
         "delivered": run.delivered,
-        "energy_by_stage": dict(s.ends)
-        | ({} if r is None else {"refinement": run.energy["total"]}),
+        "energy_by_stage": {**s.ends, **({} if r is None else {"refinement": run.energy["total"]})},
         "energy": {"start": s.energy_start, "nlp": s.energy, "solution": run.energy},
         "residuals": run.residuals,
         "nlp_residuals": constraints(s.soup, run.data.rim_ray, facing).largest,
