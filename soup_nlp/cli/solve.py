@@ -10,8 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from soup_nlp.batches.page import summary
-from soup_nlp.batches.run import FILES
+from soup_nlp.batches.run import FILES, summary
 from soup_nlp.batches.run import batch as solve_batch
 from soup_nlp.batches.sources import DATASETS
 from soup_nlp.cli import options

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 import soup_nlp
-from soup_nlp.batches.page import interval, page
-from soup_nlp.batches.run import _claimed, batch, table
+from soup_nlp.batches.run import _claimed, batch, interval, page, table
 from soup_nlp.batches.sources import problems_of
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
