@@ -81,8 +81,7 @@ def write_points(path: Path, frame: Frame) -> None:
         f"{keep.mean():.1%} of the pixels: without hidden ones, those at jumps of the depth, and"
         " those of less confidence than output.min_confidence",
     ]
-    places = frame.points[keep], frame.image[keep], frame.normals[keep]
-    write_ply(path, *places, scalars, comments)
+    write_ply(path, frame.points[keep], frame.image[keep], frame.normals[keep], scalars, comments)
 
 
 def write_fused(path: Path, chain: Chain) -> None:

@@ -241,9 +241,8 @@ def load(folder: str | Path) -> Result:
     stored = Stored.read(folder)
     tree, summary = stored.tree, stored.claims
     try:
-        for name in ("input/image_ref", "input/image_next", "input/confidence"):
-            require(tree, name)
-        K_ref, K_next = require(tree, "input/K_ref"), require(tree, "input/K_next")
+        needed = ("image_ref", "image_next", "confidence", "K_ref", "K_next")
+        *_, K_ref, K_next = (require(tree, f"input/{name}") for name in needed)
         soup = Soup(**stored.soup("solution"))
         planes = np.isfinite(soup.lam * soup.d).all()
         if not planes or not (np.abs(np.linalg.det(soup.R) - 1) < 1e-3).all():

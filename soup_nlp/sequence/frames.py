@@ -26,7 +26,6 @@ from soup_nlp.storage.files import as_path, is_folder, require_file
 from soup_nlp.storage.folders import claim, staged
 
 Raw = dict[str, Any]
-
 IMAGES = (
     *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm", ".bmp", ".webp", ".avif"),
     # these are found, so that the message can say that they must be converted

@@ -43,8 +43,7 @@ def link(
     ratio = np.log(one[both] / other[both])
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
-    pixels = int(both.sum())
-    return Link(*ends, middle, spread, pixels, flagged=flagged or pixels < MIN_PIXELS)
+    return Link(*ends, middle, spread, len(ratio), flagged=flagged or len(ratio) < MIN_PIXELS)
 
 
 def bridge(pairs: Sequence[Result], a: int) -> Link | None:

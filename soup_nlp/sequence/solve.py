@@ -100,8 +100,7 @@ def solve_chain(
     with warnings.catch_warnings(action="ignore", category=DataWarning):
         chosen = find_frames(source, folder, camera, stride, frames, depth_scale)
     common = sections(keys, "chain")
-    for section, defaults in DEFAULTS.items():
-        common[section] = {**defaults, **common.get(section, {})}
+    common |= {section: {**own, **common.get(section, {})} for section, own in DEFAULTS.items()}
     count = len(chosen)
     files = files_of_pairs(common, count - 1, stride)
     chosen = replace(chosen, files=files, keys=common, overrides=overrides)
