@@ -12,7 +12,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from soup_nlp.data.formats.map_files import read_depth
-from soup_nlp.errors import ConfigError, DataError
+from soup_nlp.errors import DataError
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.formats import FORMATS, write_formats
 from soup_nlp.report.models import fuse, surface_mesh, write_ply
@@ -238,15 +238,6 @@ def test_a_chain_has_every_format_of_a_pair(tmp_path):
     assert len(trimesh.load(tmp_path / "scene.ply").vertices) == len(fuse(chain))
     for name in ("poses.txt", "trajectory.tum"):
         assert len(np.loadtxt(tmp_path / name)) == 3
-
-
-def test_unknown_formats_are_refused(tmp_path, result):
-    with pytest.raises(ConfigError, match="obj"):
-        write_formats(tmp_path, Chain.of(result), ["ply", "obj"])
-    with pytest.raises(ConfigError, match="no format"):
-        write_formats(tmp_path, Chain.of(result), [])
-    assert not list(tmp_path.iterdir())
-    assert set(FORMATS) >= {"ply", "glb", "colmap", "npy", "pfm", "rrd"}
 
 
 def test_unknown_points_of_a_map_are_dropped(tmp_path):
