@@ -21,7 +21,7 @@ import psutil
 from soup_nlp.batches.sources import Source, problems_of
 from soup_nlp.config.problem import Problem
 from soup_nlp.errors import DataError, SoupError
-from soup_nlp.report import pairs as stored
+from soup_nlp.report import folder as stored
 from soup_nlp.report.result import PAGE
 from soup_nlp.storage.each import Row, Say, append_row, each, failed, failure, reason
 from soup_nlp.storage.files import as_path, write_text

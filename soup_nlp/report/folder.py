@@ -1,21 +1,26 @@
-"""The result folder, written whole or not at all; a run that writes and draws itself."""
+"""Result folders: that of a run, which writes and draws itself, and those of many pairs."""
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import ParamSpec
+from typing import ParamSpec, Required
 
 import numpy as np
+import psutil
 from PIL.Image import Image
+from typing_extensions import TypedDict
 
 from soup_nlp.arrays import AnyFloat
-from soup_nlp.config.problem import dump_problem
-from soup_nlp.errors import DataError
+from soup_nlp.config.problem import Problem, dump_problem
+from soup_nlp.data.formats.images import DataWarning
+from soup_nlp.errors import DataError, SoupError
 from soup_nlp.pipeline import run as pipeline
+from soup_nlp.pipeline.case import solve_bytes
 from soup_nlp.pipeline.record import Run
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.figures import shown, write_depth_png16, write_png
@@ -24,10 +29,12 @@ from soup_nlp.report.layout import LAYOUT
 from soup_nlp.report.page import page
 from soup_nlp.report.pictures import overview, pictures
 from soup_nlp.report.result import PAGE, result_of
-from soup_nlp.report.verdict import facts, summary
-from soup_nlp.storage.files import as_path, write_json, write_text
-from soup_nlp.storage.folders import claim, staged
+from soup_nlp.report.verdict import exit_code, facts, summary
+from soup_nlp.storage.each import Row, failed, read_rows
+from soup_nlp.storage.files import as_path, fits, is_file, write_json, write_text
+from soup_nlp.storage.folders import claim, read_sums, staged
 from soup_nlp.storage.store import write_h5
+from soup_nlp.storage.versions import code_version
 
 FILES = (
     *("config.yaml", "result.h5", "summary.json", "log.txt", "ipopt.log"),
@@ -39,6 +46,10 @@ FULL = ("depth_ref_full.png", "depth_next_full.png")
 """Further ones of a pair that was solved at a smaller size than that of its images."""
 FAILED = "failed.log"
 """Log of a solve that failed; the next result removes it."""
+PAIRS = "pairs"
+"""Folder with the results of the pairs."""
+ROWS = "pairs.jsonl"
+"""Every row that was ever made; the last one of a pair describes its folder."""
 
 
 def prepare_folder(
@@ -178,3 +189,88 @@ def _writable(solve: Callable[Given, Run]) -> Callable[Given, WritableRun]:
 
 
 run, solve_pair = _writable(pipeline.run), _writable(pipeline.solve_pair)
+
+
+# --- pairs of a batch or a chain: each in a folder of its own, with a row in one file -------------
+
+
+class StoredRow(TypedDict, total=False):
+    """What is read back of a row."""
+
+    key: Required[str]
+    error: str | None
+    exit_code: int
+    reason: str
+    mre: float | None
+    constant: float | None
+    drawn: float | None
+    seconds: float
+    cpu_seconds: float
+    peak_bytes: float
+    superpixels: int
+    result: str
+
+
+def head(problem: Problem) -> Row:
+    """What a row says of a pair before it is solved: if all of it is the same, so is the result."""
+    own = {"key": problem.name, "pair": problem.name, "seed": problem.seed}
+    return {**own, "identity": problem.identity(), "code": code_version()}
+
+
+def kept_rows(folder: Path, heads: Mapping[str, Row]) -> dict[str, Row]:
+    """Rows of the pairs that have been solved, or have failed, with the same input and code."""
+    last = {row["key"]: row for row in read_rows(folder / ROWS) if fits(row, StoredRow)}
+    same = {
+        name: last[name]
+        for name, own in heads.items()
+        if name in last and own.items() <= last[name].items()
+    }
+    # a command that was killed may have replaced a result before it wrote the row
+    stored = {name: _result(folder / PAIRS / name) for name in same}
+    return {k: row for k, row in same.items() if failed(row) or stored[k] == row.get("result", "")}
+
+
+def _result(place: Path) -> str | None:
+    """What the list of a result folder says of its arrays: a hash, or "" for none."""
+    sums = read_sums(place)
+    known = sums.files.get("result.h5", "") if sums else ""
+    return known if is_file(place / "result.h5") else None
+
+
+def places(names: Iterable[str]) -> list[str]:
+    """Names below the folders of pairs, for `claim`: no file or link may be in their way."""
+    # nothing is called so
+    return [f"{PAIRS}/{name}/-" for name in names]
+
+
+def fitting(workers: int, problems: Iterable[Problem]) -> int:
+    """How many of some workers have room in the free memory, whichever problems they solve."""
+    needs = 1.0
+    for problem in problems if workers > 1 else ():
+        # an image that cannot be read is an error of its row
+        with suppress(SoupError):
+            needs = max(needs, sum(solve_bytes(problem, problem.load_pair()).values()))
+    return max(1, min(workers, int(psutil.virtual_memory().available / needs)))
+
+
+def solve_into(problem: Problem, folder: Path) -> Row:
+    """Solve a pair into its folder below the one of all pairs."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solved = run(problem)
+        solved.save(place := folder / PAIRS / problem.name)
+    code, why = exit_code(solved, problem.expected.mre_at_most)
+    texts = [str(w.message) for w in caught if issubclass(w.category, DataWarning)]
+    scores = {name: m.mre for name, m in solved.metrics.items()}
+    return {
+        "exit_code": code,
+        "reason": why,
+        "converged": solved.solution.converged,
+        "components": len(solved.components),
+        "mre": scores.get("solution"),
+        "constant": scores.get("constant"),
+        "drawn": solved.confidence.share("drawn"),
+        "superpixels": len(solved),
+        "result": _result(place),
+        "warnings": [*dict.fromkeys(texts)],
+    }

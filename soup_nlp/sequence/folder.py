@@ -13,9 +13,9 @@ from soup_nlp.errors import DataError
 from soup_nlp.report.chain import AXES, Chain, Lazy
 from soup_nlp.report.check import CheckReport, Claim, check_folder, written
 from soup_nlp.report.figures import depth_png_scale, write_depth_png16
+from soup_nlp.report.folder import PAIRS, ROWS
 from soup_nlp.report.formats import check_formats, write_formats
 from soup_nlp.report.page import page
-from soup_nlp.report.pairs import PAIRS, ROWS
 from soup_nlp.report.result import PAGE, Result
 from soup_nlp.report.result import load as load_pair
 from soup_nlp.sequence.frames import pair_name

@@ -16,7 +16,7 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
 from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.pipeline.run import ProblemKeys, sections
-from soup_nlp.report import pairs as stored
+from soup_nlp.report import folder as stored
 from soup_nlp.report.chain import Chain
 from soup_nlp.sequence.folder import CHAIN, SINGLE, chain_files, read_pairs, write_chain
 from soup_nlp.sequence.frames import (

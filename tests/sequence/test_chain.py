@@ -10,8 +10,8 @@ from helpers_result import CAMERA, K, small_result, toy_pairs
 from soup_nlp.config.problem import make_problem
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.rotation import exp
+from soup_nlp.report import folder as stored
 from soup_nlp.report import page as report_page
-from soup_nlp.report import pairs as stored
 from soup_nlp.report.chain import NEAR, Lazy, Link
 from soup_nlp.report.formats import write_formats
 from soup_nlp.report.result import Result

@@ -18,8 +18,8 @@ from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.figures import write_png
+from soup_nlp.report.folder import head
 from soup_nlp.report.models import POINTS, fuse
-from soup_nlp.report.pairs import head
 from soup_nlp.report.pictures import pictures
 from soup_nlp.sequence import solve as solving
 from soup_nlp.sequence.folder import chain_files, write_chain
