@@ -17,6 +17,7 @@ from soup_nlp.evaluation import recompute
 from soup_nlp.evaluation.scoring import DEPTHS, SURE
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.report.layout import Stored
+from soup_nlp.storage.files import is_file
 from soup_nlp.storage.folders import SUMS, digest_of, read_sums
 from soup_nlp.storage.store import require
 
@@ -172,14 +173,13 @@ def _scores(r: Stored) -> Iterator[Claim]:
     # the skill of the others needs the score of the constant depth
     for name in sorted(r.claims["metrics"], key=lambda k: k != "constant"):
         claim = r.claims["metrics"][name]
-        found = recompute.scores(*_compared(r.tree, name), claim["scale_rule"], claim["cap"])
-        mre = found.pop("mre", np.nan)
-        constant = mre if name == "constant" else constant
+        scores = recompute.scores(*_compared(r.tree, name), claim["scale_rule"], claim["cap"])
+        found = {"mre": np.nan, **scores}
+        constant = found["mre"] if name == "constant" else constant
         if "skill" in claim and constant > 0:
-            found["skill"] = 1 - mre / constant
-        every = {"mre": mre, **found}
-        slack = {k: RELATIVE * abs(v) + ABSOLUTE for k, v in every.items()}
-        first, *rows = [Claim(k, _number(claim[k]), v, slack[k]) for k, v in every.items()]
+            found["skill"] = 1 - found["mre"] / constant
+        slack = {k: RELATIVE * abs(v) + ABSOLUTE for k, v in found.items()}
+        first, *rows = [Claim(k, _number(claim[k]), v, slack[k]) for k, v in found.items()]
         yield replace(first, name=f"mre {name}")
         note = ", ".join(f"{c.name} is {c.found:.6g}" for c in rows if not c.ok)
         right = float(sum(c.ok for c in rows))
@@ -206,14 +206,13 @@ def _compared(tree: Mapping[str, Any], name: str) -> tuple[Float, Float]:
 
 def written(folder: Path, needed: Set[str]) -> Iterator[Claim]:
     """Every file of a folder's list, which must have the needed ones, by its SHA-256."""
-    notes, sums = {}, read_sums(folder)
+    sums = read_sums(folder)
     files = sums.files if sums else {}
     if not needed <= files.keys():
-        notes["files as written"] = f"no SHA-256 of this result: {SUMS} is missing or damaged"
-    for name in sorted(files):
-        path, note = folder / name, "missing"
-        if path.is_file():
-            note = "" if digest_of(path) == files[name] else "changed"
-        notes[f"{name} as written"] = note
-    for name, note in notes.items():
-        yield Claim(name, 1.0, float(not note), note=note, how=WRITTEN)
+        note = f"no SHA-256 of this result: {SUMS} is missing or damaged"
+        yield Claim("files as written", 1.0, 0.0, note=note, how=WRITTEN)
+    for name, digest in sorted(files.items()):
+        note = "missing"
+        if is_file(folder / name):
+            note = "" if digest_of(folder / name) == digest else "changed"
+        yield Claim(f"{name} as written", 1.0, float(not note), note=note, how=WRITTEN)
