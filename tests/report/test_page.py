@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.lib.stride_tricks import sliding_window_view
 
 from soup_nlp.cli.main import main
 from soup_nlp.geometry.camera import pixel_grid, rays
@@ -108,25 +109,21 @@ def test_curtains_are_cut(shown, small_run):
     """Cells within one superpixel are kept; cells across components are removed."""
     labels, found = small_run.segmentation.labels, small_run.components
     # the superpixels of the left half as a component of their own
-    half = (small_run.segmentation.anchors[:, 0] < 128).astype(np.int64)
+    half = (small_run.segmentation.anchors[:, 0] < 128).astype(np.int32)
     members = (found[0], replace(found[0], label=1))
-    part = half[labels].astype(np.int32)
-    two = replace(found, of_superpixel=half, of_pixel=part, members=members)
+    two = replace(found, of_superpixel=half, of_pixel=half[labels], members=members)
     known = np.isfinite(small_run.reconstruction.depth_ref)
     surface = whole_cells(*replace(shown, components=two).surface, known)
 
     def alike(values):
-        first = values[:-1, :-1]
-        others = (values[1:, :-1], values[:-1, 1:], values[1:, 1:])
-        return np.all([first == other for other in others], axis=0)
+        cells = sliding_window_view(values, (2, 2))
+        return (cells == cells[..., :1, :1]).all(axis=(2, 3))
 
-    assert surface.shape == (labels.shape[0] - 1, labels.shape[1] - 1)
-    whole = alike(known) & known[:-1, :-1]
-    assert surface[alike(labels) & whole].all()
-    assert not surface[~whole].any()
-    assert not surface[~alike(part)].any()
+    whole, inside, part = known[:-1, :-1] & alike(known), alike(labels), alike(half[labels])
+    assert surface[inside & whole].all()
+    assert not surface[~whole | ~part].any()
     # and the surface goes on where planes meet
-    assert surface[~alike(labels) & alike(part)].mean() > 0.5
+    assert surface[~inside & part].mean() > 0.5
 
 
 def test_large_images_are_thinned(shown):

@@ -17,19 +17,14 @@ from soup_nlp.start.camera_error import CameraError
 from soup_nlp.start.regions import FIXED, SCENE
 
 
-def blamed(evidence, camera):
-    """Evidence of a flow that shows an error of the camera, or of none."""
-    errors = {camera: CameraError(camera, 0.1, 0.01, 9.0)} if camera else {}
-    return replace(evidence, errors=errors)
-
-
 def seen(run, confidence=None, focal=0.0, camera=None):
     """A run with another confidence of the flow, an unsure focal length, an error of the camera."""
-    flow, sure = run.pair.flow, run.confidence
+    flow = run.pair.flow
     flow = flow if confidence is None else replace(flow, confidence=confidence)
-    evidence = blamed(sure.evidence, camera)
+    errors = {camera: CameraError(camera, 0.1, 0.01, 9.0)} if camera else {}
+    evidence = replace(run.confidence.evidence, errors=errors)
     pair = replace(run.pair, flow=flow, focal_sigma=focal)
-    return replace(run, pair=pair, confidence=replace(sure, evidence=evidence))
+    return replace(run, pair=pair, confidence=replace(run.confidence, evidence=evidence))
 
 
 def unsure(run, sigma=1.2, **start):
@@ -135,9 +130,7 @@ def test_the_exit_code_has_a_reason(changes, code, part, monkeypatch):
 
 
 def test_a_wrong_camera_may_look_like_motion(small_run):
-    sure = small_run.confidence
-    wrong = replace(sure, evidence=blamed(sure.evidence, "lens distortion"))
-    told = findings.found_words(replace(small_run, confidence=wrong))
+    told = findings.found_words(seen(small_run, camera="lens distortion"))
     words = "the flow suggests an error of lens distortion, which may look like such motion"
     assert [line for line in told if line not in findings.found_words(small_run)] == [words]
     moving = [k for k, line in enumerate(told) if "moves by itself" in line]
