@@ -121,8 +121,7 @@ def batch(
     folder = as_path(out, "output folder")
     problems = problems_of(pairs, overrides)
     claim(folder, [*FILES, *stored.places(problems)], overwrite, journal=stored.ROWS)
-    rows: dict[str, Row] = {}
-    heads: dict[str, Row] = {}
+    rows, heads = dict[str, Row](), dict[str, Row]()
     for name, problem in problems.items():
         try:
             heads[name] = stored.head(problem)

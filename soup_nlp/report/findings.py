@@ -32,8 +32,9 @@ ORIGINS = {
     "too fast": "nearer than its contact, at which it would move too far",
 }
 """Words for what gives a component its scale (`components.TIES`)."""
-USABLE = 0.8
-"""Share of usable flow below which the flow counts as a limit."""
+USABLE, MATCHED = 0.8, 0.2
+"""Shares of usable flow below which it counts as a limit, and below which the frames may show two
+scenes, if most depth is drawn."""
 LEAST, SHARE = 0.005, 0.05
 """Shares of the image from which a kind of depth is named, and a limit mentioned."""
 FAST = 0.05
@@ -42,8 +43,6 @@ UNSURE_FOCAL = 0.2
 """Standard deviation of the log focal length above which it is called a guess."""
 SAME_PX = 0.1
 """Median length of the flow, pixels, below which the frames count as the same."""
-MATCHED = 0.2
-"""Share of usable flow below which the frames may show two scenes, if most depth is drawn."""
 LISTED = 5
 """Number of moving components that are listed."""
 STANDING = 0.001
@@ -138,13 +137,12 @@ def flow_words(run: Run) -> list[str]:
     """Usable flow, and how well simpler explanations than depth fit it."""
     sure, main = run.confidence.evidence, np.argmax(np.bincount(run.start.component))
     assert run.pair.flow is not None
-    lines = [f"usable at {run.pair.flow.usable:.0%} of the pixels, noise {sure.noise:.2f} px"]
-    if np.isfinite(sure.turn[main]):
-        lines.append(
-            f"error of the largest component: {sure.turn[main]:.2f} px by a turn alone,"
-            f" {sure.constant[main]:.2f} px at a constant depth, {sure.solution[main]:.2f} px here"
-        )
-    return lines
+    usable = f"usable at {run.pair.flow.usable:.0%} of the pixels, noise {sure.noise:.2f} px"
+    errors = (
+        f"error of the largest component: {sure.turn[main]:.2f} px by a turn alone,"
+        f" {sure.constant[main]:.2f} px at a constant depth, {sure.solution[main]:.2f} px here"
+    )
+    return [usable, errors] if np.isfinite(sure.turn[main]) else [usable]
 
 
 def hints(run: Run) -> list[str]:

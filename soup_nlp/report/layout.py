@@ -139,7 +139,6 @@ truth/points              truth  M,3    sparse truth: u and v in px, z in the un
 """
 LAYOUT = parse_table(TABLE)
 """Rows of `TABLE` by path."""
-
 INDICES = ("segmentation/labels", "segmentation/knn", "energy/edges", "energy/pairs")
 """Arrays of superpixels, 0 to N - 1."""
 SHARED = ("N", "E", "P", "H", "W")
@@ -234,12 +233,8 @@ def require_layout(tree: ReadTree) -> None:
 
 Number = float | None
 """A number in JSON, where null stands for one that is not finite."""
-_OTHERS = {"scale_rule": str, "n_pixels": int}
-Scores: Any = TypedDict(  # type: ignore[misc]
-    "Scores",
-    {f.name: _OTHERS.get(f.name, Number) for f in fields(DepthMetrics)}
-    | {"skill": NotRequired[Number]},
-)
+_ENTRIES = {f.name: Number for f in fields(DepthMetrics)} | {"scale_rule": str, "n_pixels": int}
+Scores: Any = TypedDict("Scores", {**_ENTRIES, "skill": NotRequired[Number]})  # type: ignore[misc]
 """Scores of a depth map, a `DepthMetrics`, and its skill."""
 
 

@@ -156,18 +156,17 @@ def accuracy(metrics: Mapping[str, DepthMetrics]) -> list[str]:
     """
     if not metrics:
         return []
-    first = next(iter(metrics.values()))
+    first, constant = next(iter(metrics.values())), metrics.get("constant")
     cap = "no depth cap" if first.cap is None else f"depth cap {first.cap:g}"
     rule = RULES.get(first.scale_rule, f"one global {first.scale_rule} scale each")
-    frame = "reference" if "constant" in metrics else "next"
-    lines = [f"depth of the {frame} frame, {rule}, {cap}"]
-    worst = metrics["constant"].mre if "constant" in metrics else np.nan
-    order = ["solution", "static", "moving", *SURE, "nlp", "start", "rigid", "constant"]
+    frame, worst = ("next", np.nan) if constant is None else ("reference", constant.mre)
     heads = f"{'MRE':>8}{'median':>9}{'RMSE':>10}{'d<1.25':>9}{'skill':>8}{'coverage':>10}"
-    lines.append(f"{'':<17}{heads}")
-    for name in order if "constant" in metrics else [*order, "solution_next"]:
+    lines = [f"depth of the {frame} frame, {rule}, {cap}", f"{'':<17}{heads}"]
+    order = ["solution", "static", "moving", *SURE, "nlp", "start", "rigid", "constant"]
+    order += ["solution_next"] * (constant is None)
+    for name in order:
         if (m := metrics.get(name)) is not None:
-            gain = np.nan if name == "solution_next" else skill(m.mre, worst)
+            gain = skill(m.mre, worst)
             lines.append(
                 f"{TITLES.get(name, name):<17}{m.mre:>8.4f}{m.median_relative:>9.4f}"
                 f"{m.rmse:>10.4g}{m.delta1:>9.1%}"
