@@ -175,18 +175,15 @@ def strip(panels: Sequence[Picture], title: str, columns: int = 3, panel_width: 
     """(H, W, 3) uint8: titled pictures with their legends in a grid, under a title."""
     columns = min(columns, len(panels))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
-    heights = [
-        max(_height(p, panel_width) + _LEGEND * (p.legend is not None) for p in row) for row in rows
-    ]
-    head = _HEAD if title else _GAP
-    size = columns * (panel_width + _GAP) + _GAP, head + sum(heights)
-    sheet = Pil.new("RGB", (size[0], size[1] + len(rows) * (_CAPTION + _GAP)), "white")
-    _write(sheet, _GAP, head // 2, title, size[0] - 2 * _GAP, points=13)
-    top = head
+    tall = [[_height(p, panel_width) + _LEGEND * (p.legend is not None) for p in r] for r in rows]
+    heights = [_CAPTION + max(row) + _GAP for row in tall]
+    top, width = _HEAD if title else _GAP, columns * (panel_width + _GAP) + _GAP
+    sheet = Pil.new("RGB", (width, top + sum(heights)), "white")
+    _write(sheet, _GAP, top // 2, title, width - 2 * _GAP, points=13)
     for row, height in zip(rows, heights, strict=True):
         for k, panel in enumerate(row):
             _draw_panel(sheet, panel, _GAP + k * (panel_width + _GAP), top, panel_width)
-        top += height + _CAPTION + _GAP
+        top += height
     return np.array(sheet)
 
 
@@ -225,8 +222,7 @@ def _write(
     x: float,
     y: float,
     text: str,
-    room: float = np.inf,
-    *,
+    room: float,
     points: float = 10,
     side: str = "l",
 ) -> None:

@@ -53,10 +53,7 @@ ROWS = "pairs.jsonl"
 
 
 def prepare_folder(
-    folder: str | Path,
-    inputs: Iterable[Path] = (),
-    overwrite: bool = False,
-    subject: str = "",
+    folder: str | Path, inputs: Iterable[Path] = (), overwrite: bool = False, subject: str = ""
 ) -> Path:
     """Check that a result can be written into a folder, before anything is computed.
 
