@@ -155,11 +155,11 @@ def batch(
         while left:
             known = stored.kept_rows(folder, {name: heads[name] for name in left})
             rows |= {k: row for k, row in known.items() if not (retry_failed and failed(row))}
-            todo = [name for name in left if name not in rows]
             home = folder.absolute()
             works = {
                 name: partial(_solve, problems[name], home, heads[name], token, known.get(name))
-                for name in todo
+                for name in left
+                if name not in rows
             }
             tell()
             left = []

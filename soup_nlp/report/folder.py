@@ -217,11 +217,7 @@ def head(problem: Problem) -> Row:
 def kept_rows(folder: Path, heads: Mapping[str, Row]) -> dict[str, Row]:
     """Rows of the pairs that have been solved, or have failed, with the same input and code."""
     last = {row["key"]: row for row in read_rows(folder / ROWS) if fits(row, StoredRow)}
-    same = {
-        name: last[name]
-        for name, own in heads.items()
-        if name in last and own.items() <= last[name].items()
-    }
+    same = {k: last[k] for k, own in heads.items() if own.items() <= last.get(k, {}).items()}
     # a command that was killed may have replaced a result before it wrote the row
     stored = {name: _result(folder / PAIRS / name) for name in same}
     return {k: row for k, row in same.items() if failed(row) or stored[k] == row.get("result", "")}
