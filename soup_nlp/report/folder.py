@@ -84,7 +84,9 @@ def write_folder(
     formats: Sequence[str] = (),
     overwrite: bool = False,
 ) -> list[str]:
-    """Write every file of a run; an earlier result is replaced when the new one is complete.
+    """Write every file of a run and return their names.
+
+    An earlier result is replaced when the new one is complete.
 
     Args:
         folder: Prepared folder.
@@ -94,8 +96,6 @@ def write_folder(
         ipopt_log: Log file of Ipopt.
         formats: Further formats, see `formats.FORMATS`.
         overwrite: Overwrite files that the program did not make.
-
-    Returns names of the files.
     """
     config = dump_problem(run.problem)
     with staged(folder, True, overwrite, run.problem.subject) as new:
@@ -149,15 +149,16 @@ class WritableRun(Run):
     def save(
         self, folder: str | Path, formats: Sequence[str] = (), overwrite: bool = False
     ) -> list[str]:
-        """Write a result folder, as `soup-nlp solve` does.
+        """Write a result folder, as `soup-nlp solve` does; returns the names of its files.
 
         Args:
             folder: A new or empty folder, or that of an earlier result.
             formats: Further files for other programs: "glb", "colmap", "npy", "pfm", "rrd" ...
             overwrite: Overwrite files that the program did not make.
 
-        Returns names of the files. An unknown format is a ConfigError, a folder that cannot be
-        written, or holds what is not to be overwritten, a DataError.
+        Raises:
+            ConfigError: a format is not known.
+            DataError: the folder cannot be written, or holds what is not to be overwritten.
         """
         none = formats is None or (isinstance(formats, list | tuple) and not formats)
         names = [] if none else check_formats(formats)
