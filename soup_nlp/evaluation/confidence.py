@@ -21,6 +21,7 @@ from soup_nlp.geometry.surface import hidden
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
+from soup_nlp.start.epipolar import relief_spread
 from soup_nlp.start.given_depth import Given
 from soup_nlp.start.propose import Start
 from soup_nlp.start.regions import FIXED, SCENE
@@ -151,9 +152,9 @@ def terms(
     * flow: `sqrt(noise max(noise, MISFIT misfit)) spread`. The random error of the flow, pixels,
       times the standard deviation by the marginals. The misfit is that of the answer.
     * scale: standard deviation of the log scale of a component beside the scene, by the marginals.
-    * relief: `noise / gap` times the log ratio of the depth to the median of the component. A small
+    * relief: standard deviation by the motion of a rigid component, see `Start.covariance`. A small
       turn and a small translation move an image almost alike, so that an error that a flow shares
-      stretches or flattens relief (bas-relief), the more the fewer pixels depth explains (`gap`).
+      stretches or flattens relief (bas-relief).
     * outline: step of log depth nearby.
     * mixed: `4 p (1 - p)`, p the share of usable flow of the superpixel, at least a half: two
       surfaces may share it.
@@ -176,19 +177,20 @@ def terms(
     labels, noise, part = rec.labels, start.noise, start.component
     at = labels.ravel()
     usable = np.maximum(np.bincount(at, flow.confidence.ravel()) / np.bincount(at), 0.5)
-    depth = _log(rec.soup.depth_at(anchor_ray))
-    middle = np.asarray(ndimage.median(depth, part, np.arange(int(part.max()) + 1)))
-    gap = np.maximum(np.nan_to_num(sure.gap), noise * FACTORS["relief"])
+    target, relief = rec.soup.moved(rec.soup.points(anchor_ray)), np.zeros(len(part))
+    for c, (motion, covariance) in enumerate(zip(start.motions, start.covariance)):
+        of = start.motion == c
+        relief[of] = relief_spread(motion, covariance, anchor_ray[of], target[of])
     other = part != SCENE
     drawn = start.at_rest | (start.tie == FIXED) | (start.bends & start.unexplained)
     local = np.sqrt(noise * np.maximum(noise, MISFIT * flow_misfit(rec, flow)))
     return {
         "flow": local[labels] * np.minimum(spread, LARGEST),
         "scale": (other * np.minimum(component, LARGEST)[part])[labels],
-        "relief": (noise / gap[part] * np.abs(depth - middle[part]))[labels],
+        "relief": np.nan_to_num(relief, nan=LARGEST)[labels],
         "outline": at_outlines(rec.depth_ref),
         "mixed": (4 * usable * (1 - usable))[labels],
-        "starts": np.broadcast_to(start.scatter, len(depth))[labels],
+        "starts": np.broadcast_to(start.scatter, len(part))[labels],
         "camera": np.minimum(sure.sigma, LARGEST)[labels],
         "bends": start.bends[labels].astype(float),
         "drawn": drawn[labels].astype(float),

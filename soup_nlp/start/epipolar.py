@@ -294,22 +294,24 @@ def most_probable(
     Returns:
         The motion, and the (5, 5) covariance of the parameters of `around` it.
     """
-    root, results = np.sqrt(matches.weight / matches.weight.sum()), []
+    root = np.sqrt(matches.weight / matches.weight.sum())
 
     def residual(motion: Motion) -> Float:
         distance = cauchy(matches.distance(motion), EPIPOLAR_PX)
         depth = cauchy(relief(motion, matches.ray, matches.target, expected), spread)
         return np.concatenate([root * distance / error, root * depth / spread])
 
-    for moved in map(around, motions):
+    def fitted(motion: Motion, evaluations: int) -> tuple[float, Motion, Float]:
+        moved = around(motion)
         end = least_squares(
-            lambda x, moved=moved: residual(moved(x)),
-            np.zeros(5),
-            x_scale=MOTION_CHANGE,
-            max_nfev=EVALUATIONS,
+            lambda x: residual(moved(x)), np.zeros(5), x_scale=MOTION_CHANGE, max_nfev=evaluations
         )
-        results.append((float(end.cost), moved(end.x), np.linalg.pinv(end.jac.T @ end.jac)))
-    return min(results, key=lambda result: result[0])[1:]
+        return float(end.cost), moved(end.x), end.jac
+
+    _, best, _ = min((fitted(m, EVALUATIONS) for m in motions), key=lambda fit: fit[0])
+    # derivatives at the result, in its own coordinates
+    slope = fitted(best, 1)[2]
+    return best, np.asarray(np.linalg.pinv(slope.T @ slope))
 
 
 def relief_spread(motion: Motion, covariance: Float, ray: Float, target: Float) -> Float:
@@ -319,11 +321,13 @@ def relief_spread(motion: Motion, covariance: Float, ray: Float, target: Float) 
         motion: A motion with the (5, 5) covariance of the parameters of `around` it.
         covariance: See there.
         ray: (M, 3) rays.
-        target: (M, 3) rays of the next frame.
+        target: (M, 3) points of the next frame to which they move.
     """
     moved, steps = around(motion), MOTION_STEP * np.eye(5)
+    target = target / target[:, 2:]
     ends = [[relief(moved(x), ray, target) for x in (step, -step)] for step in steps]
     slope = np.array([more - less for more, less in ends]) / (2 * MOTION_STEP)
+    slope -= np.median(slope, axis=1, keepdims=True)
     return np.sqrt(np.einsum("kn,kl,ln->n", slope, covariance, slope))
 
 

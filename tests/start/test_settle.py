@@ -11,7 +11,16 @@ from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
 from soup_nlp.pipeline import case
 from soup_nlp.start.camera_error import camera_error
-from soup_nlp.start.epipolar import MOST_RELIEF, Matches, Motion, cauchy, most_probable, relief
+from soup_nlp.start.epipolar import (
+    MOST_RELIEF,
+    Matches,
+    Motion,
+    around,
+    cauchy,
+    most_probable,
+    relief,
+    relief_spread,
+)
 
 FOCAL = 500.0
 TRUE = Motion(rotation.exp(np.array([0.004, -0.006, 0.002])), np.array([0.6, 0.0, 0.8]))
@@ -48,6 +57,30 @@ def test_depth_survives_little_parallax_and_biased_flow():
     least, _ = most_probable([TRUE], matches, 1e-4)
     found, _ = most_probable([least], matches, 0.15)
     assert relief_error(found, matches, log_z) < 0.7 * relief_error(least, matches, log_z)
+
+
+def test_the_spread_of_relief_is_that_of_depths_under_random_motions():
+    matches, _ = flow(0.3)
+    motion, covariance = most_probable([TRUE], matches, 0.05)
+    spread = relief_spread(motion, covariance, matches.ray, matches.target)
+    changes = np.random.default_rng(0).multivariate_normal(np.zeros(5), covariance, 1000)
+    drawn = np.array([relief(around(motion)(x), matches.ray, matches.target) for x in changes])
+    # the median of a draw is that of one of its points
+    drawn = (drawn - drawn.mean(axis=1, keepdims=True)).std(axis=0)
+    assert np.sqrt(np.mean(drawn**2)) == pytest.approx(np.sqrt(np.mean(spread**2)), rel=0.1)
+    assert np.corrcoef(drawn, spread)[0, 1] > 0.95
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.1])
+def test_the_less_parallax_the_less_sure_is_the_relief_about_as_much_as_it_is_wrong(bias):
+    spreads = []
+    for shift in (0.1, 0.03, 0.01):
+        matches, log_z = flow(shift, bias)
+        motion, covariance = most_probable([TRUE], matches, 0.1)
+        spread = relief_spread(motion, covariance, matches.ray, matches.target)
+        spreads.append(float(np.sqrt(np.mean(spread**2))))
+        assert relief_error(motion, matches, log_z) < 2 * spreads[-1]
+    assert spreads[0] < spreads[1] < spreads[2]
 
 
 def test_points_behind_the_camera_have_the_largest_relief():
