@@ -5,9 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from soup_nlp.arrays import Float, Mask
-from soup_nlp.data.flow.consistency import standing_edges
 from soup_nlp.data.formats.cameras import written
-from soup_nlp.data.formats.images import interlaced
 from soup_nlp.data.working_size import scaled_camera
 from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
@@ -45,8 +43,6 @@ SAME_PX = 0.1
 """Median length of the flow, pixels, below which the frames count as the same."""
 LISTED = 5
 """Number of moving components that are listed."""
-STANDING = 0.001
-"""Share of pixels with edges that stand still over a moving scene from which they are named."""
 WAYS = (("to the right", "to the left"), ("down", "up"), ("ahead", "back"))
 """Directions of the axes of a camera."""
 
@@ -161,9 +157,7 @@ def hints(run: Run) -> list[str]:
     if unmatched(run):
         # what the little flow suggests (no parallax, a wrong camera) is no cause
         return ["two frames of the same scene, closer in time: hardly anything is in both"]
-    if any(map(interlaced, (run.pair.image_ref, run.pair.image_next))):
-        out.append("frames that are not interlaced (ffmpeg -i FILE -vf yadif)")
-    if share(start.tie == FIXED) >= LEAST or standing_edges(run.pair) > STANDING:
+    if share(start.tie == FIXED) >= LEAST:
         out.append(
             "frames without what stands still in the image while the camera moves (a watermark, a"
             " logo, the bonnet of its car)"

@@ -17,12 +17,10 @@ from soup_nlp.data.flow.consistency import (
     confidence_of,
     leaves,
     round_trip_error,
-    standing_edges,
 )
 from soup_nlp.data.flow.dis import dominant_homographies, guided_flow
 from soup_nlp.data.flow.sources import dis_flow, flow_sources, resolve_flow
 from soup_nlp.data.pair import Flow, Pair, Truth
-from soup_nlp.report.findings import STANDING
 
 K = np.array([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
 
@@ -267,22 +265,6 @@ def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
     inside = (slice(20, 40), slice(20, 60))
     np.testing.assert_allclose(flow[inside][..., 0], 0.1 if taken else 0.0, atol=1e-6)
     np.testing.assert_allclose(gap[inside], 0.0 if taken else error, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_a_text_that_stands_still_over_a_moving_scene_is_seen() -> None:
-    wide = np.random.default_rng(2).integers(0, 256, (160, 330, 3), np.uint8)
-    wide = cv2.normalize(cv2.GaussianBlur(wide, (0, 0), 3), None, 0, 255, cv2.NORM_MINMAX)
-
-    def shares(text: str) -> float:
-        frames = [np.ascontiguousarray(wide[:, left : left + 300]) for left in (20, 14)]
-        for frame in frames:
-            cv2.putText(frame, text, (20, 110), cv2.FONT_HERSHEY_SIMPLEX, 3.0, (255,) * 3, 9)
-        pair = Pair(*frames, K, K)
-        return standing_edges(pair.with_flow(resolve_flow(pair, "dis")))
-
-    assert shares("") == 0
-    assert shares("COPY") > 2 * STANDING
 
 
 def test_dis_images_of_different_size() -> None:

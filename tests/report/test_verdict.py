@@ -63,10 +63,6 @@ def test_hints_name_what_would_help(small_run):
     whole = np.ones_like(start.unexplained)
     assert "--depth-prior" in told(unsure(small_run, tenth, unexplained=whole))
     assert "a watermark" in told(unsure(small_run, tie=np.full_like(start.tie, FIXED)))
-    combed = np.random.default_rng(0).integers(0, 40, small_run.pair.image_ref.shape, np.uint8)
-    combed[::2] += 100
-    pair = replace(small_run.pair, image_ref=combed)
-    assert "not interlaced" in told(replace(sure, pair=pair))
     assert "--fov" not in told(seen(unsure(small_run), focal=0.1))
     assert "--fov" in told(seen(unsure(small_run), focal=0.3))
     blind = seen(sure, np.zeros_like(small_run.pair.flow.confidence))

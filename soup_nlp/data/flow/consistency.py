@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.pair import Flow, Pair
@@ -129,40 +128,6 @@ def check_flow(flow: Flow, pair: Pair, *, backward: bool = False) -> None:
             expected="displacements (u right, v down) in pixels, to the other image",
             hint=hint,
         )
-
-
-EDGE, SAME, CHANGED = 10.0, 6.0, 20.0
-"""Grey levels: least gradient of an edge per pixel, largest change of one that stands still, and
-least difference to where the flow around it leads."""
-MOVES_PX, SHRUNK, WINDOWS = 2.0, 8, 8
-"""Least flow around such an edge, or difference to a flow that follows a still layer, pixels; by
-which factor flows are shrunk for their medians, and how many windows the longer side holds."""
-
-
-def standing_edges(pair: Pair) -> float:
-    """Share of pixels with an edge that stands still though the scene around it moves.
-
-    Of 59 pairs 56 have at most 0.0006; a car's own bonnet and the rim of an endoscope are among the
-    others. A large text over a moving scene has 0.001 to 0.006.
-    """
-    assert pair.flow is not None
-    if pair.image_ref.shape != pair.image_next.shape:
-        return 0.0
-    ref, nxt = (
-        cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (0, 0), 1.0).astype(np.float32)
-        for image in (pair.image_ref, pair.image_next)
-    )
-    slope = [cv2.Sobel(ref, cv2.CV_32F, x, 1 - x, ksize=3) / 8 for x in (1, 0)]
-    still = cv2.dilate(np.abs(ref - nxt), np.ones((3, 3))) < SAME
-    height, width = ref.shape
-    size = max(1, width // SHRUNK), max(1, height // SHRUNK)
-    small = cv2.resize(pair.flow.uv.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    side = max(size) // WINDOWS | 1
-    around = cv2.resize(median_filter(small, (side, side, 1)), (width, height))
-    v, u = (x.astype(np.float32) for x in np.mgrid[:height, :width])
-    followed = np.abs(ref - sampled(nxt, u + around[..., 0], v + around[..., 1])) > CHANGED
-    moves = (np.linalg.norm(around, axis=-1) > MOVES_PX) & ~leaves(around, (height, width))
-    return float(((np.hypot(*slope) > EDGE) & still & followed & moves).mean())
 
 
 def _grey(image: Image) -> FloatMap:

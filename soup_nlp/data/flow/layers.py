@@ -16,7 +16,6 @@ from scipy.fft import dctn, idctn
 
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.census import census, census_at
-from soup_nlp.data.flow.consistency import MOVES_PX
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.camera import pixel_grid, rays
 
@@ -27,8 +26,8 @@ WINDOW, STRIDE = 31, 4
 """Side of the window over which costs are averaged, and distance between the examined pixels."""
 TAU = 0.35
 """Truncation of the census cost."""
-STILL_PX = 0.5
-"""Largest displacement of a static pixel, pixels."""
+STILL_PX, MOVES_PX = 0.5, 2.0
+"""Largest displacement of a static pixel, and least difference to it of one that moves, pixels."""
 MIN_GAIN_STATIC, MIN_GAIN = 0.02, -0.01
 """Smallest reduction of the cost by the new flow for a static pixel to count as contradicted, and
 for any pixel to be replaced once enough static pixels are contradicted."""
