@@ -148,9 +148,16 @@ class FilesInput(FramesInput):
             elif isinstance(camera, str):
                 K = read_intrinsics(path(camera))
             cameras.append(K)
-        images, white, cropped = [path(self.ref), path(self.next)], self.white, self.cropped
-        focal = self.fov, self.focal_sigma
-        return make_pair(images, cameras, truth, white, cropped, *focal, distortion=lenses)
+        return make_pair(
+            [path(self.ref), path(self.next)],
+            cameras,
+            truth,
+            self.white,
+            cropped=self.cropped,
+            fov=self.fov,
+            focal_sigma=self.focal_sigma,
+            distortion=lenses,
+        )
 
     def files(self) -> list[str]:
         """See `PairInput`."""
@@ -228,9 +235,12 @@ def pair_hash(pair: Pair) -> str:
     """Hash of images, cameras and, if there is one, the flow."""
     digest = hashlib.sha256()
     arrays: list[NDArray[Any]] = [pair.image_ref, pair.image_next, pair.K_ref, pair.K_next]
-    arrays += [] if pair.flow is None else [pair.flow.uv, pair.flow.confidence]
-    arrays += [] if pair.depth_prior is None else [pair.depth_prior]
-    arrays += [np.array(pair.focal_sigma)] if pair.focal_sigma > 0 else []
+    if pair.flow is not None:
+        arrays += [pair.flow.uv, pair.flow.confidence]
+    if pair.depth_prior is not None:
+        arrays.append(pair.depth_prior)
+    if pair.focal_sigma > 0:
+        arrays.append(np.array(pair.focal_sigma))
     for array in arrays:
         digest.update(f"{array.dtype} {array.shape}\0".encode())
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -32,7 +32,7 @@ FACTORS = {
     "relief": 0.5,
     "outline": 0.45,
     "mixed": 0.1,
-    "bends": 0.22,
+    "bends": 0.18,
     "drawn": 0.55,
     "prior": 1.2,
 }

@@ -97,6 +97,7 @@ def make_pair(
     cameras: Sequence[Float | None],
     truth: Truth,
     white: int | None = None,
+    *,
     cropped: bool = False,
     fov: float | None = None,
     focal_sigma: float = 0.0,
@@ -177,7 +178,7 @@ class FolderInput(FramesInput):
             unit=self.unit,
         )
         cameras = [K, K if K_next is None else K_next]
-        return make_pair(images, cameras, truth, self.white, self.cropped)
+        return make_pair(images, cameras, truth, self.white, cropped=self.cropped)
 
 
 def _refuse_result(folder: Folder) -> None:
@@ -249,5 +250,10 @@ class MotorcycleInput(PairInput):
             components=np.where(valid, 0, -1).astype(np.int32),
             scene_flow=np.where(valid[:, :, None], [-baseline, 0.0, 0.0], np.nan),
         )
-        K_ref, K_next = (intrinsics(focal, focal, x, cy) for x in (cx, cx + doffs))
-        return Pair(left, right, K_ref, K_next, truth=truth)
+        return Pair(
+            image_ref=left,
+            image_next=right,
+            K_ref=intrinsics(focal, focal, cx, cy),
+            K_next=intrinsics(focal, focal, cx + doffs, cy),
+            truth=truth,
+        )
