@@ -7,7 +7,6 @@ displacements are small. The new flow is used where its round trip closes better
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -146,8 +145,14 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
     if min(float(ref.std()), float(nxt.std())) < _FLAT:
         zero = np.zeros((height, width), np.float32)
         return Flow(np.zeros((height, width, 2), np.float32), zero, "dis")
-    # one for each direction: both are computed at the same time
-    searches = _search(), _search()
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(FINEST_SCALE)
+    dis.setPatchSize(PATCH_SIZE)
+    dis.setPatchStride(PATCH_STRIDE)
+    dis.setVariationalRefinementIterations(ITERATIONS)
+    dis.setVariationalRefinementAlpha(ALPHA)
+    dis.setVariationalRefinementDelta(DELTA)
+    dis.setVariationalRefinementGamma(GAMMA)
 
     def match(first: Image, second: Image) -> tuple[FloatMap, FloatMap]:
         size = np.maximum(np.maximum(first.shape, second.shape), _WORK_SIDE)
@@ -157,24 +162,8 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
             for image in (first, second)
         )
         (h1, w1), (h2, w2) = first.shape, second.shape
-        there, back = pool.map(
-            lambda dis, *images: dis.calc(*images, None), searches, (a, b), (b, a)
-        )
-        return there[:h1, :w1], back[:h2, :w2]
+        return dis.calc(a, b, None)[:h1, :w1], dis.calc(b, a, None)[:h2, :w2]
 
-    with ThreadPoolExecutor(2) as pool:
-        uv, gap = guided_flow(ref, nxt, match, *match(ref, nxt))
+    uv, gap = guided_flow(ref, nxt, match, *match(ref, nxt))
     confidence = confidence_of(gap) if consistency else np.isfinite(gap)
     return Flow(np.ascontiguousarray(uv), confidence.astype(np.float32), "dis")
-
-
-def _search() -> cv2.DISOpticalFlow:
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    dis.setFinestScale(FINEST_SCALE)
-    dis.setPatchSize(PATCH_SIZE)
-    dis.setPatchStride(PATCH_STRIDE)
-    dis.setVariationalRefinementIterations(ITERATIONS)
-    dis.setVariationalRefinementAlpha(ALPHA)
-    dis.setVariationalRefinementDelta(DELTA)
-    dis.setVariationalRefinementGamma(GAMMA)
-    return dis
