@@ -1,6 +1,7 @@
 """Output folders are written whole or not at all, and what is the user's stays."""
 
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -267,6 +269,20 @@ def test_a_file_that_cannot_be_written_ends_in_an_error(late, tmp_path, monkeypa
     monkeypatch.setattr(*((os, "fsync") if late else (Path, "write_bytes")), full)
     with pytest.raises(DataError, match=words), staged(target, True) as new:
         write_h5(new / "r.h5", {"x": 1.0}, {})
+    assert content(target) == {"a": "1"}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_limit_of_the_size_of_files_ends_in_an_error(tmp_path):
+    target, (soft, hard) = tmp_path / "out", resource.getrlimit(resource.RLIMIT_FSIZE)
+    write(target, a="1")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, hard))
+    try:
+        where = rf"cannot be written\n  where: {target / 'r.h5'}\n"
+        with pytest.raises(DataError, match=where), staged(target, True) as new:
+            write_h5(new / "r.h5", {"x": np.random.default_rng(0).random(20_000)}, {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert content(target) == {"a": "1"}
     assert os.listdir(tmp_path) == ["out"]
 
