@@ -178,9 +178,10 @@ def terms(
     at = labels.ravel()
     usable = np.maximum(np.bincount(at, flow.confidence.ravel()) / np.bincount(at), 0.5)
     target, relief = rec.soup.moved(rec.soup.points(anchor_ray)), np.zeros(len(part))
-    for c, (motion, covariance) in enumerate(zip(start.motions, start.covariance)):
+    for c in np.unique(start.motion[start.motion >= 0]):
         of = start.motion == c
-        relief[of] = relief_spread(motion, covariance, anchor_ray[of], target[of])
+        motion = start.motions[c], start.covariance[c]
+        relief[of] = relief_spread(*motion, anchor_ray[of], target[of])
     other = part != SCENE
     drawn = start.at_rest | (start.tie == FIXED) | (start.bends & start.unexplained)
     local = np.sqrt(noise * np.maximum(noise, MISFIT * flow_misfit(rec, flow)))

@@ -315,12 +315,12 @@ def most_probable(
 
 
 def relief_spread(motion: Motion, covariance: Float, ray: Float, target: Float) -> Float:
-    """(M,) standard deviation of log depth, its median left out, by the error of a motion.
+    """(M,) standard deviation of log depth by the error of a motion, a common scale left out.
 
     Args:
-        motion: A motion with the (5, 5) covariance of the parameters of `around` it.
-        covariance: See there.
-        ray: (M, 3) rays.
+        motion: The motion.
+        covariance: (5, 5) covariance of the parameters of `around` it.
+        ray: (M, 3) rays of the reference frame.
         target: (M, 3) points of the next frame to which they move.
     """
     moved, steps = around(motion), MOTION_STEP * np.eye(5)

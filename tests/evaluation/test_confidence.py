@@ -293,6 +293,8 @@ def test_relief_is_as_unsure_as_the_motion_of_its_superpixel(small_room, sure):
     relief = sure_of(replace(small_room, start=own)).terms["relief"]
     assert (relief[odd[labels]] == 0).all()
     assert (relief[~odd[labels]] > 0).any()
+    none = replace(start, motion=np.full_like(start.motion, -1))
+    assert not sure_of(replace(small_room, start=none)).terms["relief"].any()
 
 
 @pytest.mark.slow

@@ -72,7 +72,7 @@ def test_the_spread_of_relief_is_that_of_depths_under_random_motions():
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.1])
-def test_the_less_parallax_the_less_sure_is_the_relief_about_as_much_as_it_is_wrong(bias):
+def test_relief_is_less_sure_with_less_parallax_and_not_more_wrong_than_told(bias):
     spreads = []
     for shift in (0.1, 0.03, 0.01):
         matches, log_z = flow(shift, bias)
