@@ -16,9 +16,10 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem, load_problem
 from soup_nlp.errors import ExportError
 from soup_nlp.export import foreign
-from soup_nlp.export.foreign import import_sol
+from soup_nlp.export.foreign import import_sol, sol_table
 from soup_nlp.export.program import file_orders
 from soup_nlp.export.verify import Limits, examine, violations
+from soup_nlp.geometry.constraints import kind, table
 from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
@@ -328,3 +329,28 @@ def test_an_answer_in_tangent_coordinates_becomes_a_result(tangent, tmp_path, ca
     bad[::9] *= 1.5
     write_sol(path, bad, None, *order, "elsewhere", 0)
     assert main(["check", str(path), "--export", str(tangent)]) == 1
+
+
+@pytest.mark.slow
+def test_the_worst_superpixel_is_named(exported):
+    _, nlp, layout, (v, r), _ = problem_of(exported)
+    x = nlp.x0.copy()
+    x[layout.of(np.array([7]))[0, 5]] += 1e-2
+    write_sol(exported / "seven.sol", x, None, v, r)
+    imported = import_sol(exported, exported / "seven.sol")
+    rows = sol_table(imported)
+    so3 = next(row for row in rows if row.name == "so3")
+    assert so3.worst[0][0] == 7
+    assert so3.beyond == 1
+    assert not so3.ok
+    assert "7 (" in table(rows)
+    assert kind("normal", np.array([0.0, np.nan]), 1e-6).largest == np.inf
+
+
+@pytest.mark.slow
+def test_no_multipliers_where_the_start_is_not_stationary(exported):
+    manifest = json.loads((exported / "manifest.json").read_text())
+    assert manifest["start"] == "proposal"
+    assert not manifest["initial_duals"]
+    lines = (exported / "soup.nl").read_text().splitlines()
+    assert not any(line[0] in "dS" for line in lines)

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,17 @@ import pytest
 from helpers_model import GAUGES, PAPER, TRUNCATED, tiny, wiggle
 from helpers_nl import ReadBack, close, defined_variables
 
+from soup_nlp.config.problem import make_problem
+from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ExportError
 from soup_nlp.export.nl import NLFile, write_nl
 from soup_nlp.export.sol import read_sol
+from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
 
 FORMS = [*(Formulation(gauge=gauge) for gauge in GAUGES), Formulation(coordinates="tangent")]
 
@@ -246,3 +252,41 @@ def test_scip_reads_it(written):
     at = file.variables.tolist().index(0)
     name = file.path.with_suffix(".col").read_text().split()[at]
     assert named[name].getLbOriginal() == pytest.approx(nlp.lbx[0])
+
+
+@pytest.fixture(scope="module")
+def swinging(tmp_path_factory) -> Case:
+    """A box that swings before a room: occlusion shows its order, and its true depth is given."""
+    folder = tmp_path_factory.mktemp("swing")
+    scene = {"kind": "scene", "scene": "swing", "width": 160, "height": 120}
+    np.save(folder / "depth.npy", render_scene("swing", 0, 160, 120).truth.depth_ref)
+    raw = {
+        "input": scene,
+        "flow": {"source": "truth"},
+        "segmentation": {"superpixels": 32, "neighbours": 2, "boundary_samples": 1},
+        "energy": {"pixel_samples": 1},
+        "depth_prior": {"source": str(folder / "depth.npy")},
+    }
+    return prepare(make_problem(raw))
+
+
+@pytest.mark.slow
+def test_two_readers_agree_on_a_depth_prior_and_an_order(swinging, tmp_path):
+    data, eps = swinging.data, 2e-5
+    form = swinging.formulation(hessian="exact", eps=eps, eps_pixel=eps)
+    nlp, _ = swinging.nlp(form)
+    file = write_nl(tmp_path / "soup.nl", nlp)
+    back = ReadBack(file.path)
+    x = wiggle(nlp, 0, 0.02)
+    agrees(nlp, file, back, x, 0)
+    pounce_agrees(nlp, file, x)
+    # at the start the file has both terms, up to their smoothing
+    exact = oracle.energy(swinging.soup, data, swinging.weights)
+    f = float(back.values(nlp.x0[file.variables])[0])
+    for term in ("depth", "order"):
+        weight = getattr(data, f"{term}_weight")
+        less = replace(data, **{f"{term}_weight": np.zeros_like(weight)})
+        other = build_matrix_nlp(swinging.soup, less, swinging.weights, form)[0]
+        within = eps * getattr(swinging.weights, term) * np.abs(weight).sum()
+        assert exact[term] - within <= f - other.value(other.x0) <= exact[term] + 1e-9
+        assert exact[term] > 2 * within

@@ -1,9 +1,11 @@
-"""Plain CasADi SX NLPs as .nl files: textbook programs read back, errors."""
+"""Plain CasADi SX NLPs as .nl files: textbook and random programs read back, errors."""
 
 import casadi as ca
 import numpy as np
 import pytest
 from helpers_nl import ReadBack, close, write_sx_nl
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from soup_nlp.errors import DataError, ExportError
 from soup_nlp.export.nl import NLFile
@@ -142,3 +144,66 @@ def test_expressions_that_cannot_be_written_are_refused(tmp_path):
     with pytest.raises(DataError, match="cannot be written"):
         write_sx_nl(tmp_path / "none" / "a.nl", {"x": x, "f": x**2})
     assert not list(tmp_path.rglob("*.nl"))
+
+
+BINARY = (
+    lambda a, b: a + b,
+    lambda a, b: a - b,
+    lambda a, b: a * b,
+    lambda a, b: a / (b**2 + 1),
+    lambda a, b: (a**2 + 1) ** (b / 8),
+)
+
+
+UNARY = (
+    lambda a: -a,
+    lambda a: a**2,
+    lambda a: ca.sqrt(a**2 + 1),
+    lambda a: ca.exp(a / 8),
+    lambda a: ca.log(a**2 + 2),
+    lambda a: 2 * a,
+    lambda a: 1 / (a**2 + 3),
+    ca.sin,
+    ca.cos,
+    ca.atan,
+    ca.tanh,
+    ca.fabs,
+)
+
+
+@st.composite
+def programs(draw):
+    """Random expressions of variables and numbers, which may be used repeatedly."""
+    n, m = draw(st.integers(1, 4)), draw(st.integers(0, 3))
+    x = ca.SX.sym("x", n)
+    pool = [x[k] for k in range(n)]
+    number = st.floats(-3, 3, allow_subnormal=False)
+    for _ in range(draw(st.integers(1, 12))):
+        a = pool[draw(st.integers(0, len(pool) - 1))]
+        if draw(st.booleans()):
+            b = pool[draw(st.integers(0, len(pool) - 1))]
+            pool.append(draw(st.sampled_from(BINARY))(a, b))
+        elif draw(st.booleans()):
+            pool.append(draw(st.sampled_from(UNARY))(a))
+        else:
+            pool.append(a * draw(number) + draw(number))
+    outputs = []
+    for _ in range(m + 1):
+        term = pool[draw(st.integers(0, len(pool) - 1))]
+        outputs.append(term + draw(number) * x[draw(st.integers(0, n - 1))])
+    at = np.array([draw(st.floats(-2, 2, allow_subnormal=False)) for _ in range(n)])
+    return {"x": x, "f": outputs[0], "g": ca.vertcat(*outputs[1:])}, at
+
+
+@pytest.mark.slow
+@settings(max_examples=80)
+@given(program=programs())
+def test_random_programs_read_back(program, tmp_path_factory):
+    problem, at = program
+    if not problem["g"].numel():
+        del problem["g"]
+    values = ca.Function("v", [problem["x"]], [problem["f"], problem.get("g", ca.SX(0, 1))])
+    if any(not np.abs(np.array(v)).max(initial=0.0) < 1e6 for v in values(at)):
+        return
+    file = write_sx_nl(tmp_path_factory.getbasetemp() / "random.nl", problem)
+    same_as_sx(problem, file, at)

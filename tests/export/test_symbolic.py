@@ -10,6 +10,7 @@ import pytest
 
 import soup_nlp
 from soup_nlp.errors import ModelError
+from soup_nlp.geometry.constraints import constraints
 from soup_nlp.model import oracle
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.stages import solve_soup
@@ -87,3 +88,16 @@ def test_the_symbols_are_the_program():
     np.testing.assert_allclose(np.asarray(g).ravel(), rows, atol=1e-12)
     with pytest.raises(ModelError, match="unknown parameter"):
         nlp.parameters(width=0.1)
+
+
+@pytest.mark.slow
+def test_casadi_derives_the_constrained_nlp_by_itself():
+    nlp = soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL, presolve=True)
+    careful = {"ipopt.mu_init": 1e-6, "ipopt.bound_push": 1e-8, "ipopt.nlp_scaling_method": "none"}
+    solver = ca.nlpsol("s", "ipopt", nlp.problem, {**QUIET, **careful})
+    answer = solver(**nlp.start)
+    assert solver.stats()["success"]
+    found = constraints(nlp.soup(answer["x"]), nlp.case.data.rim_ray, 1e-3).largest
+    assert max(found.values()) < 1e-6
+    first = nlp.record.value(nlp.record.x0)
+    assert float(answer["f"]) == pytest.approx(first, rel=1e-4)

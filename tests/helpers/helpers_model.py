@@ -139,6 +139,10 @@ class Tiny:
 # --- values and finite differences of an NLP ---------------------------------------------------
 
 
+def lagrangian_gradient(nlp: NLP, x: Float, lam_f: float, lam_g: Float) -> Float:
+    return lam_f * nlp.gradient(x) + nlp.jacobian(x).T @ lam_g
+
+
 def directional(fun: Callable[[Float], Float], x: Float, v: Float, h: float = 1e-4) -> Float:
     """Derivative of fun along v by Richardson-extrapolated central differences, O(h^4)."""
 

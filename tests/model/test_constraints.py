@@ -22,12 +22,15 @@ import numpy as np
 import pytest
 from helpers_model import GAUGES, PAPER, UNITS, disturbed, form, tiny, weights_for, wiggle, world
 
+from soup_nlp.config.problem import load_problem
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp
+from soup_nlp.pipeline.case import prepare
 from soup_nlp.solve.ipopt import Ipopt
+from soup_nlp.solve.stages import solve_soup
 
 ENTRIES = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)]
 """Of R'R, in the order of the rows."""
@@ -259,3 +262,53 @@ def test_ipopt_gets_every_kind_of_bound(side):
     assert stage.converged, stage
     assert found == pytest.approx(bound[k], abs=1e-3)
     assert sign * (found - bound[k]) >= -RAW
+
+
+def unseen(nlp: NLP, x: np.ndarray) -> np.ndarray:
+    """(N,) whether any visibility row of a superpixel is violated."""
+    visible = rows(nlp, "visible")
+    return (nlp.constraints(x) < nlp.lbg)[visible].reshape(12, -1).any(axis=1)
+
+
+@pytest.mark.parametrize("ratio", [2.0, 5.0])
+def test_visibility_bounds_the_depth_over_a_superpixel(ratio):
+    """A plane that the constrained NLP or the presolve admits is nowhere too steep."""
+    problem, rng = tiny(), np.random.default_rng(0)
+    f = form(depth_ratio=ratio)
+    nlp, layout = problem.nlp(PAPER, f)
+    pre, tangent = build_tangent_nlp(problem.soup, problem.data, PAPER, f)
+    rim = problem.data.rim_ray
+    admitted = 0
+    for _ in range(60):
+        n = rng.normal(0, 1, (12, 3)) * [4, 4, 1]
+        n /= -np.sign(n[:, 2:]) * np.linalg.norm(n, axis=1, keepdims=True)
+        soup = replace(problem.soup, n=n)
+        facing = -np.einsum("nc,nvc->nv", n, rim)
+        steep = (facing[:, 1:] <= facing[:, :1] / ratio).any(axis=1) | (facing <= 0).any(axis=1)
+        bad = unseen(nlp, layout.pack(soup))
+        assert (bad[facing[:, 0] > 0] >= steep[facing[:, 0] > 0]).all()
+        assert bad[facing[:, 0] <= 0].all()
+        admitted += int((~bad).sum())
+        # the presolve admits no more than the constrained NLP
+        sees = (facing > 0).all(axis=1)
+        other = unseen(pre, tangent.pack(replace(soup, n=np.where(sees[:, None], n, [0, 0, -1.0]))))
+        assert (other[sees] >= bad[sees]).all()
+    assert admitted > 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "gauge"),
+    [("room", "unit-offset"), ("street", "unit-translation")],
+)
+def test_the_raw_answer_of_a_default_solve_keeps_every_constraint(scene, gauge):
+    small = ["input.width=96", "input.height=72", "segmentation.superpixels=20"]
+    own = [f"formulation.gauge={gauge}", "flow.source=truth"]
+    case = prepare(load_problem(scene, [*small, *own]))
+    f = case.formulation()
+    solution = solve_soup(case.soup, case.data, case.weights, f, case.options)
+    assert solution.converged, solution.status
+    nlp, _ = case.nlp(f)
+    found = violations(nlp, solution.stages[-1].x, case.data, f)
+    assert max(found.values()) <= RAW, found
+    assert solution.residuals["nlp_infeasibility"] <= RAW

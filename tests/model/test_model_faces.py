@@ -1,12 +1,26 @@
-"""Faces of one NLP agree: plain numpy and kernels in tables; kinds of its Hessian."""
+"""Three faces of one NLP agree: plain numpy, kernels in tables, finite differences."""
+
+import itertools
 
 import numpy as np
 import pytest
-from helpers_model import GAUGES, K_NEXT, UNITS, exact_terms, random_soup, tiny, weights_for, wiggle
+from helpers_model import (
+    GAUGES,
+    K_NEXT,
+    UNITS,
+    directional,
+    exact_terms,
+    lagrangian_gradient,
+    random_soup,
+    tiny,
+    weights_for,
+    wiggle,
+)
 
 from soup_nlp.model import oracle
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
+from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_tangent_nlp
 
 EXACT = {
@@ -14,17 +28,24 @@ EXACT = {
     **dict.fromkeys(("proj", "cont", "orient", "prior", "depth", "order"), 1e-12),
 }
 """Relative. Symbolic distances of anchors are sqrt(|v|^2 + 1e-12): 2e-12 of E_arap."""
+DATA = list(itertools.product(UNITS, (False, True)))
+EVERY = [
+    (coordinates, *data)
+    for k, coordinates in enumerate((*GAUGES, "tangent"))
+    for data in (DATA[k % 2], DATA[3 - k % 2])
+]
+"""All coordinates, each with both units and both ways to compare motions."""
 
 
 def form(units: str = "paper", **options) -> Formulation:
-    """Wide smoothing."""
+    """Smoothing wide enough that finite differences see a smooth function."""
     wide = {"paper": (0.1 * K_NEXT[0, 0], 0.5), "pixels": (3.0, 0.5)}[units]
     return Formulation(**{"eps": wide[0], "eps_pixel": wide[1], "hessian": "exact", **options})
 
 
-def program(coordinates, units, **options):
+def program(coordinates, units, at_anchors, truncated=True, **options):
     """The NLP and its layout in matrices of a gauge, or in tangent coordinates."""
-    problem, weights = tiny(units, units == "pixels"), weights_for(units)
+    problem, weights = tiny(units, at_anchors), weights_for(units, truncated)
     if coordinates == "tangent":
         own = form(units, **options)
         return build_tangent_nlp(problem.soup, problem.data, weights, own)
@@ -71,14 +92,42 @@ def test_terms_in_tangent_coordinates_equal_plain_numpy(units, chart):
 # --- finite differences --------------------------------------------------------------------------
 
 
+def assert_derivatives(nlp: NLP, x: np.ndarray, seed: int) -> None:
+    """Gradient, Jacobian and Lagrangian Hessian along a random dense direction."""
+    rng = np.random.default_rng(seed)
+    lam_f, lam_g = rng.uniform(0.5, 2.0), rng.normal(size=nlp.ng)
+    grad, jac, H = nlp.gradient(x), nlp.jacobian(x), nlp.hessian(x, lam_g, lam_f)
+    v = rng.uniform(-1, 1, nlp.nx)
+    scale = np.abs(grad) @ np.abs(v)
+    found = directional(nlp.value, x, v)
+    assert found == pytest.approx(grad @ v, abs=1e-8 * (1 + scale))
+    found = directional(nlp.constraints, x, v)
+    np.testing.assert_allclose(found, jac @ v, atol=1e-8)
+    found = directional(lambda y: lagrangian_gradient(nlp, y, lam_f, lam_g), x, v)
+    scale = 1 + np.abs(H) @ np.abs(v)
+    np.testing.assert_allclose(found / scale, H @ v / scale, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("coordinates", "units", "at_anchors", "truncated"),
+    # with truncations and without in turn, which changes with the coordinates
+    [(*kind, (k + k // 2) % 2 == 0) for k, kind in enumerate(EVERY)],
+)
+def test_derivatives_equal_finite_differences(coordinates, units, at_anchors, truncated):
+    nlp, _ = program(coordinates, units, at_anchors, truncated)
+    assert_derivatives(nlp, wiggle(nlp, 3, 0.05), 4)
+
+
 # --- kinds of Hessian ----------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("units", UNITS)
-@pytest.mark.parametrize("coordinates", [*GAUGES, "tangent"])
-def test_gauss_newton_is_positive_semidefinite_whatever_the_multipliers(coordinates, units):
-    nlp, _ = program(coordinates, units, hessian="gauss-newton")
+@pytest.mark.parametrize(("coordinates", "units", "at_anchors"), EVERY)
+def test_gauss_newton_is_positive_semidefinite_whatever_the_multipliers(
+    coordinates, units, at_anchors
+):
+    nlp, _ = program(coordinates, units, at_anchors, hessian="gauss-newton")
     x = wiggle(nlp, 0, 0.05)
     lam_g = np.random.default_rng(0).normal(size=nlp.ng)
     H = nlp.hessian(x, lam_g).toarray()
@@ -95,7 +144,7 @@ def test_gauss_newton_is_positive_semidefinite_whatever_the_multipliers(coordina
 def test_kinds_of_hessian_share_the_curvature_of_the_constraints(gauge):
     H = {}
     for kind in HESSIANS:
-        nlp, _ = program(gauge, "paper", hessian=kind)
+        nlp, _ = program(gauge, "paper", False, hessian=kind)
         x = wiggle(nlp, 1, 0.03)
         lam_g = np.random.default_rng(2).normal(size=nlp.ng)
         H[kind] = nlp.hessian(x, lam_g), nlp.hessian(x, 0 * lam_g)
@@ -106,11 +155,12 @@ def test_kinds_of_hessian_share_the_curvature_of_the_constraints(gauge):
     assert np.abs(curvature).max() > 1
 
 
-def test_the_ridge_is_its_factor_times_a_natural_step():
+@pytest.mark.parametrize("gauge", GAUGES[:1])
+def test_the_ridge_is_its_factor_times_a_natural_step(gauge):
     """Relative 1 in scale and offset, one radian in R, one anchor depth in the translation."""
     found = {}
     for ridge in (0.0, 0.5):
-        nlp, layout = program(GAUGES[0], "pixels", hessian="gauss-newton", ridge=ridge)
+        nlp, layout = program(gauge, "pixels", False, hessian="gauss-newton", ridge=ridge)
         x = wiggle(nlp, 1, 0.01)
         found[ridge] = nlp.hessian(x, np.zeros(nlp.ng)).diagonal()
     count, stride = layout.count, layout.stride
@@ -123,9 +173,11 @@ def test_the_ridge_is_its_factor_times_a_natural_step():
 
 
 def test_theta_is_the_share_of_curvature_left_out():
-    nlp, _ = program("tangent", "pixels", hessian="gauss-newton")
-    thetas = [nlp.thetas(ridge=0.0, theta=theta) for theta in (0.0, 0.45, 0.9)]
-    found = [nlp.hessian(nlp.x0, np.zeros(nlp.ng), theta=theta).toarray() for theta in thetas]
+    found = []
+    for theta in (0.0, 0.45, 0.9):
+        own = {"hessian": "gauss-newton", "ridge": 0.0, "theta": theta}
+        nlp, _ = program("tangent", "pixels", False, truncated=False, **own)
+        found.append(nlp.hessian(nlp.x0, np.zeros(nlp.ng)).toarray())
     whole, half, less = found
     scale = np.abs(whole).max()
     assert np.abs(whole - less).max() > 1e-3 * scale

@@ -229,3 +229,13 @@ def test_interruption_in_the_first_pass(monkeypatch):
     assert (result.status, result.iterations) == ("interrupted", 0)
     assert result.lower_bound == -np.inf
     assert result.labels.tolist() == unary.argmin(1).tolist()
+
+
+def test_binary_bound_reaches_the_relaxation_of_a_frustrated_cycle():
+    edges = np.array([[0, 1], [1, 2], [0, 2]])
+    table = np.eye(2)[None].repeat(3, axis=0)  # equal neighbours cost 1: one pair must be equal
+    result = followed(np.zeros((3, 2)), edges, table, max_iter=50)
+    # all labels with half a weight each: the linear program costs nothing
+    assert result.lower_bound == pytest.approx(0.0)
+    assert result.energy == pytest.approx(1.0)
+    assert result.status == "stagnation"

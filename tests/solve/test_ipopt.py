@@ -248,3 +248,49 @@ def test_an_event_stops_and_keeps_the_best_iterate():
     assert len(seen) == 4
     assert stage.objective == min(seen)
     assert nlp.value(stage.x) == pytest.approx(stage.objective)
+
+
+def test_the_time_limit_stops_and_keeps_the_best_iterate():
+    nlp = rosenbrock(10)
+    stage = solve(nlp, seconds=0.0)
+    assert stage.status == "Time_Limit"
+    assert not stage.converged
+    assert np.isfinite(stage.x).all()
+    assert stage.iterations <= 1
+
+
+def test_a_listener_that_fails_ends_the_solve_with_its_message():
+    def listen(p: Progress) -> None:
+        raise ValueError("no more paper")
+
+    stage = solve(rosenbrock(10), watch=Watch(listen))
+    assert "no more paper" in stage.status
+    assert not stage.converged
+    assert np.isfinite(stage.x).all()
+
+
+def test_kkt_residuals_are_small_at_the_optimum_only():
+    nlp = hs071()
+    stage = solve(nlp)
+    best = optimality(nlp, stage.x, stage.lam_x, stage.lam_g)
+    assert best["dual_infeasibility"] <= 1e-6
+    assert best["complementarity"] <= 1e-4  # mu_init is small but not zero
+
+    def residual(x=stage.x, lam_x=stage.lam_x, lam_g=stage.lam_g) -> float:
+        return max(optimality(nlp, x, lam_x, lam_g).values())
+
+    assert residual(x=nlp.x0) > 1
+    assert residual(lam_g=0 * stage.lam_g) > 0.1
+    assert residual(lam_g=-stage.lam_g) > 0.1
+    assert residual(lam_x=0 * stage.lam_x) > 0.1
+    # a multiplier on an open bound is not complementary
+    assert residual(lam_x=stage.lam_x - [0, 0.5, 0, 0]) > 0.1
+
+
+def test_a_bound_beyond_the_optimum_is_active():
+    nlp = rosenbrock(2, ubx=0.5)
+    stage = solve(nlp)
+    # on x1 = 0.5 the best x2 is 0.25
+    np.testing.assert_allclose(stage.x, [0.5, 0.25], atol=1e-4)
+    assert stage.lam_x[0] == pytest.approx(1.0, rel=1e-3)
+    assert (stage.x <= 0.5 + 1e-8).all()
