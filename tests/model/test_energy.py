@@ -319,3 +319,18 @@ def test_one_superpixel_is_a_valid_problem():
         assert e["arap"] == e["cont"] == e["orient"] == 0
         assert nlp.value(nlp.x0) == pytest.approx(e["total"], rel=0.1)
         assert nlp.constraints(nlp.x0)[: 6 + 1] == pytest.approx(0, abs=1e-12)
+
+
+def test_local_units_make_every_edge_blind_to_its_own_scale():
+    """Both superpixels of an edge twice as far: its energy stays, while others' does not."""
+    problem, weights = tiny("pixels", True), weights_for("pixels", truncated=False)
+    i, k = problem.seg.edges[0]
+    lam = problem.soup.lam.copy()
+    lam[[i, k]] *= 2
+    twice = replace(problem.soup, lam=lam)
+    a = oracle.values("arap", problem.soup, problem.data, weights)
+    b = oracle.values("arap", twice, problem.data, weights)
+    assert b[0] == pytest.approx(a[0], rel=1e-12)
+    touched = np.isin(problem.seg.edges, [i, k]).any(axis=1)
+    np.testing.assert_allclose(b[~touched], a[~touched], rtol=1e-12)
+    assert (b[touched][1:] != a[touched][1:]).all()
