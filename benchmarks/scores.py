@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from benchmarks.suites import SUITES
 from benchmarks.table import Cell
@@ -11,13 +12,7 @@ from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
 from soup_nlp.evaluation.confidence import LARGEST, MOST_SIGMA
 from soup_nlp.evaluation.metrics import MEDIAN, UNSCALED, depth_metrics, skill
-from soup_nlp.evaluation.scoring import (
-    at_truth,
-    coverage,
-    fill_nearest,
-    score_depths,
-    sparsification,
-)
+from soup_nlp.evaluation.scoring import at_truth, score_depths
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.storage.each import Row
 
@@ -34,6 +29,8 @@ SURE = 0.10
 """Sigma below which a depth claims to be sure."""
 RIGHT, WRONG = 0.10, 0.20
 """Relative errors up to which a depth is right, and above which it is wrong."""
+STEPS, LAST = 50, 0.02
+"""Points of a sparsification curve, and share of the pixels kept at the last one."""
 PIXELS = 500
 """Pixels with truth of a pair, drawn at random, to which sigma is fitted."""
 
@@ -120,6 +117,32 @@ def has_depth(truth: Truth | None) -> bool:
     return truth.points is not None and MEDIAN.counts(truth.points[:, 2])
 
 
+def sparsification(error: Float, uncertainty: Float) -> tuple[Float, float]:
+    """Mean errors of the pixels that are kept when the most uncertain ones are removed.
+
+    Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", ECCV 2018.
+    Pixels of equal uncertainty count with their mean error, because their order is arbitrary.
+
+    Args:
+        error: (M,) errors, not negative; M at least 1.
+        uncertainty: (M,) larger where the error is expected to be larger.
+
+    Returns:
+        (3, STEPS) shares of the pixels from 1 down, mean error of that share with the least
+        uncertainty, and of that with the least error; and the area between both over the mean
+        error: 0 is perfect, about 1 is chance.
+    """
+    kept = np.linspace(1.0, LAST, STEPS)
+    last = np.maximum((kept * len(error)).astype(int) - 1, 0)
+    _, group = np.unique(uncertainty, return_inverse=True)
+    tie_mean = np.bincount(group, error) / np.bincount(group)
+    sums = np.cumsum(tie_mean[np.sort(group)]), np.cumsum(np.sort(error))
+    mean_error, best = (total[last] / (last + 1) for total in sums)
+    whole = float(error.mean())
+    ause = float((mean_error - best).mean() / whole) if whole > 0 else 0.0
+    return np.stack([kept, mean_error, best]), ause
+
+
 def sigma_scores(error: Float, sigma: Float) -> Row:
     """How well sigma (M,) tells the errors of log depth (M,), both at true pixels.
 
@@ -128,12 +151,11 @@ def sigma_scores(error: Float, sigma: Float) -> Row:
     by tenths of the pixels by sigma.
     """
     relative = np.abs(np.expm1(error))
-    measured = sparsification(relative, sigma)
-    curve = np.round([measured.kept, measured.error, measured.oracle], 5)
+    curve, ause = sparsification(relative, sigma)
     right, wrong, sure = relative <= RIGHT, relative > WRONG, sigma < SURE
     rms = max(math.sqrt(float(np.mean(error**2))), 1e-12)
     tenths = np.array_split(np.argsort(sigma, kind="stable"), 10)
-    within = coverage(error, sigma)
+    within = [float(np.mean(np.abs(error) <= k * sigma)) for k in (1, 2)]
     return {
         "nll": float(np.mean(0.5 * (error / sigma) ** 2 + np.log(sigma))),
         "flat": 0.5 + math.log(rms),
@@ -142,8 +164,8 @@ def sigma_scores(error: Float, sigma: Float) -> Row:
         "sure_wrong": _share(wrong, sure),
         "wrong_sure": _share(sure, wrong),
         "right_unsure": _share(sigma > MOST_SIGMA, right),
-        "ause": measured.ause,
-        "curve": curve.tolist(),
+        "ause": ause,
+        "curve": np.round(curve, 5).tolist(),
         "reliability": [
             [float(np.mean(sigma[k])), math.sqrt(float(np.mean(error[k] ** 2)))]
             for k in tenths
@@ -223,9 +245,10 @@ def depth_maps(result: Run) -> dict[str, Float]:
     out["unorganised"] = alone.depth_ref
     rigid = known.get("rigid")
     if rigid is not None:
-        valid = np.isfinite(rigid)
-        out["solution_rigid"] = np.where(valid, result.reconstruction.depth_ref, np.nan)
+        unknown = ~np.isfinite(rigid)
+        out["solution_rigid"] = np.where(unknown, np.nan, known["solution"])
         out["rigid"] = rigid
-        if valid.any():
-            out["rigid_filled"] = fill_nearest(rigid)
+        if not unknown.all():
+            nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
+            out["rigid_filled"] = rigid[tuple(nearest)]
     return out

@@ -242,38 +242,6 @@ def sample_at_points(depth: ArrayLike, points: ArrayLike) -> tuple[Float, Float]
     return out, at[:, 2].copy()
 
 
-def scene_flow_epe(
-    estimate: ArrayLike, truth: ArrayLike, *, scale: float = 1.0
-) -> dict[str, float | int]:
-    """End-point error of a scene flow: mean and median length of s * estimate - truth.
-
-    Args:
-        estimate: (..., 3) X' - X; NaN where unknown.
-        truth: (..., 3) true X' - X; NaN where unknown, but known somewhere.
-        scale: The factor s; use `DepthMetrics.scale` so that depth and motion share one scale.
-
-    Returns:
-        mean, median, mean_truth_length (unit of the truth), coverage, n_pixels. The errors are
-        NaN when nothing can be compared.
-    """
-    est, gt = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
-    true = np.isfinite(gt).all(axis=-1)
-    compared = true & np.isfinite(est).all(axis=-1)
-    n = int(compared.sum())
-    # one NaN in place of no pixel makes every mean NaN
-    error, length = (
-        np.linalg.norm(v[compared], axis=-1) if n else np.array([np.nan])
-        for v in (scale * est - gt, gt)
-    )
-    return {
-        "mean": float(np.mean(error)),
-        "median": float(np.median(error)),
-        "mean_truth_length": float(np.mean(length)),
-        "coverage": n / int(true.sum()),
-        "n_pixels": n,
-    }
-
-
 def component_overlaps(estimate: ArrayLike, true: ArrayLike) -> dict[int, tuple[int, float]]:
     """The estimated component that overlaps each true one most, and their intersection over union.
 

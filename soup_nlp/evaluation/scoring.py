@@ -2,12 +2,9 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.ndimage import distance_transform_edt
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.formats.images import array_of, read_image
@@ -171,58 +168,6 @@ def _map(values: object, what: str) -> Float:
     return array_of(values, what, "evaluate", expected, axes="(H, W)").astype(np.float64)
 
 
-STEPS = 50
-"""Points of a sparsification curve."""
-LAST = 0.02
-"""Share of the pixels kept at the last point of a sparsification curve."""
-
-
-@dataclass(frozen=True)
-class Sparsification:
-    """Mean error of the pixels that are kept when the most uncertain ones are removed.
-
-    Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", ECCV 2018.
-
-    Attributes:
-        kept: (STEPS,) shares of the pixels, from 1 down.
-        error: (STEPS,) mean error of that share with the least uncertainty.
-        oracle: (STEPS,) mean error of that share with the least error.
-        ause: Area between the two curves over the mean error: 0 is perfect, about 1 is chance.
-    """
-
-    kept: Float
-    error: Float
-    oracle: Float
-    ause: float
-
-
-def sparsification(error: ArrayLike, uncertainty: ArrayLike) -> Sparsification:
-    """Sort pixels by uncertainty and compare with sorting them by error.
-
-    Pixels of equal uncertainty count with their mean error, because their order is arbitrary.
-
-    Args:
-        error: (M,) errors, not negative; M at least 1.
-        uncertainty: (M,) larger where the error is expected to be larger.
-    """
-    e, s = np.asarray(error, float), np.asarray(uncertainty, float)
-    kept = np.linspace(1.0, LAST, STEPS)
-    last = np.maximum((kept * len(e)).astype(int) - 1, 0)
-    _, group = np.unique(s, return_inverse=True)
-    tie_mean = np.bincount(group, e) / np.bincount(group)
-    sums = np.cumsum(tie_mean[np.sort(group)]), np.cumsum(np.sort(e))
-    mean_error, best = (total[last] / (last + 1) for total in sums)
-    whole = float(e.mean())
-    ause = float((mean_error - best).mean() / whole) if whole > 0 else 0.0
-    return Sparsification(kept, mean_error, best, ause)
-
-
-def coverage(error: ArrayLike, sigma: ArrayLike) -> list[float]:
-    """Shares of the errors (M,) that are at most one and two times their sigma (M,)."""
-    e, s = np.abs(np.asarray(error, float)), np.asarray(sigma, float)
-    return [float(np.mean(e <= k * s)) for k in (1, 2)]
-
-
 # --- one rigid motion for all pixels, which methods for dynamic scenes have to beat --------------
 
 MIN_CORRESPONDENCES = 8
@@ -295,10 +240,3 @@ def _best_motion(matches: epipolar.Matches) -> epipolar.Motion | None:
         if cost < lowest:
             best, lowest = motion, cost
     return best
-
-
-def fill_nearest(depth: Float) -> Float:
-    """(H, W) copy in which each non-finite pixel has the value of the nearest finite one."""
-    unknown = ~np.isfinite(depth)
-    index = distance_transform_edt(unknown, return_distances=False, return_indices=True)
-    return np.asarray(depth[tuple(index)])

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.accuracy import comparison, read_pages, suite_page, write_suite
-from benchmarks.scores import METHODS, measure_pair, sigma_scores
+from benchmarks.scores import LAST, METHODS, STEPS, measure_pair, sigma_scores, sparsification
 from benchmarks.suites import SUITES, Options, every_pair, list_suite, spread
 from benchmarks.table import Cell, Item, frame_of
 from soup_nlp.errors import ConfigError
@@ -113,6 +113,30 @@ def test_sigma_is_scored_by_what_it_says():
     flat = sigma_scores(error, np.full(100, np.sqrt(np.mean(error**2))))
     assert flat["nll"] == pytest.approx(flat["flat"])
     assert sigma_scores(np.zeros(20), np.ones(20))["wrong_sure"] is None
+
+
+ERROR = np.linspace(0.0, 1.0, 1001)
+
+
+def test_the_errors_themselves_are_a_perfect_uncertainty():
+    (kept, error, oracle), ause = sparsification(ERROR[::-1], 3 * ERROR[::-1])
+    assert ause == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(error, oracle)
+    assert (kept[0], kept[-1], len(kept)) == (1.0, LAST, STEPS)
+
+
+def test_equal_uncertainties_are_chance_in_whatever_order_they_come():
+    constant, chance = sparsification(ERROR, np.ones(len(ERROR)))
+    np.testing.assert_allclose(constant[1], ERROR.mean())
+    half = ERROR > 0.5
+    forward, backward = (sparsification(ERROR[::k], half[::k]) for k in (1, -1))
+    np.testing.assert_allclose(forward[0], backward[0])
+    assert 0 < forward[1] < chance
+
+
+def test_what_lies_within_one_and_two_sigma_is_counted():
+    out = sigma_scores(np.array([0.5, -1.5, 2.5, 1.0]), np.ones(4))
+    assert (out["within1"], out["within2"]) == (0.5, 0.75)
 
 
 def solved(suite: str, pair: str = "p", family: str = "s", mre: float = 0.03) -> Row:

@@ -7,7 +7,7 @@ from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.evaluation.metrics import depth_metrics
-from soup_nlp.evaluation.scoring import FAR, fill_nearest, rigid_depth
+from soup_nlp.evaluation.scoring import FAR, rigid_depth
 from soup_nlp.geometry import rotation
 
 K = np.array([[90.0, 0, 41.0], [0, 92.0, 28.0], [0, 0, 1]])
@@ -69,11 +69,6 @@ def test_flow_without_confidence_is_ignored(orbit):
     np.testing.assert_array_equal(np.isnan(depth), bad)
     assert np.isfinite(depth).mean() == pytest.approx(1 - bad.mean())
     assert depth_metrics(depth, orbit.truth.depth_ref).mre < 1e-4
-    # every other pixel takes the depth of the nearest one
-    filled = fill_nearest(depth)
-    assert np.isfinite(filled).all()
-    np.testing.assert_array_equal(filled[~bad], depth[~bad])
-    assert depth_metrics(filled, orbit.truth.depth_ref).mre < 0.05
 
 
 def test_points_behind_a_camera_are_unknown():
@@ -85,7 +80,6 @@ def test_points_behind_a_camera_are_unknown():
     depth = rigid_depth(pair.with_flow(Flow(uv, pair.flow.confidence)))
     np.testing.assert_array_equal(np.isnan(depth), behind)
     assert np.isfinite(depth).mean() == pytest.approx(1 - behind.mean())
-    assert (fill_nearest(depth) > 0).all()
 
 
 def test_without_flow_or_motion_there_is_no_baseline(orbit, monkeypatch):

@@ -1,4 +1,4 @@
-"""Errors of depth, scene flow and components; sparsification and coverage; all by hand."""
+"""Errors of depth and components, all by hand."""
 
 import numpy as np
 import pytest
@@ -14,10 +14,8 @@ from soup_nlp.evaluation.metrics import (
     component_overlaps,
     depth_metrics,
     sample_at_points,
-    scene_flow_epe,
     skill,
 )
-from soup_nlp.evaluation.scoring import LAST, STEPS, coverage, sparsification
 
 depths = arrays(np.float64, 12, elements=st.floats(0.1, 100.0))
 quick = settings(max_examples=20)
@@ -118,19 +116,6 @@ def test_sampling_takes_the_nearest_pixel():
     np.testing.assert_array_equal(truth, [9, 8, 7, 6, 5, 4])
 
 
-def test_scene_flow_epe():
-    truth = np.array([[3.0, 0, 4.0], [0, 0, 0], [np.nan, 0, 0], [1, 1, 1]])
-    estimate = np.array([[0.0, 0, 0], [0, 0, 0.5], [0, 0, 0], [np.nan, 0, 0]])
-    out = scene_flow_epe(estimate, truth, scale=2.0)
-    assert out["mean"] == pytest.approx(3.0)
-    assert out["median"] == pytest.approx(3.0)
-    assert out["mean_truth_length"] == pytest.approx(2.5)
-    assert out["coverage"] == pytest.approx(2 / 3)
-    assert out["n_pixels"] == 2
-    assert scene_flow_epe(truth, truth)["mean"] == 0.0
-    assert np.isnan(scene_flow_epe(np.full((4, 3), np.nan), truth)["mean"])
-
-
 @pytest.mark.parametrize(
     ("score", "words"),
     [
@@ -153,31 +138,3 @@ def test_overlaps_of_components():
     # label 3 covers both pixels of component 1 and one more pixel that is known
     assert component_overlaps(estimate, true) == {0: (0, 4 / 7), 1: (3, 2 / 3), 2: (2, 0.5)}
     assert component_overlaps(estimate, np.full((3, 4), -1)) == {}
-
-
-# --- sparsification and coverage ------------------------------------------------------------------
-
-
-ERROR = np.linspace(0.0, 1.0, 1001)
-
-
-def test_the_errors_themselves_are_a_perfect_uncertainty():
-    curve = sparsification(ERROR[::-1], 3 * ERROR[::-1])
-    assert curve.ause == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_allclose(curve.error, curve.oracle)
-    assert curve.kept[0] == 1.0
-    assert curve.kept[-1] == LAST
-    assert len(curve.kept) == STEPS
-
-
-def test_equal_uncertainties_are_chance_in_whatever_order_they_come():
-    constant = sparsification(ERROR, np.ones(len(ERROR)))
-    np.testing.assert_allclose(constant.error, ERROR.mean())
-    half = ERROR > 0.5
-    forward, backward = (sparsification(ERROR[::k], half[::k]) for k in (1, -1))
-    np.testing.assert_allclose(forward.error, backward.error)
-    assert 0 < forward.ause < constant.ause
-
-
-def test_coverage_counts_what_lies_within():
-    assert coverage([0.5, -1.5, 2.5, 1.0], [1.0, 1.0, 1.0, 1.0]) == [0.5, 0.75]
