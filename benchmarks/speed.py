@@ -97,7 +97,7 @@ def measure_speed(cell: Cell) -> Row:
 def speed_page(frame: pd.DataFrame) -> str:
     """Markdown page of the rows: runs, seconds by stage, machine."""
     good = frame[frame["ok"].eq(True)]
-    blocks = ["# Speed", f"{provenance(frame)}."]
+    blocks = ["# Speed", f"{provenance(frame)}. Solves without a status succeeded."]
     if len(good):
         cpu = good.filter(regex="^cpu[.]").astype(float)
         runs = good.assign(
@@ -105,9 +105,13 @@ def speed_page(frame: pd.DataFrame) -> str:
             whole=cpu.drop(columns="cpu.load").sum(axis=1),
             GB=good["peak_bytes"].astype(float) / 2**30,
         )
-        runs.index = pd.MultiIndex.from_frame(good[list(RUN)].rename(columns=RUN))
+        # what all solves share is said by the overrides
+        several = [name for name in RUN if name != "k" or good["k"].nunique() > 1]
+        runs.index = pd.MultiIndex.from_frame(good[several].rename(columns=RUN))
+        failed = good["status"].ne("Solve_Succeeded").any()
+        shown = {name: form for name, form in COLUMNS.items() if failed or name != "status"}
         stages = {column: (column.removeprefix("cpu."), ".2f") for column in cpu}
-        blocks += [titled(runs, COLUMNS), NOTE, "## CPU seconds by stage", titled(runs, stages)]
+        blocks += [titled(runs, shown), NOTE, "## CPU seconds by stage", titled(runs, stages)]
     memory = f"{psutil.virtual_memory().total / 2**30:.0f} GB"
     facts = ", ".join(f"{k} {v}" for k, v in versions().items())
     machine = f"{os.cpu_count()} cores of {processor()}, {memory}, {platform.platform()}; {facts}."
