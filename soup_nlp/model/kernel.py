@@ -7,7 +7,7 @@ which variables it reads, which rows of g it adds to, and its data. Nothing here
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -20,6 +20,9 @@ from soup_nlp.errors import ModelError
 Hessian = Literal["exact", "gauss-newton", "gauss-newton+constraints"]
 HESSIANS: tuple[Hessian, ...] = get_args(Hessian)
 """gauss-newton: positive semidefinite part of the objective, without curvature of constraints."""
+
+BLOCK = 4096
+"""Largest number of elements of a block: more cost fewer calls, fewer fit into the cache."""
 
 _once = lru_cache(maxsize=1000)
 """Derivatives are taken once for all kernels that are equal: the programs of a solve share them."""
@@ -143,6 +146,26 @@ class Group:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    @property
+    def block_size(self) -> int:
+        """Number of elements of a block: all blocks are of equal size."""
+        return max(1, -(-len(self) // -(-len(self) // BLOCK)))
+
+    @cached_property
+    def blocks(self) -> list[tuple[Any, ...]]:
+        """Index, data and rows of every block, one row for each column of the table; all functions
+        of the kernel share them."""
+        tables = self.index, self.data, self.rows
+        return list(zip(*(in_blocks(t, self.block_size, t[-1:]) for t in tables)))
+
+
+def in_blocks(table: NDArray[Any], width: int, last: NDArray[Any]) -> NDArray[Any]:
+    """(E, k) table as (B, k, width), filled up with a last row (1, k)."""
+    full = np.concatenate([table, np.repeat(last, -len(table) % width, axis=0)])
+    full = full.astype(np.float64 if full.dtype.kind == "f" else np.int64)
+    blocks = full.reshape(len(full) // width, width, table.shape[1])
+    return np.ascontiguousarray(blocks.transpose(0, 2, 1))
 
 
 # --- patterns of sparse matrices ------------------------------------------------------------------

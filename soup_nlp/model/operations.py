@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float
 from soup_nlp.errors import ModelError
-from soup_nlp.model.kernel import Group
+from soup_nlp.model.kernel import Group, in_blocks
 
 
 class Operation(NamedTuple):
@@ -111,9 +111,6 @@ def instructions(function: ca.Function) -> tuple[Instruction, ...]:
 
 # --- kernels summed over their table --------------------------------------------------------------
 
-BLOCK = 4096
-"""Largest number of elements of a block: more cost fewer calls, fewer fit into the cache."""
-
 
 class Vectors:
     """One function of a kernel, for every element of the kernel's table.
@@ -124,23 +121,20 @@ class Vectors:
 
     def __init__(self, function: ca.Function, group: Group) -> None:
         """Translate a function (x, row, theta) or (x, row, theta, lam_f, lam_c) -> (k,)."""
-        # blocks of equal size
-        size = max(1, -(-len(group) // -(-len(group) // BLOCK)))
+        size = group.block_size
         # what a function does not take has no rows
         count = [function.nnz_in(i) if i < function.n_in() else 0 for i in range(5)]
         self._x, self._data = np.empty((count[0], size)), np.empty((count[1], size))
         self._theta, self._lam_f = np.empty(count[2]), np.empty(1)
         self._lam_c, self._out = np.empty((count[4], size)), np.empty((function.nnz_out(0), size))
-        self._function = function
-        tables = (_in_blocks(t, size, t[-1:]) for t in (group.index, group.data, group.rows))
-        self._blocks = list(zip(*tables))
+        self._function, self._blocks = function, group.blocks
         self.entries = len(self._blocks) * self._out.size
 
     def ordered(self, target: NDArray[np.integer], behind: int) -> NDArray[np.integer]:
         """Numbers (E, k) of the elements' entries in the order of `evaluate`; `behind` for what
         fills the last block."""
         last = np.full((1, target.shape[1]), behind)
-        return _in_blocks(target, self._out.shape[1], last).ravel()
+        return in_blocks(target, self._out.shape[1], last).ravel()
 
     @cached_property
     def _calls(self) -> list[tuple[Callable[..., Any], Any]]:
@@ -184,11 +178,3 @@ class Vectors:
                 for call, given in self._calls:
                     call(*given)
                 part[:] = self._out
-
-
-def _in_blocks(table: NDArray[Any], width: int, last: NDArray[Any]) -> NDArray[Any]:
-    """(E, k) table as (B, k, width), filled up with a last row (1, k)."""
-    full = np.concatenate([table, np.repeat(last, -len(table) % width, axis=0)])
-    full = full.astype(np.float64 if full.dtype.kind == "f" else np.int64)
-    blocks = full.reshape(len(full) // width, width, table.shape[1])
-    return np.ascontiguousarray(blocks.transpose(0, 2, 1))

@@ -33,7 +33,7 @@ def squares(elements: int, of=lambda x: x) -> NLP:
 
 @pytest.mark.parametrize("elements", [1, 7, 8, 9, 26])
 def test_sums_of_every_size_have_the_values_of_their_formula(elements, monkeypatch):
-    monkeypatch.setattr(operations, "BLOCK", 8)
+    monkeypatch.setattr("soup_nlp.model.kernel.BLOCK", 8)
     nlp = squares(elements)
     x, e = nlp.x0, np.arange(elements) + 1
     weight = np.linspace(1.0, 2.0, elements)
@@ -100,7 +100,7 @@ def test_every_operation_has_casadis_value(every, block, monkeypatch):
     place = (np.arange(count)[:, None] // 2) * width + np.arange(width)
     kernel = Kernel("every", ca.SX.sym("a"), ca.SX.sym("b"), ca.SX(0, 1))
     group = Group(kernel, np.arange(count)[:, None], data, np.zeros((count, 0), np.int64))
-    monkeypatch.setattr(operations, "BLOCK", block)
+    monkeypatch.setattr("soup_nlp.model.kernel.BLOCK", block)
     term = operations.Vectors(every, group)
     entries = np.empty(term.entries)
     term.evaluate(entries, x, np.zeros(0), 1.0, None)
