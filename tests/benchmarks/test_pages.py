@@ -7,7 +7,7 @@ from helpers_files import sets
 from benchmarks.__main__ import main
 from benchmarks.chain import chain_page, measure_chain, sequences
 from benchmarks.sigma import fitted
-from benchmarks.speed import speed_cells
+from benchmarks.speed import speed_cells, speed_page
 from benchmarks.table import Cell, frame_of
 from soup_nlp.evaluation.confidence import ADDED, FACTORS
 from soup_nlp.storage.each import append_row, read_rows
@@ -45,7 +45,17 @@ def test_a_real_run_and_its_table(tmp_path):
     assert row["energy"]["total"] < row["energy_start"]["total"]
     assert row["peak_bytes"] > 5e7
     assert {"load", "flow", "segmentation", "start", "output"} <= set(row["cpu"])
-    assert "| street-s0-64x48 |" in (tmp_path / "table.md").read_text()
+    page = (tmp_path / "table.md").read_text()
+    assert "| street-s0-64x48 |" in page
+    assert "| K |" not in page
+    # what a run does not share with the others is a column
+    failed = {**row, "k": 5, "status": "Invalid_Number_Detected"}
+    page = speed_page(frame_of([{**row, "status": "Solve_Succeeded"}, failed]))
+    assert "| K |" in page
+    assert page.count("Invalid_Number_Detected") == page.count("Solve_Succeeded") == 1
+    assert (
+        "status" not in speed_page(frame_of([{**row, "status": "Solve_Succeeded"}])).splitlines()[4]
+    )
 
 
 def no_terms(count):
