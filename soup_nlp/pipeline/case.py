@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from soup_nlp.arrays import Mask
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_depth, follow_flow
+from soup_nlp.data.flow.epipolar_search import searched
 from soup_nlp.data.flow.layers import corrected, still, without_still_layer
 from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
@@ -220,20 +222,21 @@ def build_energy(
     return in_pixels(data, start.soup, seg, bends), weights
 
 
-# --- the flow, also behind a layer that stands still before the scene ----------------------
+# --- the flow, searched again where the camera's motion tells more -------------------------------
 
 LEAST_SHARE = 0.003
 """Least share of pixels that stand still for the search for a layer."""
 LEAST_FLOW = 2.0
-"""Median displacement, pixels, below which the camera may be at rest."""
+"""Median displacement and parallax, pixels, below which the camera may be at rest, or turn only."""
 PIXELS = 6000
-"""Largest number of moving pixels to which their motion is fitted."""
+"""Largest number of pixels to which the camera's motion is fitted."""
 
 
 def with_flow(problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] | None) -> Pair:
-    """A pair with its flow, searched for behind a layer that stands still if there is one.
+    """A pair with its flow; one that was computed is searched again by the camera's motion.
 
-    `full` is the pair at its own size; `log` is called with a line if there is such a layer.
+    If a layer stands still, the scene behind it is searched for, else what is not sure. `full` is
+    the pair at its own size; `log` is called with a line if there is such a layer.
     """
     flow = pair.flow
     if flow is None and pair is not full and problem.flow.is_file():
@@ -242,9 +245,11 @@ def with_flow(problem: Problem, full: Pair, pair: Pair, log: Callable[[str], Non
     flow = flow or problem.flow.load(pair, problem.path)
     pair = pair.with_flow(flow)
     computed = is_named(flow.source) and not flow.source.startswith("truth")
-    behind = see_through(pair, problem.seed) if problem.flow.consistency and computed else None
-    if behind is None:
+    if not (computed and problem.flow.consistency and pair.size == pair.image_next.shape[:2]):
         return pair
+    behind = see_through(pair, problem.seed)
+    if behind is None:
+        return pair.with_flow(search_again(pair, problem.seed))
     if log:
         log("a layer stands still before the scene: flow searched for behind it")
     return pair.with_flow(behind)
@@ -259,25 +264,43 @@ def see_through(pair: Pair, seed: int = 0) -> Flow | None:
     flow = pair.flow
     assert flow is not None
     at_rest, sure = still(flow), flow.confidence > 0.5
-    if pair.size != pair.image_next.shape[:2] or at_rest.mean() < LEAST_SHARE:
+    if at_rest.mean() < LEAST_SHARE:
         return None
     if np.median(np.linalg.norm(flow.uv[sure], axis=1)) < LEAST_FLOW:
         return None
-    v, u = np.nonzero(sure & ~at_rest)
-    pick = np.random.default_rng(seed).permutation(len(v))[:PIXELS]
-    pixel = np.stack([u, v], axis=-1)[pick].astype(float)
-    move = flow.uv[v, u][pick].astype(float)
-    matches = Matches(
-        rays(pair.K_ref, pixel),
-        rays(pair.K_next, pixel + move),
-        flow.confidence[v, u][pick].astype(float),
-        float(pair.K_next[0, 0]),
-    )
-    motion = estimate(matches)
+    motion = estimate(_matches(pair, sure & ~at_rest, seed))
     if motion is None:
         return None
     ref, nxt = without_still_layer(pair.image_ref, pair.image_next)
     return corrected(ref, nxt, flow, motion.R, motion.t, pair.K_ref, pair.K_next)
+
+
+def search_again(pair: Pair, seed: int = 0) -> Flow:
+    """The flow of a pair, searched for along the epipolar lines of the camera's motion (`searched`)
+    unless the camera is at rest or turns only: then its lines are chance."""
+    flow = pair.flow
+    assert flow is not None
+    matches = _matches(pair, flow.confidence > 0.5, seed)
+    motion = estimate(matches)
+    if motion is None:
+        return flow
+    turned = matches.ray @ motion.R.T
+    parallax = np.linalg.norm((turned / turned[:, 2:] - matches.target)[:, :2], axis=1)
+    if np.median(matches.focal * parallax) < LEAST_FLOW:
+        return flow
+    return searched(pair, motion.R, motion.t)
+
+
+def _matches(pair: Pair, which: Mask, seed: int) -> Matches:
+    """Correspondences by the flow of at most `PIXELS` of the pixels `which` (H, W)."""
+    assert pair.flow is not None
+    v, u = np.nonzero(which)
+    pick = np.random.default_rng(seed).permutation(len(v))[:PIXELS]
+    pixel = np.stack([u, v], axis=-1)[pick].astype(float)
+    move = pair.flow.uv[v, u][pick].astype(float)
+    ends = rays(pair.K_ref, pixel), rays(pair.K_next, pixel + move)
+    weight = pair.flow.confidence[v, u][pick].astype(float)
+    return Matches(*ends, weight, float(pair.K_next[0, 0]))
 
 
 # --- memory, estimated before a solve ---------------------------------------------------------

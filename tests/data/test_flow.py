@@ -259,7 +259,7 @@ def test_a_guided_flow_must_be_better_by_a_margin(monkeypatch, error, taken):
         return constant(0.1), constant(-0.1)
 
     monkeypatch.setattr(dis, "dominant_homographies", lambda *a: [np.eye(3)])
-    monkeypatch.setattr(dis, "_MARGIN", 0.5)
+    monkeypatch.setattr(dis, "MARGIN", 0.5)
     first, back = constant(0.0), constant(error)
     flow, gap = guided_flow(grey, grey, match, first, back)
     inside = (slice(20, 40), slice(20, 60))

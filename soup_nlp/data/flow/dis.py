@@ -25,7 +25,6 @@ _LEAST = 0.03  # share of the confident pixels that a homography must explain
 _INLIER = 2.0  # pixels
 _ROUND_TRIP_CAP = 3.0  # pixels
 _WINDOW = 25  # side of the window of a score, pixels
-_MARGIN = 0.3  # by how much a flow under a homography must be better, pixels
 _GREY_CAP, _PER_GREY = 30.0, 0.05  # cap of a difference in grey levels; pixels per grey level
 
 
@@ -64,10 +63,10 @@ def guided_flow(
     gap = round_trip_error(forward, backward)
     maps = dominant_homographies(forward, confidence_of(gap, support=5), PLANES)
     best, best_gap = forward.copy(), gap
-    best_score = _score(ref, nxt, forward, gap)
+    best_score = flow_score(ref, nxt, forward, gap)
     for H in maps:
         flow, error = _under(H, ref, nxt, match)
-        score = _score(ref, nxt, flow, error) + _MARGIN
+        score = flow_score(ref, nxt, flow, error) + MARGIN
         better = score < best_score
         best[better], best_gap[better] = flow[better], error[better]
         best_score = np.minimum(score, best_score)
@@ -94,7 +93,9 @@ def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, Fl
     return flow.astype(np.float32), gap
 
 
-def _score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap) -> FloatMap:
+def flow_score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap) -> FloatMap:
+    """(H, W) mean over a window of the round-trip error (H, W) and of the difference in grey levels
+    between a pixel and its target, pixels; large where the round trip leaves the image."""
     height, width = ref.shape
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     target = sampled(nxt, u + flow[..., 0], v + flow[..., 1])
@@ -115,6 +116,8 @@ ITERATIONS, ALPHA, DELTA, GAMMA = 20, 30.0, 1.0, 10.0
 intensities (preset: delta 5): the error falls on driving, indoor and rendered pairs."""
 PLANES = 4
 """Dominant homographies under which the flow is computed again."""
+MARGIN = 0.3
+"""By how much another flow must be better than the first one, pixels."""
 
 _FLAT = 1.0  # standard deviation in grey levels of an image without contrast
 _WORK_SIDE = 64  # DIS gets images of at least this side; smaller ones are padded
