@@ -9,7 +9,7 @@ from soup_nlp.arrays import Mask
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_depth, follow_flow
 from soup_nlp.data.flow.epipolar_search import searched
-from soup_nlp.data.flow.layers import corrected, still, without_still_layer
+from soup_nlp.data.flow.layers import corrected, still
 from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow, Pair
@@ -271,8 +271,7 @@ def see_through(pair: Pair, seed: int = 0) -> Flow | None:
     motion = estimate(_matches(pair, sure & ~at_rest, seed))
     if motion is None:
         return None
-    ref, nxt = without_still_layer(pair.image_ref, pair.image_next)
-    return corrected(ref, nxt, flow, motion.R, motion.t, pair.K_ref, pair.K_next)
+    return corrected(pair, motion.R, motion.t)
 
 
 def search_again(pair: Pair, seed: int = 0) -> Flow:

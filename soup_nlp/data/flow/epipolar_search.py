@@ -26,6 +26,10 @@ SMALL, LARGE = 3, 24
 """Price of a change of the inverse depth by one level and by more, in bits of the descriptor."""
 OUTSIDE = 8
 """Cost of a target outside of the image: half of the bits."""
+NEAREST = 0.05
+"""Least depth of a point in the next frame, in lengths of its ray before."""
+WINDOW = 31
+"""Side of the window over which a matching cost is averaged, pixels."""
 SURE = 0.5
 """Confidence of a flow from which on it is not searched again."""
 COMPARED = (
@@ -35,6 +39,7 @@ COMPARED = (
 """(dv, du) of the neighbours of a descriptor, in strides."""
 
 Cost = NDArray[np.uint8]
+Bits = NDArray[np.uint16]
 
 
 def searched(pair: Pair, R: Float, t: Float) -> Flow:
@@ -46,15 +51,23 @@ def searched(pair: Pair, R: Float, t: Float) -> Flow:
     assert pair.flow is not None
     flow = pair.flow
     ref, nxt = (cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in (pair.image_ref, pair.image_next))
-    forward = epipolar_flow(ref, nxt, R, t, pair.K_ref, pair.K_next)
-    backward = epipolar_flow(nxt, ref, R.T, -R.T @ t, pair.K_next, pair.K_ref)
-    error = round_trip_error(forward, backward)
+    new, error = round_trip(ref, nxt, R, t, pair.K_ref, pair.K_next)
     with np.errstate(divide="ignore"):
-        gap = np.minimum(np.sqrt(-np.log(flow.confidence)), LIMIT)
-    better = flow_score(ref, nxt, forward, error) + MARGIN < flow_score(ref, nxt, flow.uv, gap)
+        # the round-trip error that the confidence stands for
+        gap = np.minimum(np.sqrt(-np.log(flow.confidence)), np.float32(LIMIT))
+    better = flow_score(ref, nxt, new, error) + MARGIN < flow_score(ref, nxt, flow.uv, gap)
     better &= flow.confidence <= SURE
-    uv = np.where(better[..., None], forward, flow.uv)
+    uv = np.where(better[..., None], new, flow.uv)
     return Flow(uv, np.where(better, confidence_of(error), flow.confidence), flow.source)
+
+
+def round_trip(
+    ref: Image, nxt: Image, R: Float, t: Float, K: Float, K_next: Float
+) -> tuple[FloatMap, FloatMap]:
+    """The flow along epipolar lines, see `epipolar_flow`, and its round-trip error (H, W)."""
+    forward = epipolar_flow(ref, nxt, R, t, K, K_next)
+    backward = epipolar_flow(nxt, ref, R.T, -R.T @ t, K_next, K)
+    return forward, round_trip_error(forward, backward)
 
 
 def epipolar_flow(ref: Image, nxt: Image, R: Float, t: Float, K: Float, K_next: Float) -> FloatMap:
@@ -66,14 +79,10 @@ def epipolar_flow(ref: Image, nxt: Image, R: Float, t: Float, K: Float, K_next: 
     levels = REACH * nxt.shape[1] / K_next[0, 0] * np.arange(LEVELS) / (LEVELS - 1)
     ray = rays(K, pixel_grid(*ref.shape)) @ R.T
     first, second = descriptor(ref)[::STRIDE, ::STRIDE], descriptor(nxt)
-    cost = np.empty((*first.shape, LEVELS), np.uint8)
-    coarse = np.ascontiguousarray(ray[::STRIDE, ::STRIDE])
-    for k, inverse in enumerate(levels):
-        x, y = np.moveaxis(np.rint(_projected(coarse + inverse * t, K_next)).astype(int), -1, 0)
-        inside = (x >= 0) & (y >= 0) & (x < nxt.shape[1]) & (y < nxt.shape[0])
-        other = second[np.where(inside, y, 0), np.where(inside, x, 0)]
-        cost[..., k] = np.where(inside, np.bitwise_count(first ^ other), OUTSIDE)
-    best = _between_levels(aggregated(cost)).astype(np.float32)
+    coarse = np.ascontiguousarray(ray[::STRIDE, ::STRIDE], np.float32)
+    steps = (levels[:, None] * t).astype(np.float32)
+    cost = np.stack([_differences(first, second, _projected(coarse + s, K_next)) for s in steps])
+    best = _between_levels(aggregated(np.moveaxis(cost, 0, 2))).astype(np.float32)
     v, u = np.mgrid[: ref.shape[0], : ref.shape[1]].astype(np.float32) / STRIDE
     inverse = sampled(cv2.medianBlur(best, 3), u, v) * levels[1]
     flow = _projected(ray + inverse[..., None] * t, K_next) - pixel_grid(*ref.shape)
@@ -85,13 +94,27 @@ def epipolar_flow(ref: Image, nxt: Image, R: Float, t: Float, K: Float, K_next: 
     return np.stack(refinement.calcUV(ref, nxt, *parts), axis=-1)
 
 
-def _projected(point: Float, K: Float) -> Float:
+def _projected(point: NDArray[np.floating], K: Float) -> NDArray[np.floating]:
     """(..., 2) pixels of points (..., 3); those behind the camera are far outside."""
-    ahead = np.maximum(point[..., 2:], 0.05)
-    return point[..., :2] / ahead * K.diagonal()[:2] + K[:2, 2]
+    return point / np.maximum(point[..., 2:], NEAREST) @ K[:2].T.astype(point.dtype)
 
 
-def descriptor(image: Image) -> NDArray[np.uint16]:
+def _differences(first: Bits, second: Bits, target: NDArray[np.floating]) -> Cost:
+    """(H, W) bits in which descriptors differ from those at targets (H, W, 2)."""
+    x, y = np.moveaxis(np.rint(target).astype(np.int32), -1, 0)
+    inside = (x >= 0) & (y >= 0) & (x < second.shape[1]) & (y < second.shape[0])
+    other = second[np.where(inside, y, 0), np.where(inside, x, 0)]
+    return np.where(inside, np.bitwise_count(first ^ other), np.uint8(OUTSIDE))
+
+
+def matching_cost(ref: Image, nxt: Image, flow: FloatMap) -> FloatMap:
+    """(H, W) bits in which descriptors differ along a flow, mean over a window."""
+    target = pixel_grid(*ref.shape) + flow
+    bits = _differences(descriptor(ref), descriptor(nxt), target).astype(np.float32)
+    return np.asarray(cv2.blur(bits, (WINDOW, WINDOW)), np.float32)
+
+
+def descriptor(image: Image) -> Bits:
     """(H, W) census transform of a grey image: a bit for each darker one of the neighbours."""
     grey = cv2.GaussianBlur(image.astype(np.float32), (0, 0), STRIDE / 2)
     pad, (height, width) = 2 * STRIDE, grey.shape
@@ -109,7 +132,7 @@ def aggregated(cost: Cost) -> Cost:
     L(p, d) = C(p, d) + min(L(q, d), L(q, d +- 1) + SMALL, min_k L(q, k) + LARGE) - min_k L(q, k)
     with q the pixel before p. Sums stay below 256, since C has at most 16 bits.
     """
-    total = np.zeros_like(cost)
+    total = np.zeros(cost.shape, np.uint8)
     for axes in ((0, 1, 2), (1, 0, 2)):
         along = np.ascontiguousarray(cost.transpose(axes))
         for step in (1, -1):
