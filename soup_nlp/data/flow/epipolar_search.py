@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap, Image
-from soup_nlp.data.flow.consistency import LIMIT, confidence_of, round_trip_error, sampled
+from soup_nlp.data.flow.consistency import LIMIT, SUPPORT, confidence_of, round_trip_error, sampled
 from soup_nlp.data.flow.dis import ALPHA, DELTA, GAMMA, MARGIN, flow_score
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.geometry.camera import pixel_grid, rays
@@ -46,7 +46,8 @@ def searched(pair: Pair, R: Float, t: Float) -> Flow:
     """The flow of a pair, searched for along epipolar lines where it is not sure.
 
     R (3, 3) and the unit translation t (3,) are the motion next_from_ref of the scene. Both images
-    have one size. A pixel takes the new flow if its score is better by `MARGIN`.
+    have one size. Pixels take the new flow if its score is better by `MARGIN`, and if their
+    connected piece has a window of `SUPPORT` pixels in which the new flow is sure.
     """
     assert pair.flow is not None
     flow = pair.flow
@@ -57,6 +58,11 @@ def searched(pair: Pair, R: Float, t: Float) -> Flow:
         gap = np.minimum(np.sqrt(-np.log(flow.confidence)), np.float32(LIMIT))
     better = flow_score(ref, nxt, new, error) + MARGIN < flow_score(ref, nxt, flow.uv, gap)
     better &= flow.confidence <= SURE
+    # a wrong flow may be consistent at single pixels, but rarely in a whole window
+    sure = (better & (confidence_of(error) > SURE)).astype(np.uint8)
+    window = cv2.morphologyEx(sure, cv2.MORPH_OPEN, np.ones((SUPPORT, SUPPORT), np.uint8)) > 0
+    piece = cv2.connectedComponents(better.astype(np.uint8), connectivity=4)[1]
+    better &= np.isin(piece, piece[window])
     uv = np.where(better[..., None], new, flow.uv)
     return Flow(uv, np.where(better, confidence_of(error), flow.confidence), flow.source)
 
