@@ -83,40 +83,47 @@ def epipolar_flow(ref: Image, nxt: Image, R: Float, t: Float, K: Float, K_next: 
     becomes a flow, which the variational step of DIS refines at all pixels.
     """
     levels = REACH * nxt.shape[1] / K_next[0, 0] * np.arange(LEVELS) / (LEVELS - 1)
-    ray = rays(K, pixel_grid(*ref.shape)) @ R.T
+    # a point at inverse depth m has the homogeneous pixel far + m shift
+    far = np.moveaxis(rays(K, pixel_grid(*ref.shape)) @ (K_next @ R).T, -1, 0)
+    shift = (K_next @ t)[:, None, None]
     first, second = descriptor(ref)[::STRIDE, ::STRIDE], descriptor(nxt)
-    coarse = np.ascontiguousarray(ray[::STRIDE, ::STRIDE], np.float32)
-    steps = (levels[:, None] * t).astype(np.float32)
-    cost = np.stack([_differences(first, second, _projected(coarse + s, K_next)) for s in steps])
-    best = _between_levels(aggregated(np.moveaxis(cost, 0, 2))).astype(np.float32)
-    v, u = np.mgrid[: ref.shape[0], : ref.shape[1]].astype(np.float32) / STRIDE
-    inverse = sampled(cv2.medianBlur(best, 3), u, v) * levels[1]
-    flow = _projected(ray + inverse[..., None] * t, K_next) - pixel_grid(*ref.shape)
+    coarse, step = np.ascontiguousarray(far[:, ::STRIDE, ::STRIDE], np.float32), np.float32(shift)
+    targets = (_pixels(coarse + np.float32(m) * step) for m in levels)
+    cost = np.stack([_differences(first, second, *target) for target in targets], axis=-1)
+    best = _between_levels(aggregated(cost)).astype(np.float32)
+    v, u = np.mgrid[: ref.shape[0], : ref.shape[1]].astype(np.float32)
+    inverse = sampled(cv2.medianBlur(best, 3), u / STRIDE, v / STRIDE) * levels[1]
+    x, y = _pixels(far + inverse * shift)
     refinement = cv2.VariationalRefinement.create()
     refinement.setAlpha(ALPHA)
     refinement.setDelta(DELTA)
     refinement.setGamma(GAMMA)
-    parts = (np.ascontiguousarray(flow[..., k], np.float32) for k in (0, 1))
-    return np.stack(refinement.calcUV(ref, nxt, *parts), axis=-1)
+    flow = refinement.calcUV(ref, nxt, (x - u).astype(np.float32), (y - v).astype(np.float32))
+    return np.stack(flow, axis=-1)
 
 
-def _projected(point: NDArray[np.floating], K: Float) -> NDArray[np.floating]:
-    """(..., 2) pixels of points (..., 3); those behind the camera are far outside."""
-    return point / np.maximum(point[..., 2:], NEAREST) @ K[:2].T.astype(point.dtype)
+def _pixels(point: NDArray[np.floating]) -> tuple[NDArray[np.floating], ...]:
+    """x and y (H, W) of homogeneous pixels (3, H, W); those behind the camera are far outside."""
+    ahead = np.maximum(point[2], NEAREST)
+    return point[0] / ahead, point[1] / ahead
 
 
-def _differences(first: Bits, second: Bits, target: NDArray[np.floating]) -> Cost:
-    """(H, W) bits in which descriptors differ from those at targets (H, W, 2)."""
-    x, y = np.moveaxis(np.rint(target).astype(np.int32), -1, 0)
-    inside = (x >= 0) & (y >= 0) & (x < second.shape[1]) & (y < second.shape[0])
-    other = second[np.where(inside, y, 0), np.where(inside, x, 0)]
+def _differences(
+    first: Bits, second: Bits, x: NDArray[np.floating], y: NDArray[np.floating]
+) -> Cost:
+    """(H, W) bits in which descriptors differ from those at pixels (x, y) of (H, W)."""
+    height, width = second.shape
+    column = np.rint(np.clip(x, -1, width)).astype(np.int32)
+    row = np.rint(np.clip(y, -1, height)).astype(np.int32)
+    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    other = second.ravel().take(row * width + column, mode="clip")
     return np.where(inside, np.bitwise_count(first ^ other), np.uint8(OUTSIDE))
 
 
 def matching_cost(ref: Image, nxt: Image, flow: FloatMap) -> FloatMap:
     """(H, W) bits in which descriptors differ along a flow, mean over a window."""
-    target = pixel_grid(*ref.shape) + flow
-    bits = _differences(descriptor(ref), descriptor(nxt), target).astype(np.float32)
+    x, y = np.moveaxis(pixel_grid(*ref.shape) + flow, -1, 0)
+    bits = _differences(descriptor(ref), descriptor(nxt), x, y).astype(np.float32)
     return np.asarray(cv2.blur(bits, (WINDOW, WINDOW)), np.float32)
 
 
