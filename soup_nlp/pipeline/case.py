@@ -8,6 +8,7 @@ import numpy as np
 from soup_nlp.arrays import Mask
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_depth, follow_flow
+from soup_nlp.data.flow.consistency import SURE
 from soup_nlp.data.flow.epipolar_search import searched
 from soup_nlp.data.flow.layers import corrected, still
 from soup_nlp.data.flow.sources import is_named
@@ -233,16 +234,19 @@ PIXELS = 6000
 
 
 def with_flow(problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] | None) -> Pair:
-    """A pair with its flow; one that was computed is searched again by the camera's motion.
+    """A pair with its flow; one that is computed here is searched again by the camera's motion.
 
-    If a layer stands still, the scene behind it is searched for, else what is not sure. `full` is
-    the pair at its own size; `log` is called with a line if there is such a layer.
+    If a layer stands still, the scene behind it is searched for, else what is not sure. A flow that
+    the pair has is taken as it is. `full` is the pair at its own size; `log` is called with a line
+    if there is such a layer.
     """
-    flow = pair.flow
-    if flow is None and pair is not full and problem.flow.is_file():
+    if pair.flow is not None:
+        return pair
+    if pair is not full and problem.flow.is_file():
         # a flow file has the size of the original images
         flow = resized_flow(problem.flow.load(full, problem.path), full, pair)
-    flow = flow or problem.flow.load(pair, problem.path)
+    else:
+        flow = problem.flow.load(pair, problem.path)
     pair = pair.with_flow(flow)
     computed = is_named(flow.source) and not flow.source.startswith("truth")
     if not (computed and problem.flow.consistency and pair.size == pair.image_next.shape[:2]):
@@ -263,7 +267,7 @@ def see_through(pair: Pair, seed: int = 0) -> Flow | None:
     """
     flow = pair.flow
     assert flow is not None
-    at_rest, sure = still(flow), flow.confidence > 0.5
+    at_rest, sure = still(flow), flow.confidence > SURE
     if at_rest.mean() < LEAST_SHARE:
         return None
     if np.median(np.linalg.norm(flow.uv[sure], axis=1)) < LEAST_FLOW:
@@ -279,7 +283,7 @@ def search_again(pair: Pair, seed: int = 0) -> Flow:
     unless the camera is at rest or turns only: then its lines are chance."""
     flow = pair.flow
     assert flow is not None
-    matches = _matches(pair, flow.confidence > 0.5, seed)
+    matches = _matches(pair, flow.confidence > SURE, seed)
     motion = estimate(matches)
     if motion is None:
         return flow

@@ -282,11 +282,16 @@ def test_images_without_a_layer_are_left_alone(street: Pair):
 
 
 @pytest.mark.slow
-def test_true_flow_is_believed(reflecting: Pair):
-    """The correction applies to computed flow only, and an option disables it."""
+@pytest.mark.parametrize(
+    ("source", "options", "searched"),
+    [("truth", {}, False), ("dis", {"consistency": False}, False), ("dis", {}, True)],
+)
+def test_only_computed_flow_is_searched_again(reflecting, monkeypatch, source, options, searched):
+    """It is, unless an option disables it; a flow that the pair has is taken as it is."""
     memory = {"input": {"kind": "memory", "hash": "0"}}
-    for source, options in (("truth", {}), ("dis", {"consistency": False})):
-        reflected = given(reflecting, still=True, source=source)
-        problem = make_problem({**memory, "flow": options})
-        believed = with_flow(problem, reflected, reflected, None)
-        assert (believed.flow.uv[BEHIND] == 0).all()
+    reflected = given(reflecting, still=True, source=source)
+    monkeypatch.setattr(FlowOptions, "load", lambda *_: reflected.flow)
+    problem = make_problem({**memory, "flow": options})
+    loaded = with_flow(problem, reflecting, reflecting, None)
+    assert bool((loaded.flow.uv[BEHIND] == 0).all()) is not searched
+    assert with_flow(problem, loaded, loaded, None) is loaded

@@ -19,6 +19,8 @@ from soup_nlp.errors import DataError
 SUPPORT = 15
 """Side of the window over which the round-trip error is averaged, pixels: a wrong flow may be
 consistent at a single pixel, but rarely in a whole window."""
+SURE = 0.5
+"""Confidence above which a flow counts as right."""
 LIMIT, MOST = 3.0, 5.0
 """Round-trip error, pixels, above which a flow is not used: its confidence would be 0.0001; and
 largest error that counts in the mean of a window."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from soup_nlp.arrays import Float, FloatMap, Image
-from soup_nlp.data.flow.consistency import confidence_of, round_trip_error, sampled
+from soup_nlp.data.flow.consistency import LIMIT, SURE, confidence_of, round_trip_error, sampled
 from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError
 
@@ -20,10 +20,8 @@ Match = Callable[[Image, Image], tuple[FloatMap, FloatMap]]
 """Forward and backward flow of two grey images of one size."""
 
 _STEP = 4  # homographies are fitted to every fourth pixel of both directions
-_SURE = 0.5  # confidence above which a pixel is fitted
 _LEAST = 0.03  # share of the confident pixels that a homography must explain
 _INLIER = 2.0  # pixels
-_ROUND_TRIP_CAP = 3.0  # pixels
 _WINDOW = 25  # side of the window of a score, pixels
 _GREY_CAP, _PER_GREY = 30.0, 0.05  # cap of a difference in grey levels; pixels per grey level
 
@@ -35,7 +33,7 @@ def dominant_homographies(flow: FloatMap, confidence: FloatMap, count: int) -> l
     """
     height, width = confidence.shape
     v, u = np.mgrid[0:height:_STEP, 0:width:_STEP]
-    sure = confidence[::_STEP, ::_STEP] > _SURE
+    sure = confidence[::_STEP, ::_STEP] > SURE
     ref = np.stack([u[sure], v[sure]], axis=-1).astype(np.float64)
     target = ref + flow[::_STEP, ::_STEP][sure]
     least = max(20.0, _LEAST * len(ref))
@@ -100,9 +98,9 @@ def flow_score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap) -> FloatMa
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     target = sampled(nxt, u + flow[..., 0], v + flow[..., 1])
     grey = np.minimum(np.abs(target - ref), _GREY_CAP)
-    cost = np.minimum(gap, _ROUND_TRIP_CAP) + np.float32(_PER_GREY) * grey
+    cost = np.minimum(gap, LIMIT) + np.float32(_PER_GREY) * grey
     score = cv2.blur(cost.astype(np.float32), (_WINDOW, _WINDOW))
-    score[~np.isfinite(gap)] = 2 * (_ROUND_TRIP_CAP + _PER_GREY * _GREY_CAP)
+    score[~np.isfinite(gap)] = 2 * (LIMIT + _PER_GREY * _GREY_CAP)
     return np.asarray(score, dtype=np.float32)
 
 

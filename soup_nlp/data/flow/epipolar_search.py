@@ -3,7 +3,7 @@
 A dense search in two dimensions loses large displacements and weak texture. Where a pixel moves
 with the camera's motion, one unknown is left, its inverse depth. Costs of matching are summed along
 paths, in which the inverse depth changes at a price, so that weak texture follows what is around it
-(H. Hirschmueller, PAMI 30, 2008; K. Yamaguchi, D. McAllester, R. Urtasun, ECCV 2014). The result is
+(H. Hirschmüller, PAMI 30, 2008; K. Yamaguchi, D. McAllester, R. Urtasun, ECCV 2014). The result is
 one more flow among which the round trip and the colours choose, as in `guided_flow`.
 """
 
@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, FloatMap, Image
-from soup_nlp.data.flow.consistency import LIMIT, SUPPORT, confidence_of, round_trip_error, sampled
+from soup_nlp.data.flow.consistency import (
+    LIMIT,
+    SUPPORT,
+    SURE,
+    confidence_of,
+    round_trip_error,
+    sampled,
+)
 from soup_nlp.data.flow.dis import ALPHA, DELTA, GAMMA, MARGIN, flow_score
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.geometry.camera import pixel_grid, rays
@@ -30,8 +37,8 @@ NEAREST = 0.05
 """Least depth of a point in the next frame, in lengths of its ray before."""
 WINDOW = 31
 """Side of the window over which a matching cost is averaged, pixels."""
-SURE = 0.5
-"""Confidence of a flow from which on it is not searched again."""
+DARKER = 0.5
+"""Least difference to a darker neighbour, grey levels."""
 COMPARED = (
     *((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)),
     *((-2, 0), (2, 0), (0, -2), (0, 2), (-2, -2), (2, 2), (-2, 2), (2, -2)),
@@ -134,7 +141,7 @@ def descriptor(image: Image) -> Bits:
     framed, bits = np.pad(grey, pad, mode="edge"), np.zeros(grey.shape, np.uint16)
     for k, (dv, du) in enumerate(COMPARED):
         v, u = pad + STRIDE * dv, pad + STRIDE * du
-        darker = framed[v : v + height, u : u + width] < grey - 0.5
+        darker = framed[v : v + height, u : u + width] < grey - DARKER
         bits |= darker.astype(np.uint16) << np.uint16(k)
     return bits
 

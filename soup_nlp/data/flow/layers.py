@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
 from soup_nlp.arrays import Float, FloatMap, Image
-from soup_nlp.data.flow.consistency import confidence_of
+from soup_nlp.data.flow.consistency import SURE, confidence_of
 from soup_nlp.data.flow.epipolar_search import matching_cost, round_trip
 from soup_nlp.data.pair import Flow, Pair
 
@@ -58,7 +58,7 @@ def _integrated(along: FloatMap, down: FloatMap, mean: float) -> Image:
 def still(flow: Flow) -> NDArray[np.bool_]:
     """(H, W) static pixels with a confident flow."""
     near: NDArray[np.bool_] = np.linalg.norm(flow.uv, axis=2) < STILL_PX
-    return near & (flow.confidence > 0.5)
+    return near & (flow.confidence > SURE)
 
 
 def corrected(pair: Pair, R: Float, t: Float) -> Flow | None:
