@@ -22,7 +22,7 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.start.epipolar import relief_spread
-from soup_nlp.start.given_depth import Given
+from soup_nlp.start.given_depth import GivenDepth
 from soup_nlp.start.propose import Start
 from soup_nlp.start.regions import FIXED, SCENE
 
@@ -183,7 +183,7 @@ def terms(
         motion = start.motions[c], start.covariance[c]
         relief[of] = relief_spread(*motion, anchor_ray[of], target[of])
     other = part != SCENE
-    drawn = start.at_rest | (start.tie == FIXED) | (start.bends & start.unexplained)
+    drawn = start.at_rest | (start.origin == FIXED) | (start.bends & start.unexplained)
     local = np.sqrt(noise * np.maximum(noise, MISFIT * flow_misfit(rec, flow)))
     return {
         "flow": local[labels] * np.minimum(spread, LARGEST),
@@ -212,7 +212,7 @@ def kinds(rec: Reconstruction, flow: Flow, start: Start, drawn: Mask, given: Mas
         drawn: (H, W) True where nothing tells the depth.
         given: (N,) True where a given depth decides.
     """
-    by_others = (start.component != SCENE) | start.bends | start.borrowed | given
+    by_others = (start.component != SCENE) | start.bends | start.interpolated | given
     inferred = by_others[rec.labels] | (flow.confidence <= 0) | hidden(rec)
     return np.where(drawn, 2, inferred).astype(np.uint8)
 
@@ -224,7 +224,7 @@ def confidence(
     data: EnergyData,
     weights: Weights,
     form: FormulationOptions,
-    given_depth: Given | None = None,
+    given_depth: GivenDepth | None = None,
 ) -> Confidence:
     """The uncertainty of the depth of an answer.
 
@@ -254,7 +254,7 @@ def confidence(
             np.full(int(start.component.max()) + 1, np.inf),
         )
         spread = np.full(labels.shape, np.inf)
-    rigid = ~start.bends & (start.tie != FIXED) & (not start.at_rest)
+    rigid = ~start.bends & (start.origin != FIXED) & (not start.at_rest)
     sure = evidence(rec.soup, data, start.component, start.noise, pair.focal_sigma, rigid)
     component = np.sqrt(variances.component)
     known = terms(rec, pair.flow, start, data.anchor_ray, spread, component, sure)

@@ -32,7 +32,7 @@ class Component:
         pixels: Number of its pixels.
         residual_px: Median distance, in the next image, between the component's points moved by
             `motion` and by their superpixels' motions, pixels; large if it is not rigid.
-        borrowed: Share of its pixels whose depth is that of neighbours.
+        interpolated: Share of its pixels whose depth is that of neighbours.
         centre: (3,) median of its points in the reference frame.
     """
 
@@ -41,7 +41,7 @@ class Component:
     superpixels: int
     pixels: int
     residual_px: float
-    borrowed: float
+    interpolated: float
     centre: Float
 
     def __str__(self) -> str:
@@ -116,14 +116,14 @@ def find_components(
     group: Int,
     K_ref: Float,
     K_next: Float,
-    borrowed: Mask | None = None,
+    interpolated: Mask | None = None,
 ) -> Components:
     """One rigid motion for every group of superpixels; groups with the same motion are joined.
 
     A motion is fitted to the anchors and rims as their superpixels' motions move them: least
     absolute distances in the next image by re-weighted Procrustes fits; without a point in front of
     both cameras it is that of the first superpixel. The first of the groups (N,) is the background;
-    `borrowed` (N,) marks superpixels with the depth of neighbours.
+    `interpolated` (N,) marks superpixels with the depth of neighbours.
     """
     ray = rays(K_ref, np.concatenate([seg.anchors[:, None], seg.rim], axis=1))
     before = soup.points(ray)
@@ -153,7 +153,7 @@ def find_components(
     pixels = np.bincount(label, seg.sizes, len(motions)).astype(np.int64)
     order = np.concatenate([[0], 1 + np.argsort(-pixels[1:], kind="stable")])
     label = np.argsort(order)[label]
-    lent = np.zeros(len(soup), bool) if borrowed is None else borrowed
+    lent = np.zeros(len(soup), bool) if interpolated is None else interpolated
     members = []
     for c, old in enumerate(order):
         mask = label == c
@@ -167,7 +167,7 @@ def find_components(
                 superpixels=int(mask.sum()),
                 pixels=int(pixels[old]),
                 residual_px=float(np.median(off)) if len(x) else np.nan,
-                borrowed=float(seg.sizes[mask & lent].sum() / pixels[old]),
+                interpolated=float(seg.sizes[mask & lent].sum() / pixels[old]),
                 centre=np.median(x, axis=0) if len(x) else np.full(3, np.nan),
             )
         )

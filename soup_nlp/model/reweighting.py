@@ -68,16 +68,16 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
     by_prior, depth, change = np.zeros((3, len(i)))
     turn = np.zeros((len(a), 3))
     if known.prior is not None:
-        log_depth, opened, error = known.prior
+        log_depth, ambiguity, error = known.prior
         error = np.maximum(error[i], error[k])
-        by_prior = np.where(group[i] == group[k], np.maximum(opened[i], opened[k]), 1.0)
+        by_prior = np.where(group[i] == group[k], np.maximum(ambiguity[i], ambiguity[k]), 1.0)
         by_prior = np.where(np.isfinite(error), by_prior, 0.0)
         depth, change = by_prior * prior / error, log_depth[i] - log_depth[k]
         # the flow holds no slopes where the prior decides: its own stay; it may have steps
-        tilted = np.flatnonzero((opened > 0.5)[data.pairs].all(axis=1) & ~(bends[a] | bends[b]))
+        tilted = np.flatnonzero((ambiguity > 0.5)[data.pairs].all(axis=1) & ~(bends[a] | bends[b]))
         turn[tilted] = (soup.n[a] - soup.n[b])[tilted]
-        stiff |= opened > 0.5
-        steps = gap & (opened > 0.5)[data.pairs].any(axis=1)
+        stiff |= ambiguity > 0.5
+        steps = gap & (ambiguity > 0.5)[data.pairs].any(axis=1)
         touching = np.where(steps, options.across, touching)
     order, step = np.zeros((2, len(a)))
     if known.order is not None and options.weights.order > 0:
@@ -117,10 +117,10 @@ def _with_scene(data: EnergyData, soup: Soup, known: Known, weight: float) -> En
     if weight == 0 or len(members) < 2:
         return data
     z = soup.depth_at(data.anchor_ray)[members]
-    hub = members[np.argsort(z)[len(z) // 2]]
-    edges = np.sort(np.column_stack([np.full(len(members), hub), members]), axis=1)
+    centre = members[np.argsort(z)[len(z) // 2]]
+    edges = np.sort(np.column_stack([np.full(len(members), centre), members]), axis=1)
     n = len(data)
-    edges = edges[~np.isin(edges @ [n, 1], np.append(data.edges @ [n, 1], hub * (n + 1)))]
+    edges = edges[~np.isin(edges @ [n, 1], np.append(data.edges @ [n, 1], centre * (n + 1)))]
     values = {"edge_weight": weight, "edge_unit": 1.0, "rotation_scale": 1.0}
     more = {k: np.full(len(edges), values.get(k, 0.0)) for k in OF_EDGES} | {"edges": edges}
     rows: dict[str, Any] = {k: np.concatenate([getattr(data, k), v]) for k, v in more.items()}

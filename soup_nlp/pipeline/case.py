@@ -26,10 +26,10 @@ from soup_nlp.solve.solver_options import ITERATIONS, Stages
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.camera_error import camera_error
 from soup_nlp.start.epipolar import Matches, estimate
-from soup_nlp.start.given_depth import Given, by_prior
+from soup_nlp.start.given_depth import GivenDepth, by_prior
 from soup_nlp.start.prior_evidence import JUDGED_PIECES, LEAST_SIGMA, PriorEvidence, judged
 from soup_nlp.start.propose import Start, most_usual, propose
-from soup_nlp.start.regions import TIES, TOO_FAST, covering
+from soup_nlp.start.regions import ORIGINS, TOO_FAST, covering
 from soup_nlp.start.views import FlowFit, SeededStart
 from soup_nlp.storage.progress import Watch
 from soup_nlp.storage.system import require_memory
@@ -196,7 +196,11 @@ def solver_options(problem: Problem, start: Start) -> Stages:
 
 
 def build_energy(
-    problem: Problem, pair: Pair, seg: Segmentation, start: Start, given_depth: Given | None = None
+    problem: Problem,
+    pair: Pair,
+    seg: Segmentation,
+    start: Start,
+    given_depth: GivenDepth | None = None,
 ) -> tuple[EnergyData, Weights]:
     """The energy of a problem, on a pair that carries its flow."""
     assert pair.flow is not None
@@ -208,12 +212,12 @@ def build_energy(
     data = replace(data, pixel_weight=np.where(start.wrong[:, None], 0.0, data.pixel_weight))
     prior = None
     if given_depth is not None and given_depth.evidence.used:
-        prior = given_depth.log_depth, given_depth.opened, given_depth.error
+        prior = given_depth.log_depth, given_depth.ambiguity, given_depth.error
     elif start.at_rest:
         # nothing is measured: terms on shape must not undo what is drawn
         drawn, one = np.log(start.soup.depth_at(data.anchor_ray)), np.ones(len(seg))
         prior = drawn, one, LEAST_SIGMA * one
-    placed = np.isin(start.tie, [TIES.index("occlusion"), TOO_FAST])
+    placed = np.isin(start.origin, [ORIGINS.index("occlusion"), TOO_FAST])
     known = Known(start.component, bends, start.variance, start.noise, start.order, placed, prior)
     data = weighted(data, start.soup, known, e)
     if e.units == "paper":

@@ -28,7 +28,7 @@ from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp, exact_c
 from soup_nlp.refine.records import Refined
 from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import Solution
-from soup_nlp.start.given_depth import Given
+from soup_nlp.start.given_depth import GivenDepth
 from soup_nlp.start.propose import Start
 
 
@@ -58,7 +58,7 @@ class Case:
     soup: Soup
     options: Stages
     original: Pair | None = None
-    given: Given | None = None
+    given: GivenDepth | None = None
 
     def __len__(self) -> int:
         return len(self.segmentation)
@@ -151,7 +151,7 @@ class Run(Case):
         """Rigid components with their motions; the first is the static scene."""
         pair, start = self.pair, self.start
         geometry = self.soup, self.segmentation, start.part, pair.K_ref, pair.K_next
-        return find_components(*geometry, start.borrowed)
+        return find_components(*geometry, start.interpolated)
 
     @property
     def camera(self) -> RigidMotion:

@@ -18,7 +18,7 @@ SAID = {
     "drawn": "drawn: nothing tells its depth",
 }
 """Words for the kinds of depth (`evaluation.confidence.KINDS`)."""
-ORIGINS = {
+ORIGIN_WORDS = {
     "reference": "the largest, which defines the scale",
     "contact below": "its scale from what it stands on",
     "outline": "its scale from what is around it",
@@ -29,7 +29,7 @@ ORIGINS = {
     "occlusion": "placed in front of what it covers",
     "too fast": "nearer than its contact, at which it would move too far",
 }
-"""Words for what gives a component its scale (`components.TIES`)."""
+"""Words for what gives a component its scale (`regions.ORIGINS`)."""
 USABLE, MATCHED = 0.8, 0.2
 """Shares of usable flow below which it counts as a limit, and below which the frames may show two
 scenes, if most depth is drawn."""
@@ -157,7 +157,7 @@ def hints(run: Run) -> list[str]:
     if unmatched(run):
         # what the little flow suggests (no parallax, a wrong camera) is no cause
         return ["two frames of the same scene, closer in time: hardly anything is in both"]
-    if share(start.tie == FIXED) >= LEAST:
+    if share(start.origin == FIXED) >= LEAST:
         out.append(
             "frames without what stands still in the image while the camera moves (a watermark, a"
             " logo, the bonnet of its car)"

@@ -139,7 +139,7 @@ def write_failure(folder: Path, log: str, ipopt_log: Path, overwrite: bool = Fal
 
 # --- the run that Python gets --------------------------------------------------------------------
 
-Given = ParamSpec("Given")
+Params = ParamSpec("Params")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -175,11 +175,11 @@ class WritableRun(Run):
         return shown(str(self), np.asarray(self.plot()))
 
 
-def _writable(solve: Callable[Given, Run]) -> Callable[Given, WritableRun]:
+def _writable(solve: Callable[Params, Run]) -> Callable[Params, WritableRun]:
     """The same function with a `WritableRun` as its result."""
 
     @wraps(solve)
-    def solved(*args: Given.args, **options: Given.kwargs) -> WritableRun:
+    def solved(*args: Params.args, **options: Params.kwargs) -> WritableRun:
         done = solve(*args, **options)
         return WritableRun(**{field.name: getattr(done, field.name) for field in fields(done)})
 

@@ -19,10 +19,10 @@ from soup_nlp.geometry.rotation import log, nearest
 from soup_nlp.geometry.surface import hidden, whole_cells
 from soup_nlp.report.chain import STILL, Chain
 from soup_nlp.report.figures import Legend, Picture, component_colours, data_url
-from soup_nlp.report.findings import ORIGINS, SAID, drawn_line
+from soup_nlp.report.findings import ORIGIN_WORDS, SAID, drawn_line
 from soup_nlp.report.pictures import pictures
 from soup_nlp.report.result import Result
-from soup_nlp.start.regions import TIES
+from soup_nlp.start.regions import ORIGINS
 from soup_nlp.storage.files import plain
 
 MODES = {
@@ -159,7 +159,7 @@ def make_scene(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> dict
         "far": far,
         "deepest": float(z.max()),
         "unit": chain.length,
-        "origins": [ORIGINS[name] for name in TIES],
+        "origins": [ORIGIN_WORDS[name] for name in ORIGINS],
         "kinds": [*SAID.values()],
     }
 
@@ -188,7 +188,7 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
         "motion": (N, 9) motion of every superpixel relative to the background: rotation vector w,
             pivot p and shift s; at time t a point X is at exp(t w) (X - p) + p + t s.
         "motionCamera": (N, 9) the same relative to the camera.
-        "component": (N,) what moves as one, by track. "tie": (N,) index in "origins".
+        "component": (N,) what moves as one, by track. "origin": (N,) index in "origins".
         "seen": (h, w) pixels that are visible in the next frame.
         "sigma": (h, w) standard deviation of log depth, 0 to 254 for 0 to 0.5; 255 where unknown.
         "surface": bits of the (h - 1, w - 1) cells of four pixels without a jump of the depth.
@@ -214,7 +214,7 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
         "sigma": byte.round().astype(np.uint8),
         "kind": result.kind[every].astype(np.uint8),
         "component": chain.tracks[k][result.components.of_superpixel].astype(np.uint16),
-        "tie": np.asarray(start["tie"], np.uint8),
+        "origin": np.asarray(start["origin"], np.uint8),
         "surface": np.packbits(whole_cells(*result.surface, known, step), bitorder="little"),
         "count": len(soup),
         "step": step,

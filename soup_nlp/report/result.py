@@ -252,7 +252,9 @@ def load(folder: str | Path) -> Result:
         seg, (height, width) = Segmentation(**given), tree["depth"]["next"].shape
         rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
         start = tree["start"]
-        parts = start["part"], K_ref, K_next, start["borrowed"].astype(bool)
+        # older results name it so
+        interpolated = start.get("interpolated", start.get("borrowed"))
+        parts = start["part"], K_ref, K_next, interpolated.astype(bool)
         return Result(
             tree=tree,
             summary=summary,

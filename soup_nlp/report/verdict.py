@@ -239,7 +239,7 @@ def summary(run: Run) -> dict[str, Any]:
         },
         "start": {
             "motions": len(run.start.motions),
-            "borrowed": int(run.start.borrowed.sum()),
+            "interpolated": int(run.start.interpolated.sum()),
             "median_error_px": float(np.median(run.start.error)),
         },
         "certainty": certainty(run),

@@ -26,7 +26,7 @@ LEAST_OVERLAP = 0.3
 
 def still(result: Result) -> bool:
     """Whether most of the background has no parallax."""
-    return result.components.background.borrowed > MOST_DRAWN
+    return result.components.background.interpolated > MOST_DRAWN
 
 
 def link(

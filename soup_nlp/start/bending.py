@@ -204,19 +204,19 @@ def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float
     return Soup(np.ones(len(R)), n, np.ones(len(R)), R, T).normalised(), error
 
 
-TORN = 8.0
+DISCONTINUOUS = 8.0
 """Ratio of the 95 % quantile of the flow's jumps inside surfaces to their median above which parts
 move differently: surfaces that bend have at most 6.4, vehicles that seem to bend at least 9.2."""
 
 
-def torn(flow: FlowFit, surface: Int, bends: Mask) -> Mask:
+def discontinuous(flow: FlowFit, surface: Int, bends: Mask) -> Mask:
     """(N,) True in connected regions that bend although the flow jumps inside surfaces (N,)."""
     region, pairs = connected_pieces(bends, flow.seg), flow.seg.pairs
     inside = (bends & flow.views.usable)[pairs].all(axis=1) & ~flow.seg.across(surface)
     out = np.zeros(len(bends), bool)
     for c in np.unique(region[bends]):
         jump = flow.jump[inside & (region[pairs] == c).all(axis=1)]
-        if len(jump) and np.quantile(jump, 0.95) > TORN * np.median(jump):
+        if len(jump) and np.quantile(jump, 0.95) > DISCONTINUOUS * np.median(jump):
             out |= region == c
     return out
 

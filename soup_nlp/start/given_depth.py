@@ -21,11 +21,11 @@ from soup_nlp.start.prior_evidence import (
     JUDGED_PIECES,
     LEAST_SIGMA,
     PriorEvidence,
-    Seen,
+    StartWithFlow,
     without_gaps,
 )
 from soup_nlp.start.propose import Start
-from soup_nlp.start.regions import FIXED, SCENE, TIES
+from soup_nlp.start.regions import FIXED, ORIGINS, SCENE
 from soup_nlp.start.views import FlowFit
 
 HELD_SHARE, NEAR_SHARE = PIECE_SIZE / JUDGED_PIECES, 0.1
@@ -36,14 +36,14 @@ SLOPE_REACH = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Given:
+class GivenDepth:
     """A depth prior as the start uses it.
 
     Attributes:
         evidence: Evidence of flow and image for it.
         log_depth: (N,) log depth at the anchors, up to a common scale.
         sigma: (N,) its standard deviation, estimated from the flow; inf where it decides nothing.
-        opened: (N,) how far the flow leaves the shape of a component open, 0 to 1.
+        ambiguity: (N,) how far the flow leaves the shape of a component open, 0 to 1.
         error: (N,) standard deviation of log depth by which E_depth weighs the prior.
         from_prior: (N,) True where depth or scale of the start are the prior's.
     """
@@ -51,7 +51,7 @@ class Given:
     evidence: PriorEvidence
     log_depth: Float
     sigma: Float
-    opened: Float
+    ambiguity: Float
     error: Float
     from_prior: Mask
 
@@ -64,7 +64,7 @@ class Given:
 
 def by_prior(
     start: Start, pair: Pair, flow: FlowFit, evidence: PriorEvidence
-) -> tuple[Start, Given]:
+) -> tuple[Start, GivenDepth]:
     """The start with depths and scales of the pair's prior where the flow leaves them open.
 
     Every rigid component, the scene first, takes its shape and motion from flow and prior and its
@@ -76,11 +76,11 @@ def by_prior(
     value, with_value, whole = without_gaps(pair, seg)
     prior, sigma = evidence.log_depth(value), np.full(n, evidence.sigma)
     if not evidence.used:
-        return start, Given(evidence, prior, sigma, np.zeros(n), sigma, np.zeros(n, bool))
-    seen, main = Seen(start, flow), start.component == SCENE
+        return start, GivenDepth(evidence, prior, sigma, np.zeros(n), sigma, np.zeros(n, bool))
+    seen, main = StartWithFlow(start, flow), start.component == SCENE
     soup, before = start.soup, np.log(start.soup.depth_at(anchor))
     # components that are fixed in the image keep their depth relative to the scene
-    fixed = start.tie == FIXED
+    fixed = start.origin == FIXED
     off, strong = np.zeros(n), fixed.copy()
     for c in np.unique(start.component[~start.bends & ~fixed]):
         determined = evidence.determined if c == SCENE else seen.relief(c) > least_gap(start.noise)
@@ -98,23 +98,23 @@ def by_prior(
     off = np.where(start.bends, before - prior, off)
     sigma = np.where(fixed | ~with_value, np.inf, sigma)
     noise = start.noise / np.maximum(flow.views.parallax(soup), 1e-3)
-    opened = np.where(strong & ~fixed, 1 / (1 + (sigma / noise) ** 2) ** 2, 1.0)
+    ambiguity = np.where(strong & ~fixed, 1 / (1 + (sigma / noise) ** 2) ** 2, 1.0)
     from_prior = ~fixed & ~(main & strong)
     # a superpixel has the translation of its component, whatever its depth
     scaled = replace(soup, lam=soup.lam * np.exp(-off))
     slope = _slopes(np.exp(-evidence.log_depth(whole)), pair, seg) * flow.views.radius[:, None]
     tilted = flow.views.soup(np.exp(-prior), slope, soup.R, scaled.translation)
     soup = scaled.taking(tilted, ~strong).normalised()
-    tie = np.where(from_prior & ~main, TIES.index("given depth"), start.tie)
+    origin = np.where(from_prior & ~main, ORIGINS.index("given depth"), start.origin)
     # without a flow to weigh it against, terms on shape must not undo the prior
     error = sigma if evidence.determined else np.where(np.isfinite(sigma), LEAST_SIGMA, np.inf)
     decides = np.where(from_prior, sigma, np.inf)
-    given = Given(evidence, prior, decides, opened, error, from_prior)
-    return replace(start, soup=soup, tie=tie), given
+    given = GivenDepth(evidence, prior, decides, ambiguity, error, from_prior)
+    return replace(start, soup=soup, origin=origin), given
 
 
 def _shaped(
-    seen: Seen, soup: Soup, c: int, prior: Float, sigma: float, determined: bool
+    seen: StartWithFlow, soup: Soup, c: int, prior: Float, sigma: float, determined: bool
 ) -> tuple[Soup, Mask]:
     """Soup with the planes and the motion of a rigid component by flow and prior, see `settled`.
 
@@ -125,7 +125,7 @@ def _shaped(
     mask = start.component == c
     rigid = np.ptp(soup.R[mask], axis=0).max() < 1e-9 and np.any(soup.translation[mask][0])
     if len(use) < LEAST_MATCHES or not rigid:
-        firm = mask & ~start.borrowed
+        firm = mask & ~start.interpolated
         return soup, firm if firm.any() else mask
     if not determined:
         _, R, T, _ = seen.motion(use, np.exp(-prior[use]))

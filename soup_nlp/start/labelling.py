@@ -226,7 +226,7 @@ def smooth(flow: FlowFit, cost: Float) -> Int:
     return solve_trws(cost, seg.pairs, weight[:, None, None] * (1 - np.eye(m)), max_iter=30).labels
 
 
-def settle(flow: FlowFit, choice: Labelling) -> tuple[Labelling, Float]:
+def with_least_relief(flow: FlowFit, choice: Labelling) -> tuple[Labelling, Float]:
     """The labelling with the most probable motion of every rigid component (`most_probable`).
 
     The error that the flow of a component shares follows from what its motion leaves unexplained,

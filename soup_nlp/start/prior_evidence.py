@@ -104,7 +104,7 @@ class PriorEvidence:
         return self.sigma < np.inf
 
 
-class Seen(NamedTuple):
+class StartWithFlow(NamedTuple):
     """A start and the flow that it explains."""
 
     start: Start
@@ -195,13 +195,13 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
 
     The start without the prior and the flow are those of about `JUDGED_PIECES` superpixels.
     """
-    seen = Seen(start, flow)
+    seen = StartWithFlow(start, flow)
     value, with_value, whole = without_gaps(pair, flow.seg)
     anchor, relief = flow.views.anchor, seen.relief(SCENE)
     known = with_value & seen.usable & (start.component == SCENE)
     determined = relief > least_gap(start.noise)
     tells = relief > least_gap(start.noise) / 3 and known.sum() >= LEAST_MATCHES
-    sure = known & ~start.borrowed
+    sure = known & ~start.interpolated
     if tells and sure.sum() >= LEAST_MATCHES:
         far = ranks(start.soup.depth_at(anchor)[sure]), ranks(value[sure])
     else:

@@ -12,9 +12,9 @@ from soup_nlp.geometry.plane import about_anchor, at_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import (
     constant_depth,
+    discontinuous,
     moving_pieces,
     surface_motions,
-    torn,
     turn_alone,
 )
 from soup_nlp.start.epipolar import (
@@ -32,11 +32,11 @@ from soup_nlp.start.labelling import (
     fixed_to_camera,
     labelled,
     limited_noise,
-    settle,
+    with_least_relief,
 )
 from soup_nlp.start.regions import (
+    ORIGINS,
     SCENE,
-    TIES,
     connected_labels,
     connected_pieces,
     continued,
@@ -55,7 +55,7 @@ class Start:
         soup: Start of the optimisation, mean plane distance 1.
         error: (N,) mean re-projection error of every superpixel, pixels.
         parallax: (N,) pixels by which its translation moves the anchor.
-        borrowed: (N,) True where plane or motion come from neighbours.
+        interpolated: (N,) True where plane or motion come from neighbours.
         motion: (N,) index of its motion in `motions`, -1 where it has its own.
         component: (N,) index of the rigid component, which shares one scale: the superpixels of a
             dominant motion, or a connected piece of superpixels with their own motions; `SCENE`.
@@ -63,11 +63,11 @@ class Start:
         motions: The M motions that superpixels share.
         covariance: (M, 5, 5) covariances by the error that a flow shares, see `relief_spread`.
         surface: (N,) index of the surface: a connected group without flow discontinuities inside.
-        tie: (N,) origin of the scale of every superpixel's component, an index of `TIES`.
+        origin: (N,) origin of the scale of every superpixel's component, an index of `ORIGINS`.
         bends: (N,) True where the energy for bending surfaces is used. Its connected regions are
             components that start at a constant depth, each superpixel with a motion of its own.
         unexplained: (N,) True where nothing tells the depth: the motion leaves a large error, or a
-            region bends although its flow jumps, see `torn`.
+            region bends although its flow jumps, see `discontinuous`.
         wrong: (N,) True where the motion does not explain the flow, which does not count then.
         at_rest: Whether the camera is taken to be at rest, or to turn only.
         noise: Noise of the flow, pixels, see `limited_noise`.
@@ -81,14 +81,14 @@ class Start:
     soup: Soup
     error: Float
     parallax: Float
-    borrowed: Mask
+    interpolated: Mask
     motion: Int
     component: Int
     part: Int
     motions: list[Motion]
     covariance: Float
     surface: Int
-    tie: Int
+    origin: Int
     bends: Mask
     unexplained: Mask
     wrong: Mask
@@ -103,7 +103,7 @@ class Start:
             f"{len(self.soup)} superpixels",
             f"{count or 'no'} shared motion{'s' * (count != 1)}",
             f"median error {np.median(self.error):.2f} px",
-            f"{int(self.borrowed.sum())} borrowed",
+            f"{int(self.interpolated.sum())} interpolated",
         ]
         parts += [f"{self.bends.mean():.0%} bending"] * self.bending
         return f"Start({', '.join(parts)})"
@@ -111,21 +111,23 @@ class Start:
     __repr__ = __str__
 
     @classmethod
-    def whole(cls, views: Views, soup: Soup, error: Float, borrowed: Mask, noise: float) -> Self:
+    def whole(
+        cls, views: Views, soup: Soup, error: Float, interpolated: Mask, noise: float
+    ) -> Self:
         """A start whose only component and surface is the whole image, without shared motions."""
         zero, none = np.zeros(len(soup), np.int64), np.zeros(len(soup), bool)
         return cls(
             soup=soup,
             error=error,
             parallax=views.parallax(soup),
-            borrowed=borrowed,
+            interpolated=interpolated,
             motion=zero - 1,
             component=zero,
             part=zero,
             motions=[],
             covariance=np.zeros((0, 5, 5)),
             surface=zero,
-            tie=zero,
+            origin=zero,
             bends=none,
             unexplained=none,
             wrong=none,
@@ -134,9 +136,9 @@ class Start:
 
     @property
     def variance(self) -> Float:
-        """(N,) variance of log depth by noise and parallax; inf where the depth is borrowed."""
+        """(N,) variance of log depth by noise and parallax; inf where the depth is interpolated."""
         with np.errstate(divide="ignore"):
-            return np.asarray((self.noise / np.where(self.borrowed, 0.0, self.parallax)) ** 2)
+            return np.asarray((self.noise / np.where(self.interpolated, 0.0, self.parallax)) ** 2)
 
     @property
     def bending(self) -> bool:
@@ -169,17 +171,17 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     """
     seg, views, o = flow.seg, flow.views, flow.options
     if o.method == "homography":
-        soup, borrowed = unorganised(flow)
+        soup, interpolated = unorganised(flow)
         soup = soup.normalised()
         error = views.distance(soup.moved(soup.points(views.ray)))
-        return Start.whole(views, soup, error, borrowed, limited_noise(error))
+        return Start.whole(views, soup, error, interpolated, limited_noise(error))
     contrast = np.zeros(len(seg.pairs)) if contrast is None else contrast
     fixed, shift = fixed_to_camera(flow)
     flow = flow.without(fixed)
     surface = connected_labels(flow.jump < JUMP_PX, seg)
     motions, bends = surface_motions(flow, surface)
     bends &= o.bending
-    jumping = torn(flow, surface, bends)
+    jumping = discontinuous(flow, surface, bends)
     # the flow of bending regions is no evidence of the motions of rigid ones
     rigid = flow.without(bends)
     choice = None if bends.all() else labelled(rigid, motions, surface)
@@ -195,7 +197,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         )
         part = _scene_first(surface) if turn is None else moving_pieces(flow)
         return _ordered(flow, start, part, contrast)
-    choice, covariance = settle(rigid, choice)
+    choice, covariance = with_least_relief(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
     soup, weak = _with_depth(rigid, choice, wrong)
     label = component = choice.label
@@ -213,7 +215,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     component = _scene_first(component, ~fixed)
     floor = ground(flow, 1 / soup.depth_at(views.anchor), reliable & (component == SCENE))
     order = vote(contrast, component, seg)
-    scale, tie = scaled(flow, soup, component, order, fixed, floor)
+    scale, origin = scaled(flow, soup, component, order, fixed, floor)
     soup = replace(soup, lam=soup.lam * scale)
     soup, lifted = on_ground(flow, soup, floor, reliable, component)
     wrong = (wrong | lifted) & ~bends
@@ -223,33 +225,33 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         soup=soup.normalised(),
         error=error,
         parallax=parallax,
-        borrowed=weak | lifted,
+        interpolated=weak | lifted,
         motion=label,
         component=component,
         part=component,
         motions=choice.motions,
         covariance=covariance,
         surface=surface,
-        tie=tie,
+        origin=origin,
         bends=bends,
         unexplained=jumping | (wrong & large),
         wrong=wrong,
         noise=limited_noise(error[~bends]),
-        order=held(flow, soup, component, tie, order, contrast),
+        order=held(flow, soup, component, origin, order, contrast),
     )
 
 
 def _ordered(flow: FlowFit, start: Start, part: Int, contrast: Float) -> Start:
     """A start without relief, with its parts (N,) placed in the order by occlusion."""
     order = vote(contrast, part, flow.seg)
-    scale, tie = scaled(flow, start.soup, part, order)
+    scale, origin = scaled(flow, start.soup, part, order)
     moved = np.abs(scale - 1) > 1e-6
     soup = replace(start.soup, lam=start.soup.lam * scale).normalised()
-    tie = np.where(moved, TIES.index("occlusion"), 0)
+    origin = np.where(moved, ORIGINS.index("occlusion"), 0)
     component = numbered(np.where(moved, part, SCENE))
-    stays = held(flow, soup, component, tie, order, contrast)
+    stays = held(flow, soup, component, origin, order, contrast)
     part = part if start.at_rest else component
-    return replace(start, soup=soup, tie=tie, component=component, part=part, order=stays)
+    return replace(start, soup=soup, origin=origin, component=component, part=part, order=stays)
 
 
 def _scene_first(label: Int, counts: Mask | None = None) -> Int:
@@ -259,8 +261,9 @@ def _scene_first(label: Int, counts: Mask | None = None) -> Int:
 
 
 def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Mask]:
-    """Planes under the chosen motions, and (N,) True where they are borrowed from neighbours, also
-    where the motion does not explain the flow, `wrong` (N,).
+    """Planes under the chosen motions, and (N,) True where they are interpolated.
+
+    They are also where the motion does not explain the flow, `wrong` (N,).
     """
     fit, views = choice.fit, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
@@ -298,7 +301,7 @@ PATCH_PIXELS, PATCH_PX = 400, 0.5
 
 
 def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
-    """The soup of independent superpixels with equal scales, and which of them borrowed (N,).
+    """The soup of independent superpixels with equal scales, and which are a neighbour's (N,).
 
     The motion (R, t) of a superpixel comes from the flow of itself and of its nearest neighbours,
     by essential matrix and cheirality; its plane then follows from `q ~ (R - t n^T / d) r`, which
@@ -313,7 +316,7 @@ def unorganised(flow: FlowFit) -> tuple[Soup, Mask]:
     sideways = SIDEWAYS, np.array([0.0, 0.0, 1.0])
     motions, planes = zip(*(patches[s] or sideways for s in source))
     R, t = stacked(motions)
-    # a borrowed plane keeps depth and slopes, since at this anchor it may be behind the camera
+    # a neighbour's plane keeps depth and slopes, since at this anchor it may be behind the camera
     depth, slope = at_anchor(np.stack(planes), anchor[source])
     n, D = normal_and_distance(about_anchor(np.ones(len(seg)), slope, anchor))
     return Soup(np.ones(len(seg)), n, D, R, t / depth[:, None]), fails

@@ -40,7 +40,7 @@ def numbered(label: Int) -> Int:
 
 SCENE = 0
 """Index of the component that is the static scene: depths and motions refer to it."""
-TIES = (
+ORIGINS = (
     "reference",
     "contact below",
     "outline",
@@ -58,7 +58,7 @@ still there, though the camera moves, and is placed by its outline. given depth:
 it. occlusion: it covers its background, and is placed in front of it by the least step that is
 usual. too fast: contact is probably wrong, because it would make the component move much farther
 than the scene."""
-FIXED, TOO_FAST = TIES.index("fixed in the image"), TIES.index("too fast")
+FIXED, TOO_FAST = ORIGINS.index("fixed in the image"), ORIGINS.index("too fast")
 
 
 # --- what is not seen continues what is around it -------------------------------------------------

@@ -5,7 +5,7 @@ pair of neighbours and x the log scales, the program adds up
 
 * contact: the pinball loss with the quantile `HIDES` of `x_a - x_b - log(z_b / z_a)` over the
   outline of a component, which hides what is behind it; below it, where it stands, it counts more;
-* pace: what a component moves farther than the scene;
+* displacement: what a component moves farther than the scene;
 * ground: how far a component reaches below the ground of the scene;
 * order: by how much a component that covers another one is less than `LEAST_STEP_IN_FRONT`
   before it.
@@ -24,7 +24,7 @@ from scipy.optimize import linprog
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.regions import CONTRAST, FIXED, SCENE, TIES, TOO_FAST, numbered
+from soup_nlp.start.regions import CONTRAST, FIXED, ORIGINS, SCENE, TOO_FAST, numbered
 from soup_nlp.start.views import JUMP_PX, FlowFit
 
 STEEP_COSINE = 0.5
@@ -34,20 +34,20 @@ HIDES = 0.3
 STRONG = 3.0
 """Weight of the contact below a component and of the order along an outline, relative to the
 contact of a whole outline."""
-FASTER, FREE_PACE = 1.5, 1.0
+FASTER, FREE_DISPLACEMENT = 1.5, 1.0
 """Price of a log unit by which a component moves farther than the scene, and how many are free."""
 UNDER = 2.0
 """Price of a log unit by which a component lies below the ground."""
 LEAST_STEP_IN_FRONT = 0.3
 """Least step of log depth along the outline of what covers something: true steps have medians of
 0.2 to 1.9."""
-MOST_LOG_PACE, MOST_LOG_SCALE = np.log(100.0), 6.0
+MOST_LOG_DISPLACEMENT, MOST_LOG_SCALE = np.log(100.0), 6.0
 """If motion and contact differ by more, in logarithms, the camera is taken to be at rest; largest
 log scale."""
 
 
 class Rows(NamedTuple):
-    """Rows `w_up max(r, 0) + w_down max(-r, 0)`, r = x_a - x_b - value, of a kind of `TIES`.
+    """Rows `w_up max(r, 0) + w_down max(-r, 0)`, r = x_a - x_b - value, of a kind of `ORIGINS`.
 
     Every field is an array, or a number for all rows.
     """
@@ -57,7 +57,7 @@ class Rows(NamedTuple):
     value: Float
     up: Float | float
     down: Float | float
-    tie: Int | int
+    origin: Int | int
 
 
 def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
@@ -79,12 +79,12 @@ def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
     cost = np.concatenate([np.zeros(count), up, down])
     x = linprog(cost, A_eq=A.tocsr(), b_eq=value, bounds=np.vstack([bounds, slack])).x[:count]
     exact = np.abs(x[a] - x[b] - value) < 1e-7
-    tie = np.full(count, TIES.index("nothing"))
+    origin = np.full(count, ORIGINS.index("nothing"))
     for end in (b, a):
         for row in np.flatnonzero(exact)[np.argsort((up + down)[exact], kind="stable")]:
-            tie[end[row]] = kind[row]
-    tie[still] = TIES.index("reference")
-    return x, tie
+            origin[end[row]] = kind[row]
+    origin[still] = ORIGINS.index("reference")
+    return x, origin
 
 
 def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> Rows:
@@ -104,11 +104,11 @@ def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> Rows:
     a, b = label[own[mine]], label[other[mine]]
     part = 2 * a + below
     weight = length / np.bincount(part, length)[part] * np.where(below, STRONG, 1.0)
-    tie = np.where(below, TIES.index("contact below"), TIES.index("outline"))
-    return Rows(a, b, ratio, weight * (1 - HIDES), weight * HIDES, tie)
+    origin = np.where(below, ORIGINS.index("contact below"), ORIGINS.index("outline"))
+    return Rows(a, b, ratio, weight * (1 - HIDES), weight * HIDES, origin)
 
 
-def pace(flow: FlowFit, soup: Soup, label: Int) -> Rows:
+def displacement(flow: FlowFit, soup: Soup, label: Int) -> Rows:
     """Rows of how far the anchors of components (N,) move relative to the camera, which turns as
     the scene does; medians count."""
     point = soup.points(flow.views.anchor)
@@ -118,8 +118,8 @@ def pace(flow: FlowFit, soup: Soup, label: Int) -> Rows:
     median = np.array([np.median(far[label == c]) for c in range(int(label.max()) + 1)])
     median = np.maximum(median, 1e-12)
     ratio = np.log(median / median[SCENE])
-    c = np.flatnonzero((np.abs(ratio) < MOST_LOG_PACE) & (np.arange(len(ratio)) != SCENE))
-    return Rows(c, SCENE, FREE_PACE - ratio[c], FASTER, 0.0, TOO_FAST)
+    c = np.flatnonzero((np.abs(ratio) < MOST_LOG_DISPLACEMENT) & (np.arange(len(ratio)) != SCENE))
+    return Rows(c, SCENE, FREE_DISPLACEMENT - ratio[c], FASTER, 0.0, TOO_FAST)
 
 
 def above(flow: FlowFit, soup: Soup, label: Int, floor: Float) -> Rows:
@@ -128,7 +128,7 @@ def above(flow: FlowFit, soup: Soup, label: Int, floor: Float) -> Rows:
     at = np.flatnonzero((floor > 0) & (label != SCENE))
     weight = UNDER * (size[at] / np.bincount(label, size)[label[at]])
     value = np.log(mu[at] / floor[at])
-    return Rows(label[at], SCENE, value, weight, 0.0, TIES.index("ground"))
+    return Rows(label[at], SCENE, value, weight, 0.0, ORIGINS.index("ground"))
 
 
 def before(flow: FlowFit, soup: Soup, label: Int, order: Float) -> Rows:
@@ -147,7 +147,7 @@ def before(flow: FlowFit, soup: Soup, label: Int, order: Float) -> Rows:
     outline = numbered(front * (int(label.max()) + 1) + back)
     weight = STRONG * length / np.bincount(outline, length)[outline]
     value = np.log(z[1] / z[0]) - LEAST_STEP_IN_FRONT
-    return Rows(front, back, value, weight, 0.0, TIES.index("occlusion"))
+    return Rows(front, back, value, weight, 0.0, ORIGINS.index("occlusion"))
 
 
 def scaled(
@@ -166,18 +166,18 @@ def scaled(
     """
     count = int(label.max()) + 1
     if count == 1 or not len(flow.seg.pairs):
-        return np.ones(len(soup)), np.full(len(soup), TIES.index("reference"))
+        return np.ones(len(soup)), np.full(len(soup), ORIGINS.index("reference"))
     fixed = np.zeros(len(soup), bool) if fixed is None else fixed
     parts = [contact(flow, soup, label, fixed), before(flow, soup, label, order)]
     if floor is not None:
-        parts += [pace(flow, soup, label), above(flow, soup, label, floor)]
-    x, tie = minimum(count, parts, np.array([SCENE]))
-    tie = np.where(fixed, FIXED, tie[label])
-    return np.exp(x)[label], tie
+        parts += [displacement(flow, soup, label), above(flow, soup, label, floor)]
+    x, origin = minimum(count, parts, np.array([SCENE]))
+    origin = np.where(fixed, FIXED, origin[label])
+    return np.exp(x)[label], origin
 
 
 def held(
-    flow: FlowFit, soup: Soup, label: Int, tie: Int, order: Float, contrast: Float
+    flow: FlowFit, soup: Soup, label: Int, origin: Int, order: Float, contrast: Float
 ) -> Float | None:
     """(P,) order that the energy holds, see `Start.order`; None where nothing is known.
 
@@ -186,10 +186,10 @@ def held(
     (N,), keep the steps of the soup, which the energy would close otherwise.
     """
     pairs = flow.seg.pairs
-    by_order = (tie == TIES.index("occlusion"))[pairs].any(axis=1)
+    by_order = (origin == ORIGINS.index("occlusion"))[pairs].any(axis=1)
     told = np.abs(contrast) > CONTRAST
     out = np.where(told | (by_order & (flow.jump >= JUMP_PX)), order, 0.0)
-    near = (tie == TOO_FAST)[pairs]
+    near = (origin == TOO_FAST)[pairs]
     z = soup.depth_across(pairs, flow.middle)
     second = np.where(z[1] < z[0], near[:, 1], 0.0)
     first = np.where(z[0] < z[1], near[:, 0], 0.0)

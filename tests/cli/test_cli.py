@@ -157,7 +157,7 @@ def test_little_to_see_is_a_result(flow, most, images, tmp_path):
     small += " solver.presolve_iterations=2 solver.max_iter=2"
     assert solve_files(images, tmp_path, flow=flow, sets=small) in (0, 1)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["sizes"]["superpixels"] - summary["start"]["borrowed"] == 0
+    assert summary["sizes"]["superpixels"] - summary["start"]["interpolated"] == 0
     assert summary["sizes"]["superpixels"] <= most
 
 

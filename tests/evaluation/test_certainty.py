@@ -8,9 +8,9 @@ import pytest
 
 from soup_nlp.evaluation.confidence import FACTORS, KINDS, confidence, kinds
 from soup_nlp.geometry.surface import hidden
-from soup_nlp.report.findings import ORIGINS
+from soup_nlp.report.findings import ORIGIN_WORDS
 from soup_nlp.report.verdict import certainty
-from soup_nlp.start.regions import SCENE, TIES
+from soup_nlp.start.regions import ORIGINS, SCENE
 
 
 def sure_of(run, start, given=None):
@@ -32,7 +32,7 @@ def test_every_pixel_is_of_one_kind(small_run):
     assert (sure.kind[~static] > 0).all()
 
 
-@pytest.mark.parametrize("name", ["bends", "borrowed", "given"])
+@pytest.mark.parametrize("name", ["bends", "interpolated", "given"])
 def test_what_parallax_does_not_tell_is_inferred(name, small_run):
     start, rec = small_run.start, small_run.reconstruction
     half = np.arange(len(start.soup)) % 2 == 0
@@ -72,5 +72,5 @@ def test_what_is_as_uncertain_as_a_drawing_is_one(small_run):
 
 
 def test_the_page_has_words_for_what_gives_a_component_its_scale():
-    assert ORIGINS.keys() == set(TIES)
-    assert not set(ORIGINS.values()) & set(TIES)
+    assert ORIGIN_WORDS.keys() == set(ORIGINS)
+    assert not set(ORIGIN_WORDS.values()) & set(ORIGINS)

@@ -33,7 +33,7 @@ from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.start.regions import FIXED, SCENE, TIES
+from soup_nlp.start.regions import FIXED, ORIGINS, SCENE
 
 FORM = Formulation()
 PRIOR = FACTORS["prior"]
@@ -43,8 +43,8 @@ PRIOR = FACTORS["prior"]
 def small_room(small_room):
     """The small room with a second component, whose scale is from contact."""
     second = np.arange(len(small_room.soup)) < 9
-    tie = np.where(second, TIES.index("contact below"), TIES.index("reference"))
-    start = replace(small_room.start, component=second.astype(int), tie=tie)
+    origin = np.where(second, ORIGINS.index("contact below"), ORIGINS.index("reference"))
+    start = replace(small_room.start, component=second.astype(int), origin=origin)
     return replace(small_room, start=start)
 
 
@@ -301,7 +301,7 @@ def test_relief_is_as_unsure_as_the_motion_of_its_superpixel(small_room, sure):
 @pytest.mark.parametrize("change", ["rest", "fixed"])
 def test_drawn_depth_has_the_sigma_of_what_is_drawn(small_room, change):
     start, part = small_room.start, np.arange(len(small_room.soup)) < 5
-    changes = {"rest": {"at_rest": True}, "fixed": {"tie": np.where(part, FIXED, start.tie)}}
+    changes = {"rest": {"at_rest": True}, "fixed": {"origin": np.where(part, FIXED, start.origin)}}
     drawn = sure_of(replace(small_room, start=replace(start, **changes[change]))).sigma
     inside = (part | (change == "rest"))[small_room.segmentation.labels]
     assert (drawn[inside] == FACTORS["drawn"]).all()

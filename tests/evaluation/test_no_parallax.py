@@ -109,7 +109,7 @@ def turned(angle: float) -> np.ndarray:
 def test_a_start_without_parallax_borrows_depth_but_fits_flow(tiles, angle):
     flow = Flow(turned(angle).astype(np.float32), np.ones((120, 160), np.float32), "turn")
     start = propose(FlowFit.of(tiles, flow, K, K))
-    assert start.borrowed.all()
+    assert start.interpolated.all()
     data = build_energy_data(tiles, flow, K, K)
     error = oracle.values("proj", start.soup, data, Weights())
     assert error.max() < 1e-3

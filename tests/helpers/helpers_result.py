@@ -19,8 +19,8 @@ BOARD = RigidMotion(exp([0.0, 0.0, 0.05]), np.array([-0.1, 0.0, -0.1]))
 WALL_Z, BOARD_Z = 4.0, 2.0
 CERTAINTY = {"measured": 1.0, "inferred": 0.0, "drawn": 0.0, "median_sigma": 0.07}
 """The shares of `report.verdict.certainty`."""
-START = {"bends": np.zeros(12), "borrowed": np.zeros(12), "parallax": np.full(12, 5.0)}
-START |= {"tie": np.where(np.isin(np.arange(12), (5, 6)), 1, 0)}
+START = {"bends": np.zeros(12), "interpolated": np.zeros(12), "parallax": np.full(12, 5.0)}
+START |= {"origin": np.where(np.isin(np.arange(12), (5, 6)), 1, 0)}
 
 
 def board() -> np.ndarray:

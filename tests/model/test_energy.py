@@ -230,18 +230,19 @@ def test_weights_are_shares_across_components_and_factors_where_surfaces_bend():
 def test_what_a_prior_decides_keeps_its_slopes_and_has_its_depths():
     data, soup = tiny("pixels").data, tiny().soup
     part = np.arange(len(soup)) % 2
-    opened = np.where(np.arange(len(soup)) < 7, 1.0, 0.0)
+    ambiguity = np.where(np.arange(len(soup)) < 7, 1.0, 0.0)
     log_depth = np.log(soup.depth_at(data.anchor_ray))
-    known = of_scene(len(soup), component=part, prior=(log_depth, opened, np.full(len(soup), 0.12)))
+    prior = log_depth, ambiguity, np.full(len(soup), 0.12)
+    known = of_scene(len(soup), component=part, prior=prior)
     plain = replace(data, orient_turn=0 * data.orient_turn)
     found = weighted(plain, soup, known, EnergyOptions(across=1.0, arap_scene=0.0))
     i, k = data.edges.T
     # between components the flow says nothing
-    by_prior = np.where(part[i] == part[k], np.maximum(opened[i], opened[k]), 1.0)
+    by_prior = np.where(part[i] == part[k], np.maximum(ambiguity[i], ambiguity[k]), 1.0)
     np.testing.assert_allclose(found.depth_weight, by_prior * data.prior_weight / 0.12)
     np.testing.assert_allclose(found.depth_change, log_depth[i] - log_depth[k])
     np.testing.assert_allclose(found.prior_weight, (1 - by_prior) * data.prior_weight)
-    held = opened[data.pairs].all(axis=1)
+    held = ambiguity[data.pairs].all(axis=1)
     assert 0 < held.sum() < len(held)
     cost = oracle.values("orient", soup, found, Weights())
     np.testing.assert_allclose(cost[held], 0.0, atol=1e-12)
@@ -295,8 +296,8 @@ def test_the_scene_is_joined_through_its_superpixel_of_median_depth():
     np.testing.assert_array_equal(plain.edges, data.edges)
     Z, known = soup.depth_at(data.anchor_ray), {tuple(e) for e in data.edges.tolist()}
     members = sorted(set(range(count)) - {3, 5}, key=Z.__getitem__)
-    hub = members[len(members) // 2]
-    expected = {(min(i, hub), max(i, hub)) for i in members if i != hub} - known
+    centre = members[len(members) // 2]
+    expected = {(min(i, centre), max(i, centre)) for i in members if i != centre} - known
     assert 1 < len(expected) < len(members) - 1
     np.testing.assert_array_equal(joined.edges[: len(data.edges)], data.edges)
     assert sorted(map(tuple, joined.edges[len(data.edges) :].tolist())) == sorted(expected)

@@ -62,7 +62,7 @@ def test_hints_name_what_would_help(small_run):
     assert "--depth-prior" in told(unsure(small_run, np.where(moving, 1.2, 0.05)))
     whole = np.ones_like(start.unexplained)
     assert "--depth-prior" in told(unsure(small_run, tenth, unexplained=whole))
-    assert "a watermark" in told(unsure(small_run, tie=np.full_like(start.tie, FIXED)))
+    assert "a watermark" in told(unsure(small_run, origin=np.full_like(start.origin, FIXED)))
     assert "--fov" not in told(seen(unsure(small_run), focal=0.1))
     assert "--fov" in told(seen(unsure(small_run), focal=0.3))
     blind = seen(sure, np.zeros_like(small_run.pair.flow.confidence))

@@ -88,7 +88,7 @@ def test_a_pair_without_parallax_is_bridged():
     first, second = toy_pairs()
     # in between nothing moves, and its depth is nonsense
     still = small_result()
-    rest = tuple(replace(c, borrowed=1.0) for c in still.components)
+    rest = tuple(replace(c, interpolated=1.0) for c in still.components)
     identity = np.arange(60 * 80).reshape(60, 80)
     rec = replace(
         still.reconstruction,

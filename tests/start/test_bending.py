@@ -27,9 +27,9 @@ from soup_nlp.start.bending import (
     AT_REST,
     REFERENCE,
     constant_depth,
+    discontinuous,
     fit_turn,
     joined,
-    torn,
     turn_alone,
 )
 from soup_nlp.start.labelling import IN_NOISE, LEAST_NOISE, Labelling, dominant, labelled
@@ -105,7 +105,7 @@ def test_a_bending_region_whose_flow_jumps_is_torn():
     jump = np.where(cut, 1.0, 0.05)
 
     def found(surface: np.ndarray, bends: np.ndarray, usable: np.ndarray | None = None) -> Mask:
-        return torn(flow_of(seg, jump, usable), surface, bends)
+        return discontinuous(flow_of(seg, jump, usable), surface, bends)
 
     # one column moves by itself inside the left half, nothing does inside the right one
     np.testing.assert_array_equal(found(one, left), left)

@@ -27,7 +27,7 @@ from soup_nlp.start import prior_evidence
 from soup_nlp.start.given_depth import Given, _slopes, by_prior
 from soup_nlp.start.prior_evidence import EXPLAINED, LEAST_MARGIN, edge_margin, judged
 from soup_nlp.start.propose import Start, propose
-from soup_nlp.start.regions import TIES
+from soup_nlp.start.regions import ORIGINS
 
 pytestmark = pytest.mark.slow
 
@@ -72,7 +72,7 @@ def test_a_confirmed_prior_gives_a_swinging_object_its_scale(swing):
     assert given.evidence.kind == "relative"
     assert given.evidence.explained > EXPLAINED
     assert np.abs(swing.error(start)).mean() < 0.5 * before
-    assert TIES.index("given depth") in start.tie
+    assert ORIGINS.index("given depth") in start.origin
 
 
 def test_inverse_depth_with_a_shift_is_found(swing):
@@ -108,8 +108,8 @@ def test_a_prior_scales_objects_beside_a_determined_background():
     firm = main & ~given.from_prior
     assert (main & given.from_prior).any()
     assert given.from_prior[~main].all()
-    assert (start.tie[~main] == TIES.index("given depth")).all()
-    assert TIES.index("given depth") not in start.tie[main]
+    assert (start.origin[~main] == ORIGINS.index("given depth")).all()
+    assert ORIGINS.index("given depth") not in start.origin[main]
     # objects have the scale of the prior, the background keeps its shape by the flow
     apart = given.log_depth - np.log(start.soup.depth_at(road.anchor))
     apart -= np.median(apart[firm])
@@ -254,16 +254,16 @@ def test_orientation_is_held_where_the_prior_decides(pan):
     data = build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 4, 0, True)
     none = np.zeros(len(seg), bool)
 
-    def gain(opened: np.ndarray) -> np.ndarray:
-        prior = given.log_depth, opened, given.error
+    def gain(ambiguity: np.ndarray) -> np.ndarray:
+        prior = given.log_depth, ambiguity, given.error
         known = Known(start.component, none, start.variance, 1.0, None, none, prior)
         found = weighted(data, start.soup, known, EnergyOptions())
-        assert (found.depth_weight > 0).any() == opened.any()
+        assert (found.depth_weight > 0).any() == ambiguity.any()
         return found.orient_weight / data.orient_weight
 
-    np.testing.assert_allclose(gain(given.opened), BENDING["orient"] * len(seg) / 1000)
+    np.testing.assert_allclose(gain(given.ambiguity), BENDING["orient"] * len(seg) / 1000)
     # where the flow determines the slopes nothing changes
-    np.testing.assert_array_equal(gain(0 * given.opened), 1.0)
+    np.testing.assert_array_equal(gain(0 * given.ambiguity), 1.0)
 
 
 def test_superpixels_end_at_steps_of_an_unconfirmed_prior(pan, swing):

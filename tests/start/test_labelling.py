@@ -159,7 +159,7 @@ def test_what_is_not_seen_has_no_motion_of_its_own(world):
     assert len(found.motions) == 2
     assert len(np.unique(found.label[inner])) == 1
     start = propose(blind)
-    assert start.borrowed[hidden].all()
+    assert start.interpolated[hidden].all()
     assert not start.wrong[hidden].any()
     z, true = start.soup.depth_at(blind.views.anchor), propose(flow).soup
     ratio = z[hidden] / true.depth_at(blind.views.anchor)[hidden]

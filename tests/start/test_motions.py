@@ -61,7 +61,7 @@ def test_groups_of_one_motion_are_one_component(seg):
     np.testing.assert_allclose(CAMERA(still), CAR(np.ones(3)), atol=ROUNDING)
     assert [c.superpixels for c in components] == [10, 2]
     assert [c.pixels for c in components] == [4000, 800]
-    assert components[0].borrowed == pytest.approx(0.1)
+    assert components[0].interpolated == pytest.approx(0.1)
     assert max(c.residual_px for c in components) < 1e-6
     assert components[1].centre[2] == pytest.approx(2)
 
@@ -105,7 +105,7 @@ def test_the_near_car_of_a_street_is_a_component():
     case = prepare(make_problem(raw))
     pair, start = case.pair, case.start
     components = find_components(
-        start.soup, case.segmentation, start.component, pair.K_ref, pair.K_next, start.borrowed
+        start.soup, case.segmentation, start.component, pair.K_ref, pair.K_next, start.interpolated
     )
     for label, true in ((0, 0), (1, 1)):
         a, b = components.of_pixel == label, pair.truth.components == true

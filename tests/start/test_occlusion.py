@@ -16,7 +16,7 @@ from soup_nlp.model import oracle
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.start.propose import Start, propose
-from soup_nlp.start.regions import LEAST_ORDER, TIES, covering, vote
+from soup_nlp.start.regions import LEAST_ORDER, ORIGINS, covering, vote
 from soup_nlp.start.scales import LEAST_STEP_IN_FRONT
 
 HEIGHT, WIDTH, CELL = 96, 128, 16
@@ -99,7 +99,7 @@ def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
     assert before.at_rest
     z = np.log(start.soup.depth_at(camera.rays(K, seg.anchors)))
     z -= np.log(before.soup.depth_at(camera.rays(K, seg.anchors)))
-    moves = start.tie == TIES.index("occlusion")
+    moves = start.origin == ORIGINS.index("occlusion")
     assert moves.sum() == 12
     # relative to the plane on which all of the image is drawn
     step = np.median(z[~moves]) - np.median(z[moves])
@@ -141,7 +141,7 @@ def test_a_swinging_object_comes_before_the_wall(swing):
     main = start.component == np.argmax(np.bincount(start.component))
     ratio = start.soup.distance[main] / before.soup.distance[main]
     np.testing.assert_allclose(ratio, ratio[0])
-    assert not (start.tie[main] == TIES.index("occlusion")).any()
+    assert not (start.origin[main] == ORIGINS.index("occlusion")).any()
 
 
 OPTIONS = ("segmentation.superpixels=48", "segmentation.neighbours=6", "refine.enabled=false")
@@ -159,7 +159,7 @@ def made(covers: bool, *options: str):
 def test_the_nlp_keeps_the_order_and_is_unsure_of_it(covers):
     problem, pair = made(covers)
     done = run(problem, pair=pair)
-    assert (done.start.tie == TIES.index("occlusion")).any()
+    assert (done.start.origin == ORIGINS.index("occlusion")).any()
     ordered_pairs = done.start.order != 0
     z = done.soup.depth_across(done.segmentation.pairs, done.data.boundary_ray.mean(axis=1))
     step = (np.log(z[0] / z[1]) * np.sign(done.start.order))[ordered_pairs]

@@ -49,14 +49,14 @@ def test_a_still_region_before_a_moving_camera_is_fixed(seg, clean, where):
     mask[where] = True
     flow[mask] = 0.0
     start = start_of(seg, flow)
-    at = start.tie == FIXED
+    at = start.origin == FIXED
     assert at[seg.labels][mask].mean() > 0.9
     assert at[seg.labels][~mask].mean() < 0.02
     np.testing.assert_array_equal(start.soup.t[at], 0.0)
     assert not set(start.component[at]) & set(start.component[~at])
     # other superpixels are as without the region
     ray = camera.rays(K, seg.anchors)
-    log = np.log(start.soup.depth_at(ray) / clean.soup.depth_at(ray))[~at & ~clean.borrowed]
+    log = np.log(start.soup.depth_at(ray) / clean.soup.depth_at(ray))[~at & ~clean.interpolated]
     assert np.median(np.abs(log - np.median(log))) < 0.02
 
 
@@ -70,4 +70,4 @@ def test_what_moves_or_is_far_is_not_fixed(seg, what):
         flow[30:90, 30:110] = moving[30:90, 30:110]
     else:
         flow[50:80, 50:100] = [3.0, -2.0]
-    assert not (start_of(seg, flow).tie == FIXED).any()
+    assert not (start_of(seg, flow).origin == FIXED).any()

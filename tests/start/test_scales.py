@@ -5,8 +5,15 @@ import pytest
 from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry import camera
-from soup_nlp.start.regions import TIES, TOO_FAST
-from soup_nlp.start.scales import FREE_PACE, LEAST_STEP_IN_FRONT, Rows, held, minimum, scaled
+from soup_nlp.start.regions import ORIGINS, TOO_FAST
+from soup_nlp.start.scales import (
+    FREE_DISPLACEMENT,
+    LEAST_STEP_IN_FRONT,
+    Rows,
+    held,
+    minimum,
+    scaled,
+)
 
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 HANGS = [[0] * 5, [0, 0, 1, 0, 0], [0] * 5, [0] * 5]
@@ -15,7 +22,7 @@ CUT_OFF = [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 0, 0]]
 
 
 def found(z, component, far=0.5, floor=0.0, order=None, **options):
-    """Log scale and tie of component 1, whose planes are at depth 1 in its own unit.
+    """Log scale and origin of component 1, whose planes are at depth 1 in its own unit.
 
     There it moves by `far` where the scene moves by 1.
     """
@@ -24,10 +31,10 @@ def found(z, component, far=0.5, floor=0.0, order=None, **options):
     moved = np.where(label, far, 1.0)[:, None] * [1.0, 0.0, 0.0]
     soup = facing(np.where(label == 1, 1.0, np.ravel(z)), moved)
     says = np.zeros(len(flow.seg.pairs)) if order is None else order(label, flow.seg)
-    scale, tie = scaled(flow, soup, label, says, floor=np.full(len(soup), floor))
+    scale, origin = scaled(flow, soup, label, says, floor=np.full(len(soup), floor))
     assert (scale[label == 0] == 1).all()
-    assert (tie[label == 0] == TIES.index("reference")).all()
-    return float(np.log(scale[label == 1][0])), TIES[tie[label == 1][0]]
+    assert (origin[label == 0] == ORIGINS.index("reference")).all()
+    return float(np.log(scale[label == 1][0])), ORIGINS[origin[label == 1][0]]
 
 
 def cost(x, r: Rows) -> float:
@@ -39,11 +46,11 @@ def test_the_minimum_is_one():
     rng = np.random.default_rng(0)
     a, b = rng.integers(0, 4, (2, 40))
     value, up, down = rng.normal(size=40), rng.random(40), rng.random(40)
-    r = Rows(a, b, value, up, down, TIES.index("outline"))
-    x, tie = minimum(4, [r], np.array([0]))
+    r = Rows(a, b, value, up, down, ORIGINS.index("outline"))
+    x, origin = minimum(4, [r], np.array([0]))
     assert x[0] == 0
-    assert tie[0] == TIES.index("reference")
-    assert (tie[1:] == TIES.index("outline")).all()
+    assert origin[0] == ORIGINS.index("reference")
+    assert (origin[1:] == ORIGINS.index("outline")).all()
     for step in (1e-3, 0.1, 1.0):
         for _ in range(50):
             other = x + step * rng.normal(size=4) * [0, 1, 1, 1]
@@ -52,46 +59,46 @@ def test_the_minimum_is_one():
 
 def test_a_row_is_a_weighted_quantile():
     value = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    one, tie = np.ones(5, int), TIES.index("outline")
+    one, origin = np.ones(5, int), ORIGINS.index("outline")
     for share, expected in ((0.1, 1.0), (0.5, 3.0), (0.7, 4.0)):
-        x, _ = minimum(2, [Rows(one, 0, value, 1 - share, share, tie)], np.array([0]))
+        x, _ = minimum(2, [Rows(one, 0, value, 1 - share, share, origin)], np.array([0]))
         np.testing.assert_allclose(x[1], expected, atol=1e-9)
 
 
 def test_what_stands_on_the_ground_has_its_depth():
     z = np.array([[8.0] * 5, [8.0] * 5, [8.0] * 5, [2.0] * 5])
-    log_scale, tie = found(z, STANDS)
-    assert tie == "contact below"
+    log_scale, origin = found(z, STANDS)
+    assert origin == "contact below"
     np.testing.assert_allclose(log_scale, np.log(2), rtol=1e-6)
 
 
 def test_what_is_before_a_wall_is_not_behind_it():
     z = np.array([[4.0] * 5, [4.0] * 5, [4.0] * 5])
-    log_scale, tie = found(z, HANGS[:3], upright=False)
-    assert tie == "outline"
+    log_scale, origin = found(z, HANGS[:3], upright=False)
+    assert origin == "outline"
     np.testing.assert_allclose(log_scale, np.log(4), rtol=1e-6)
 
 
 def test_what_contact_would_make_too_fast_has_the_pace_of_the_scene():
     """It touches the wall, where it would move eight times as far as the scene."""
     wall = np.full((4, 5), 8.0)
-    log_scale, tie = found(wall, CUT_OFF, far=1.0)
-    assert tie == "too fast"
-    np.testing.assert_allclose(log_scale, FREE_PACE, atol=1e-6)
-    log_scale, tie = found(wall, HANGS, far=1e-3)
-    assert tie == "contact below"
+    log_scale, origin = found(wall, CUT_OFF, far=1.0)
+    assert origin == "too fast"
+    np.testing.assert_allclose(log_scale, FREE_DISPLACEMENT, atol=1e-6)
+    log_scale, origin = found(wall, HANGS, far=1e-3)
+    assert origin == "contact below"
     np.testing.assert_allclose(log_scale, np.log(8), rtol=1e-6)
 
 
 def test_what_is_too_fast_covers_all_that_it_touches():
     label = np.ravel(CUT_OFF)
     flow = flow_of(squares(4, 5), K=K)
-    soup, tie = facing(np.where(label, 1.0, 8.0), np.ones(3)), np.where(label, TOO_FAST, 0)
+    soup, origin = facing(np.where(label, 1.0, 8.0), np.ones(3)), np.where(label, TOO_FAST, 0)
     ends = label[flow.seg.pairs]
     none = np.zeros(len(ends))
-    order = held(flow, soup, label, tie, none, none)
+    order = held(flow, soup, label, origin, none, none)
     np.testing.assert_array_equal(order, ends[:, 1] - ends[:, 0])
-    assert held(flow, soup, label, 0 * tie, none, none) is None
+    assert held(flow, soup, label, 0 * origin, none, none) is None
 
 
 def covers(label, seg):
@@ -102,18 +109,18 @@ def covers(label, seg):
 
 def test_what_covers_is_in_front_of_all_but_what_it_stands_on():
     wall = np.full((4, 5), 8.0)
-    log_scale, tie = found(wall, HANGS, far=1e-3, order=covers, upright=False)
-    assert tie == "occlusion"
+    log_scale, origin = found(wall, HANGS, far=1e-3, order=covers, upright=False)
+    assert origin == "occlusion"
     np.testing.assert_allclose(log_scale, np.log(8) - LEAST_STEP_IN_FRONT, rtol=1e-6)
     wall[-1] = 4.0
-    log_scale, tie = found(wall, STANDS, far=1e-3, order=covers)
-    assert tie == "contact below"
+    log_scale, origin = found(wall, STANDS, far=1e-3, order=covers)
+    assert origin == "contact below"
     np.testing.assert_allclose(log_scale, np.log(4), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("floor", "expected"), [(0.0, np.log(8)), (0.25, np.log(4))])
 def test_nothing_is_below_the_ground(floor, expected):
     """The ground is at depth 4 everywhere, or unknown."""
-    log_scale, tie = found(np.full((4, 5), 8.0), HANGS, far=1e-3, floor=floor)
-    assert tie == ("ground" if floor else "contact below")
+    log_scale, origin = found(np.full((4, 5), 8.0), HANGS, far=1e-3, floor=floor)
+    assert origin == ("ground" if floor else "contact below")
     np.testing.assert_allclose(log_scale, expected, rtol=1e-6)

@@ -80,7 +80,7 @@ def assert_usable(start: Start, seg: Segmentation, K_ref: np.ndarray = CORNER_K)
         assert np.isfinite(getattr(start.soup, f.name)).all(), f.name
     for name in ("error", "parallax"):
         assert not np.isnan(getattr(start, name)).any(), name
-    assert len(start.soup) == len(start.borrowed) == len(start.motion) == len(seg)
+    assert len(start.soup) == len(start.interpolated) == len(start.motion) == len(seg)
     anchors = camera.rays(K_ref, seg.anchors)[:, None]
     r = constraints(start.soup, anchors, 0.0).largest
     assert r["so3"] <= 1e-8
@@ -112,7 +112,7 @@ def test_one_motion_is_recovered_exactly(shift):
     assert np.median(e.depth()) < 1e-4
     assert e.depth().max() < 2e-3
     assert start.error[pure].max() < 0.05
-    assert not start.borrowed[pure].any()
+    assert not start.interpolated[pure].any()
     assert (start.motion == 0).mean() > 0.9
 
 
@@ -216,8 +216,8 @@ def test_superpixels_without_confidence_borrow(room, matched):
     assert flow.poor[blind].all() == (matched == 0.0)
     start = propose(flow)
     assert_usable(start, seg)
-    assert start.borrowed[blind].all()
-    assert not start.borrowed[~blind & pure].any()
+    assert start.interpolated[blind].all()
+    assert not start.interpolated[~blind & pure].any()
     e = compare(start, pair, seg, np.ones(len(seg), bool))
     assert e.rotation[blind].max() < 1e-3
     assert (e.depth()[blind] < 0.5).all()
@@ -233,7 +233,7 @@ def test_a_superpixel_without_parallax_borrows_its_depth(room):
     uv = np.where((seg.labels == far)[..., None], turned, pair.flow.uv)
     start = propose(fitted(with_uv(pair, uv), seg))
     assert_usable(start, seg)
-    assert start.borrowed[far]
+    assert start.interpolated[far]
     z = start.soup.depth_at(camera.rays(CORNER_K, seg.anchors))
     assert 0.3 < z[far] / np.median(z[seg.knn[far]]) < 3
 
@@ -251,9 +251,9 @@ def test_flow_that_determines_no_depth_is_finite_and_flagged(room, what):
     start = propose(fitted(with_uv(pair, uv, confidence), seg))
     assert_usable(start, seg)
     blind = np.bincount(seg.labels.ravel(), confidence.ravel()) == 0
-    assert start.borrowed[blind].all()
-    assert start.borrowed.mean() > 0.9
-    assert start.borrowed.all() or what != "zero flow"
+    assert start.interpolated[blind].all()
+    assert start.interpolated.mean() > 0.9
+    assert start.interpolated.all() or what != "zero flow"
 
 
 @pytest.mark.slow
@@ -264,7 +264,7 @@ def test_pure_rotation_is_finite_explains_the_flow_and_is_flagged(turn):
     start = propose(fitted(pair, seg))
     assert_usable(start, seg)
     assert np.median(start.error) < 0.3
-    assert start.borrowed.mean() > 0.9
+    assert start.interpolated.mean() > 0.9
 
 
 PLANE_LABELS = {

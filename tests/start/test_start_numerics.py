@@ -1,4 +1,4 @@
-"""Formulas of the start on exact rays: motions, planes, borrowed depths and affine flows."""
+"""Formulas of the start on exact rays: motions, planes, interpolated depths and affine flows."""
 
 import numpy as np
 import pytest

@@ -206,7 +206,7 @@ function motionTexture(values, component) {
 async function makePart(k) {
   const pair = pairs[k], [w, h] = pair.grid, kinds = {
     labels: Uint16Array, planes: Float32Array, motion: Float32Array, motionCamera: Float32Array,
-    seen: Uint8Array, surface: Uint8Array, sigma: Uint8Array, kind: Uint8Array, component: Uint16Array, tie: Uint8Array,
+    seen: Uint8Array, surface: Uint8Array, sigma: Uint8Array, kind: Uint8Array, component: Uint16Array, origin: Uint8Array,
   };
   const part = { k, w, h, step: pair.step, pictures: pair.pictures, textures: {}, group: new THREE.Group() };
   await Promise.all(Object.keys(kinds).map(async (name) => { part[name] = await unpack(pair[name], kinds[name]); }));
@@ -461,7 +461,7 @@ function tell(p) {
   if (p < 0) { $("picked").textContent = "No point is shown there."; return; }
   const i = now.labels[p], sigma = now.sigma[p], own = now.component[i];
   const spread = sigma < 255 ? `${(sigma / 5.1).toFixed(sigma < 26 ? 1 : 0)} %` : "50 % or unknown";
-  const part = own ? `component ${own}, ${data.origins[now.tie[i]]}` : "the static scene";
+  const part = own ? `component ${own}, ${data.origins[now.origin[i]]}` : "the static scene";
   $("picked").textContent = (last > 1 ? `${data.names[now.k][0]}, ` : "")
     + `pixel (${(p % now.w) * now.step}, ${Math.floor(p / now.w) * now.step}): depth`
     + ` ${now.position.getZ(p).toPrecision(4)} ${data.unit}, sigma ${spread}; superpixel ${i}, ${part}; ${data.kinds[now.kind[p]]}`;
