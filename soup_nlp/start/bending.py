@@ -37,6 +37,8 @@ AT_REST, TURN_SHARE = 0.8, 9e-5
 and the error up to which it explains the flow, as a share of the longer side of a small image."""
 LEAST_MOVED_DEPTH, LEAST_SCALE = 1e-3, 0.02
 """Least depth of a moved point, and least scale of the refinement of a motion, pixels."""
+LEAST_GAIN = 1e-3
+"""Relative change of the loss that ends a fit of `fit_robustly`."""
 
 
 def least_gap(noise: float) -> float:
@@ -129,7 +131,8 @@ def fit_robustly(
 
     x = np.zeros(size)
     for width in (10.0, 3.0, 1.0, 0.3):
-        x = least_squares(miss, x, slope, loss="cauchy", f_scale=width, max_nfev=30).x
+        limits = {"f_scale": width, "ftol": LEAST_GAIN, "max_nfev": 30}
+        x = least_squares(miss, x, slope, loss="cauchy", **limits).x
     return x @ free, miss(x).reshape(2, -1).T
 
 
