@@ -24,7 +24,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run
 from soup_nlp.report.verdict import summary
 from soup_nlp.start import prior_evidence
-from soup_nlp.start.given_depth import Given, _slopes, by_prior
+from soup_nlp.start.given_depth import GivenDepth, _slopes, by_prior
 from soup_nlp.start.prior_evidence import EXPLAINED, LEAST_MARGIN, edge_margin, judged
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.regions import ORIGINS
@@ -45,7 +45,7 @@ class Seen:
         self.depth = self.pair.truth.depth_ref
         self.anchor = self.fitted.views.anchor
 
-    def by(self, prior: np.ndarray, kind: str | None = None) -> tuple[Start, Given]:
+    def by(self, prior: np.ndarray, kind: str | None = None) -> tuple[Start, GivenDepth]:
         start_data = self.start, replace(self.pair, depth_prior=prior), self.fitted
         return by_prior(*start_data, judged(*start_data, kind))
 
