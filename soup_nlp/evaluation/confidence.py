@@ -29,7 +29,6 @@ from soup_nlp.start.regions import FIXED, SCENE
 FACTORS = {
     "flow": 2.5,
     "scale": 1.5,
-    "relief": 0.5,
     "outline": 0.45,
     "mixed": 0.1,
     "bends": 0.18,
@@ -38,8 +37,8 @@ FACTORS = {
 }
 """Constants of sigma: factors of the terms, and the standard deviations of log depth of what is
 drawn, and within a scene without any evidence; see `sigma_of`."""
-ADDED = tuple(name for name in FACTORS if name not in ("drawn", "prior"))
-"""Terms whose squares are added up."""
+ADDED = ("flow", "scale", "relief", "outline", "mixed", "starts", "camera", "bends")
+"""Terms whose squares are added up; those without a factor are standard deviations as they are."""
 MISFIT, MOST_MISFIT = 2.0, 5.0
 """Misfits count as this many times as much noise, and the largest misfit of a pixel, pixels: larger
 values carry no information."""
@@ -130,10 +129,9 @@ def sigma_of(terms: Mapping[str, Float], factor: Mapping[str, float] = FACTORS) 
     """Standard deviation of log depth by its terms, see `terms`, and `FACTORS`.
 
     What is drawn has one number. Elsewhere it is the root of the sum of the squares of the terms
-    times their factors (starts and camera have none), to which the information of a prior is added.
+    times their factors, to which the information of a prior is added.
     """
-    squares = sum((factor[name] * terms[name]) ** 2 for name in ADDED)
-    squares = squares + terms["starts"] ** 2 + terms["camera"] ** 2
+    squares = sum((factor.get(name, 1.0) * terms[name]) ** 2 for name in ADDED)
     known = with_prior(np.sqrt(squares), factor["prior"])
     return np.where(terms["drawn"] > 0, factor["drawn"], known)
 

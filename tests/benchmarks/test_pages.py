@@ -59,7 +59,7 @@ def test_a_real_run_and_its_table(tmp_path):
 
 
 def no_terms(count):
-    return dict.fromkeys((*ADDED, "starts", "camera", "drawn"), np.zeros(count))
+    return dict.fromkeys((*ADDED, "drawn"), np.zeros(count))
 
 
 def test_the_fit_finds_the_factor_of_normal_errors():
