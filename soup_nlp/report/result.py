@@ -33,6 +33,8 @@ from soup_nlp.storage.files import plain
 from soup_nlp.storage.store import ReadTree, require
 
 PAGE = "report.html"
+RENAMED = {"interpolated": "borrowed", "origin": "tie"}
+"""Arrays of "start", and their names in results before December 2026."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,9 +254,10 @@ def load(folder: str | Path) -> Result:
         seg, (height, width) = Segmentation(**given), tree["depth"]["next"].shape
         rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
         start = tree["start"]
-        # older results name it so
-        interpolated = start.get("interpolated", start.get("borrowed"))
-        parts = start["part"], K_ref, K_next, interpolated.astype(bool)
+        for name, older in RENAMED.items():
+            if older in start:
+                start[name] = start.pop(older)
+        parts = start["part"], K_ref, K_next, start["interpolated"].astype(bool)
         return Result(
             tree=tree,
             summary=summary,

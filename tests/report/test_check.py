@@ -17,6 +17,7 @@ from soup_nlp.geometry.camera import pixel_grid, project, rays
 from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import WRITTEN, CheckReport, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
+from soup_nlp.report.result import RENAMED, load
 from soup_nlp.sequence.folder import convert
 from soup_nlp.storage.folders import SUMS, Sums, digest_of, files_in, write_sums
 
@@ -103,6 +104,16 @@ def test_forged_arrays_are_recomputed(place, folder):
         (so3,) = (row for row in report.rows if row.name == "answer so3")
         # R'R = 1.02 I
         assert re.match(r"25 of 25 beyond .*; worst superpixels \d+ \(2\.0e-02\)", so3.note)
+
+
+def test_a_result_with_the_names_of_before_is_read(folder):
+    start = load(folder).tree["start"]
+    with h5py.File(folder / "result.h5", "a") as file:
+        for name, older in RENAMED.items():
+            file.move(f"start/{name}", f"start/{older}")
+    assert np.array_equal(load(folder).tree["start"]["origin"], start["origin"])
+    relist(folder)
+    assert bad(check_folder(folder)) == []
 
 
 @pytest.mark.parametrize(("off", "good"), [(1e-10, True), (1e-7, False)])
