@@ -81,30 +81,30 @@ def by_prior(
     soup, before = start.soup, np.log(start.soup.depth_at(anchor))
     # components that are fixed in the image keep their depth relative to the scene
     fixed = start.origin == FIXED
-    off, strong = np.zeros(n), fixed.copy()
+    off, from_flow = np.zeros(n), fixed.copy()
     for c in np.unique(start.component[~start.bends & ~fixed]):
         determined = evidence.determined if c == SCENE else seen.relief(c) > least_gap(start.noise)
-        soup, firm = _shaped(seen, soup, c, prior, evidence.sigma, determined)
-        strong |= firm
-        if not firm.any():
+        soup, own = _shaped(seen, soup, c, prior, evidence.sigma, determined)
+        from_flow |= own
+        if not own.any():
             continue
         gap = np.log(soup.depth_at(anchor)) - prior
-        off[start.component == c] = np.median(gap[firm])
+        off[start.component == c] = np.median(gap[own])
         if c == SCENE:
-            shift, sigma = _local(seg, firm & with_value, gap - off, evidence.sigma)
+            shift, sigma = _local(seg, own & with_value, gap - off, evidence.sigma)
             prior = np.where(main, prior + shift, prior)
     off[fixed] = np.median((before - prior)[main])
     # surfaces that bend have a motion for every superpixel, which grows with its depth
     off = np.where(start.bends, before - prior, off)
     sigma = np.where(fixed | ~with_value, np.inf, sigma)
     noise = start.noise / np.maximum(flow.views.parallax(soup), 1e-3)
-    ambiguity = np.where(strong & ~fixed, 1 / (1 + (sigma / noise) ** 2) ** 2, 1.0)
-    from_prior = ~fixed & ~(main & strong)
+    ambiguity = np.where(from_flow & ~fixed, 1 / (1 + (sigma / noise) ** 2) ** 2, 1.0)
+    from_prior = ~fixed & ~(main & from_flow)
     # a superpixel has the translation of its component, whatever its depth
     scaled = replace(soup, lam=soup.lam * np.exp(-off))
     slope = _slopes(np.exp(-evidence.log_depth(whole)), pair, seg) * flow.views.radius[:, None]
     tilted = flow.views.soup(np.exp(-prior), slope, soup.R, scaled.translation)
-    soup = scaled.taking(tilted, ~strong).normalised()
+    soup = scaled.taking(tilted, ~from_flow).normalised()
     origin = np.where(from_prior & ~main, ORIGINS.index("given depth"), start.origin)
     # without a flow to weigh it against, terms on shape must not undo the prior
     error = sigma if evidence.determined else np.where(np.isfinite(sigma), LEAST_SIGMA, np.inf)
@@ -116,7 +116,7 @@ def by_prior(
 def _shaped(
     seen: StartWithFlow, soup: Soup, c: int, prior: Float, sigma: float, determined: bool
 ) -> tuple[Soup, Mask]:
-    """Soup with the planes and the motion of a rigid component by flow and prior, see `settled`.
+    """Soup with the planes and the motion of a rigid component by flow and prior, see `refitted`.
 
     Unless the flow has determined the depth of component `c`, it takes the motion that fits the log
     depth (N,) of the prior.
@@ -125,13 +125,13 @@ def _shaped(
     mask = start.component == c
     rigid = np.ptp(soup.R[mask], axis=0).max() < 1e-9 and np.any(soup.translation[mask][0])
     if len(use) < LEAST_MATCHES or not rigid:
-        firm = mask & ~start.interpolated
-        return soup, firm if firm.any() else mask
+        own = mask & ~start.interpolated
+        return soup, own if own.any() else mask
     if not determined:
         _, R, T, _ = seen.motion(use, np.exp(-prior[use]))
         by_prior = views.soup(np.exp(-prior), np.zeros((len(prior), 2)), R, T)
         return soup.taking(by_prior, mask), np.zeros(len(mask), bool)
-    return seen.settled(soup, c, prior, sigma)
+    return seen.refitted(soup, c, prior, sigma)
 
 
 def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:

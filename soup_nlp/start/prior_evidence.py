@@ -144,7 +144,7 @@ class StartWithFlow(NamedTuple):
         floor = min(self.start.noise, float(np.median(self.start.error[at])))
         return self.motion(at, np.ones(len(at)))[0] - floor
 
-    def settled(self, soup: Soup, c: int, prior: Float, sigma: float) -> tuple[Soup, Mask]:
+    def refitted(self, soup: Soup, c: int, prior: Float, sigma: float) -> tuple[Soup, Mask]:
         """Soup with planes and motion of a rigid component by its flow, near a prior's depths.
 
         Of the motions that explain the flow about as well, it has the one that agrees with the
@@ -160,11 +160,11 @@ class StartWithFlow(NamedTuple):
         error = min(COMMON_NOISES * start.noise, MOST_COMMON_PX)
         best, _ = most_probable(motions, matches, error, prior[use], sigma)
         planes = views.fit([best])
-        strong = determined(planes)[:, 0] & (planes.cost[:, 0] < CLIP_PX) & self.usable & mask
-        slope = np.where(strong[:, None], planes.slope[:, 0], 0.0)
-        mu = np.where(strong, planes.inverse_depth[:, 0], 1.0)
+        from_flow = determined(planes)[:, 0] & (planes.cost[:, 0] < CLIP_PX) & self.usable & mask
+        slope = np.where(from_flow[:, None], planes.slope[:, 0], 0.0)
+        mu = np.where(from_flow, planes.inverse_depth[:, 0], 1.0)
         by_flow = views.soup(mu, slope, best.R, best.t)
-        return soup.taking(by_flow, mask), strong
+        return soup.taking(by_flow, mask), from_flow
 
 
 def without_gaps(pair: Pair, seg: Segmentation) -> tuple[Float, Mask, Float]:
@@ -213,11 +213,11 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
         at = np.flatnonzero(known)
         shift = seen.motion(at, value[at], True)[3] if kind == "inverse" else 0.0
         shifted = as_log_depth(kind, value, shift)
-        soup, strong = seen.settled(start.soup, SCENE, shifted(value), UNCONFIRMED)
+        soup, from_flow = seen.refitted(start.soup, SCENE, shifted(value), UNCONFIRMED)
         depth = np.log(soup.depth_at(anchor))
-        if (strong & known).sum() >= LEAST_MATCHES:
+        if (from_flow & known).sum() >= LEAST_MATCHES:
             by_flow, gap = (
-                float(np.ptp(np.quantile(log[strong & known], (0.16, 0.84)))) / 2
+                float(np.ptp(np.quantile(log[from_flow & known], (0.16, 0.84)))) / 2
                 for log in (depth, depth - shifted(value))
             )
             ratio = gap / by_flow

@@ -199,7 +199,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         return _ordered(flow, start, part, contrast)
     choice, covariance = with_least_relief(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
-    soup, weak = _with_depth(rigid, choice, wrong)
+    soup, interpolated = _with_depth(rigid, choice, wrong)
     label = component = choice.label
     error, parallax = choice.fit.cost[:, 0], choice.parallax
     at_camera = replace(soup, R=0 * soup.R + np.eye(3), t=0 * soup.t)
@@ -211,7 +211,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
             # each connected region of the mask is a component
             regions = component.max() + 1 + connected_pieces(mask, seg)
             component = numbered(np.where(mask, regions, component))
-    reliable = ~weak & rigid.views.usable
+    reliable = ~interpolated & rigid.views.usable
     component = _scene_first(component, ~fixed)
     floor = ground(flow, 1 / soup.depth_at(views.anchor), reliable & (component == SCENE))
     order = vote(contrast, component, seg)
@@ -225,7 +225,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         soup=soup.normalised(),
         error=error,
         parallax=parallax,
-        interpolated=weak | lifted,
+        interpolated=interpolated | lifted,
         motion=label,
         component=component,
         part=component,
@@ -267,17 +267,17 @@ def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Ma
     """
     fit, views = choice.fit, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
-    weak = ~determined(fit)[:, 0] | flow.poor | wrong | (flow.seen < LEAST_SEEN)
-    if weak.all():
+    interpolated = ~determined(fit)[:, 0] | flow.poor | wrong | (flow.seen < LEAST_SEEN)
+    if interpolated.all():
         # no depth is known: all depths are one, with translations that move the image as before
         length = np.where(mu > 0, mu, 0.0)
         mu, slope = np.ones(len(mu)), np.zeros((len(mu), 2))
     else:
         length = np.ones(len(mu))
-        mu = continued(flow.seg, mu, choice.label, ~weak)
-        slope = np.where(weak[:, None], 0.0, slope)
+        mu = continued(flow.seg, mu, choice.label, ~interpolated)
+        slope = np.where(interpolated[:, None], 0.0, slope)
     R, t = stacked(choice.motions)
-    return views.soup(mu, slope, R[choice.label], t[choice.label] * length[:, None]), weak
+    return views.soup(mu, slope, R[choice.label], t[choice.label] * length[:, None]), interpolated
 
 
 RECEDES = 0.7

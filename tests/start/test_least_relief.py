@@ -1,4 +1,4 @@
-"""Motions that the flow leaves open are settled; the flow corrects a guessed focal length."""
+"""Motions that the flow leaves open have the least relief; flow corrects a guessed focal length."""
 
 from dataclasses import replace
 
