@@ -153,7 +153,7 @@ def find_components(
     pixels = np.bincount(label, seg.sizes, len(motions)).astype(np.int64)
     order = np.concatenate([[0], 1 + np.argsort(-pixels[1:], kind="stable")])
     label = np.argsort(order)[label]
-    lent = np.zeros(len(soup), bool) if interpolated is None else interpolated
+    by_others = np.zeros(len(soup), bool) if interpolated is None else interpolated
     members = []
     for c, old in enumerate(order):
         mask = label == c
@@ -167,7 +167,7 @@ def find_components(
                 superpixels=int(mask.sum()),
                 pixels=int(pixels[old]),
                 residual_px=float(np.median(off)) if len(x) else np.nan,
-                interpolated=float(seg.sizes[mask & lent].sum() / pixels[old]),
+                interpolated=float(seg.sizes[mask & by_others].sum() / pixels[old]),
                 centre=np.median(x, axis=0) if len(x) else np.full(3, np.nan),
             )
         )

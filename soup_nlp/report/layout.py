@@ -78,12 +78,12 @@ start|solution|nlp|answer/t  soup  N,3  translations; lam t is next_from_ref
 
 start/error               px    N       mean re-projection error
 start/parallax            px    N       displacement that the translation causes
-start/interpolated            1     N       plane or motion from neighbours
+start/interpolated        1     N       plane or motion from neighbours
 start/motion              1     N       dominant motion, -1 for its own
 start/component           1     N       rigid component, which has one scale
 start/part                1     N       what moves as one, also before a camera at rest
 start/surface             1     N       region without a flow discontinuity
-start/origin                 1     N       what gives its component a scale: 0 it is the scene, \
+start/origin              1     N       what gives its component a scale: 0 it is the scene, \
 1 contact below, 2 outline, 3 nothing, 4 ground, 5 fixed in image, 6 given depth, 7 occlusion, \
 8 too fast
 start/bends               1     N       in a region with the energy for surfaces that bend
@@ -122,7 +122,7 @@ confidence/component_sigma  1   C       standard deviation of a rigid component'
 components/of_superpixel  1     N       what moves as one in the solution; 0 is the background
 components/motion         soup  C,4,4   next_from_ref, the camera's motion included
 components/residual_px    px    C       median distance from where the superpixels' motions lead
-components/interpolated       1     C       share of the pixels whose depth is that of neighbours
+components/interpolated   1     C       share of the pixels whose depth is that of neighbours
 
 truth/depth_ref           truth  H,W    true z of the reference frame, NaN where unknown
 truth/depth_next          truth  H,W    true z of the next frame, NaN where unknown

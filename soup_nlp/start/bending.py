@@ -131,8 +131,10 @@ def fit_robustly(
 
     x = np.zeros(size)
     for width in (10.0, 3.0, 1.0, 0.3):
-        limits = {"f_scale": width, "ftol": LEAST_GAIN, "max_nfev": 30}
-        x = least_squares(miss, x, slope, loss="cauchy", **limits).x
+        fit = least_squares(
+            miss, x, slope, loss="cauchy", f_scale=width, ftol=LEAST_GAIN, max_nfev=30
+        )
+        x = fit.x
     return x @ free, miss(x).reshape(2, -1).T
 
 

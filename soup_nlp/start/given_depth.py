@@ -77,14 +77,14 @@ def by_prior(
     prior, sigma = evidence.log_depth(value), np.full(n, evidence.sigma)
     if not evidence.used:
         return start, GivenDepth(evidence, prior, sigma, np.zeros(n), sigma, np.zeros(n, bool))
-    seen, main = StartWithFlow(start, flow), start.component == SCENE
+    both, main = StartWithFlow(start, flow), start.component == SCENE
     soup, before = start.soup, np.log(start.soup.depth_at(anchor))
     # components that are fixed in the image keep their depth relative to the scene
     fixed = start.origin == FIXED
     off, from_flow = np.zeros(n), fixed.copy()
     for c in np.unique(start.component[~start.bends & ~fixed]):
-        determined = evidence.determined if c == SCENE else seen.relief(c) > least_gap(start.noise)
-        soup, own = _shaped(seen, soup, c, prior, evidence.sigma, determined)
+        determined = evidence.determined if c == SCENE else both.relief(c) > least_gap(start.noise)
+        soup, own = _shaped(both, soup, c, prior, evidence.sigma, determined)
         from_flow |= own
         if not own.any():
             continue
@@ -114,24 +114,24 @@ def by_prior(
 
 
 def _shaped(
-    seen: StartWithFlow, soup: Soup, c: int, prior: Float, sigma: float, determined: bool
+    both: StartWithFlow, soup: Soup, c: int, prior: Float, sigma: float, determined: bool
 ) -> tuple[Soup, Mask]:
     """Soup with the planes and the motion of a rigid component by flow and prior, see `refitted`.
 
     Unless the flow has determined the depth of component `c`, it takes the motion that fits the log
     depth (N,) of the prior.
     """
-    start, use, views = seen.start, seen.members(c), seen.flow.views
+    start, use, views = both.start, both.members(c), both.flow.views
     mask = start.component == c
     rigid = np.ptp(soup.R[mask], axis=0).max() < 1e-9 and np.any(soup.translation[mask][0])
     if len(use) < LEAST_MATCHES or not rigid:
         own = mask & ~start.interpolated
         return soup, own if own.any() else mask
     if not determined:
-        _, R, T, _ = seen.motion(use, np.exp(-prior[use]))
+        _, R, T, _ = both.motion(use, np.exp(-prior[use]))
         by_prior = views.soup(np.exp(-prior), np.zeros((len(prior), 2)), R, T)
         return soup.taking(by_prior, mask), np.zeros(len(mask), bool)
-    return seen.refitted(soup, c, prior, sigma)
+    return both.refitted(soup, c, prior, sigma)
 
 
 def _slopes(inverse: Float, pair: Pair, seg: Segmentation) -> Float:

@@ -195,10 +195,10 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
 
     The start without the prior and the flow are those of about `JUDGED_PIECES` superpixels.
     """
-    seen = StartWithFlow(start, flow)
+    both = StartWithFlow(start, flow)
     value, with_value, whole = without_gaps(pair, flow.seg)
-    anchor, relief = flow.views.anchor, seen.relief(SCENE)
-    known = with_value & seen.usable & (start.component == SCENE)
+    anchor, relief = flow.views.anchor, both.relief(SCENE)
+    known = with_value & both.usable & (start.component == SCENE)
     determined = relief > least_gap(start.noise)
     tells = relief > least_gap(start.noise) / 3 and known.sum() >= LEAST_MATCHES
     sure = known & ~start.interpolated
@@ -211,9 +211,9 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
     log_depth, ratio, gap = as_log_depth(kind, value), np.nan, np.inf
     if tells:
         at = np.flatnonzero(known)
-        shift = seen.motion(at, value[at], True)[3] if kind == "inverse" else 0.0
+        shift = both.motion(at, value[at], True)[3] if kind == "inverse" else 0.0
         shifted = as_log_depth(kind, value, shift)
-        soup, from_flow = seen.refitted(start.soup, SCENE, shifted(value), UNCONFIRMED)
+        soup, from_flow = both.refitted(start.soup, SCENE, shifted(value), UNCONFIRMED)
         depth = np.log(soup.depth_at(anchor))
         if (from_flow & known).sum() >= LEAST_MATCHES:
             by_flow, gap = (

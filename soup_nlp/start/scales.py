@@ -10,9 +10,9 @@ pair of neighbours and x the log scales, the program adds up
 * order: by how much a component that covers another one is less than `LEAST_STEP_IN_FRONT`
   before it.
 
-Superpixels that borrow their depth, and components scaled by their outline, may come out far below
-the road. In an upright image, a level plane on which much of the scene lies and below which almost
-nothing lies bounds the depth of everything seen below the horizon.
+Interpolated superpixels, and components scaled by their outline, may come out far below the road.
+In an upright image, a level plane on which much of the scene lies and below which almost nothing
+lies bounds the depth of everything seen below the horizon.
 """
 
 from dataclasses import replace

@@ -106,7 +106,7 @@ def turned(angle: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.02])
-def test_a_start_without_parallax_borrows_depth_but_fits_flow(tiles, angle):
+def test_a_start_without_parallax_interpolates_depth_but_fits_flow(tiles, angle):
     flow = Flow(turned(angle).astype(np.float32), np.ones((120, 160), np.float32), "turn")
     start = propose(FlowFit.of(tiles, flow, K, K))
     assert start.interpolated.all()

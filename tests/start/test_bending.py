@@ -97,7 +97,7 @@ def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least,
     assert least <= start.bends.mean() <= most
 
 
-def test_a_bending_region_whose_flow_jumps_is_torn():
+def test_a_bending_region_whose_flow_jumps_is_discontinuous():
     seg = squares(6, 20)
     column = seg.anchors[:, 0] // 8
     left, cut = column < 10, seg.across(column == 5)

@@ -79,7 +79,7 @@ def test_what_is_before_a_wall_is_not_behind_it():
     np.testing.assert_allclose(log_scale, np.log(4), rtol=1e-6)
 
 
-def test_what_contact_would_make_too_fast_has_the_pace_of_the_scene():
+def test_what_contact_would_make_too_fast_moves_little_farther_than_the_scene():
     """It touches the wall, where it would move eight times as far as the scene."""
     wall = np.full((4, 5), 8.0)
     log_scale, origin = found(wall, CUT_OFF, far=1.0)

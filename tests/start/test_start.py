@@ -202,7 +202,7 @@ def test_flow_that_is_wrong_in_parts(room, change, turn, depth, worst):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("matched", [0.0, 0.05])
-def test_superpixels_without_confidence_borrow(room, matched):
+def test_superpixels_without_confidence_are_interpolated(room, matched):
     """Also where a few pixels match by chance, here as if they were three times as far away."""
     pair, seg, pure = room
     blind = np.zeros(len(seg), bool)
@@ -224,7 +224,7 @@ def test_superpixels_without_confidence_borrow(room, matched):
 
 
 @pytest.mark.slow
-def test_a_superpixel_without_parallax_borrows_its_depth(room):
+def test_a_superpixel_without_parallax_has_an_interpolated_depth(room):
     """The camera's rotation alone moves it, as it does the sky."""
     pair, seg, _ = room
     far = 27

@@ -65,7 +65,6 @@ def searched(pair: Pair, R: Float, t: Float) -> Flow:
         gap = np.minimum(np.sqrt(-np.log(flow.confidence)), np.float32(LIMIT))
     better = flow_score(ref, nxt, new, error) + MARGIN < flow_score(ref, nxt, flow.uv, gap)
     better &= flow.confidence <= SURE
-    # a wrong flow may be consistent at single pixels, but rarely in a whole window
     sure = (better & (confidence_of(error) > SURE)).astype(np.uint8)
     window = cv2.morphologyEx(sure, cv2.MORPH_OPEN, np.ones((SUPPORT, SUPPORT), np.uint8)) > 0
     piece = cv2.connectedComponents(better.astype(np.uint8), connectivity=4)[1]
