@@ -129,6 +129,5 @@ def _run(
         residuals=residuals(nlp, soup, stage, case.data, form.min_facing),
         multipliers=multipliers(nlp, stage),
         nlp=nlp.sizes(),
-        description=str(nlp),
     )
     return make_run(case, solution)

@@ -25,12 +25,12 @@ BLOCK = 4096
 """Largest number of elements of a block: more cost fewer calls, fewer fit into the cache."""
 
 _once = lru_cache(maxsize=1000)
-"""Derivatives are taken once for all kernels that are equal: the programs of a solve share them."""
+"""Derivatives are taken once: the programs of a solve share the kernels of the energy."""
 
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """Symbolic element of an NLP. Kernels with the same expressions are equal.
+    """Symbolic element of an NLP.
 
     Attributes:
         name: Identifier, also of the generated functions.
@@ -53,21 +53,6 @@ class Kernel:
 
     def __str__(self) -> str:
         return f"Kernel({self.name}, {self.nx} variables, {self.row.numel()} data, {self.nc} rows)"
-
-    def __hash__(self) -> int:
-        return hash(self._content)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Kernel) and self._content == other._content
-
-    @cached_property
-    def _content(self) -> str:
-        args = [self.x, self.row, self.theta]
-        parts = {"f": self.objective, "g": self.constraints, "h": self.curvature}
-        present = {k: e for k, e in parts.items() if e is not None}
-        names = ["x", "row", "theta"]
-        function = ca.Function(self.name, args, list(present.values()), names, list(present))
-        return str(function.serialize())
 
     @property
     def nx(self) -> int:
@@ -214,6 +199,7 @@ class Pattern:
         sets = ((rows, columns.astype(np.int64)) for rows, columns in self.sets())
         return [np.searchsorted(keys, c * self.shape[0] + r).astype(np.int32) for r, c in sets]
 
+    @cached_property
     def sparsity(self) -> ca.Sparsity:
         """For CasADi."""
         return ca.Sparsity(*self.shape, self._union.indptr.tolist(), self.rows.tolist(), True)

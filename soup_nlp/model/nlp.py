@@ -158,16 +158,6 @@ class NLP:
         """Constraints."""
         return len(self.lbg)
 
-    @property
-    def nnzj(self) -> int:
-        """Nonzeros of the Jacobian."""
-        return len(self.jacobian_pattern.rows)
-
-    @property
-    def nnzh(self) -> int:
-        """Nonzeros of the Hessian's upper triangle."""
-        return len(self.hessian_pattern.rows)
-
     def thetas(self, **values: float) -> Float:
         """(nt,) values of theta, with other ones for some of its entries."""
         for name in values.keys() - self.theta.keys():
@@ -182,18 +172,18 @@ class NLP:
             "constraints": self.ng,
             "equalities": eq,
             "inequalities": self.ng - eq,
-            "jacobian_nonzeros": self.nnzj,
-            "hessian_nonzeros": self.nnzh,
+            "jacobian_nonzeros": len(self.jacobian_pattern.rows),
+            "hessian_nonzeros": len(self.hessian_pattern.rows),
         }
 
     def __str__(self) -> str:
+        sizes = self.sizes()
         lines = [f"NLP {self.name}: {self.nx} variables, {self.ng} constraints"]
-        for label, nnz, cells in (
-            ("Jacobian", self.nnzj, self.nx * self.ng),
-            ("Hessian", self.nnzh, self.nx * (self.nx + 1) // 2),
-        ):
-            share = nnz / cells if cells else 0.0
-            lines.append(f"  {label:<11} {nnz:>9} nonzeros, {share:.3%} of {cells}")
+        cells = {"Jacobian": self.nx * self.ng, "Hessian": self.nx * (self.nx + 1) // 2}
+        for label, cell_count in cells.items():
+            nnz = sizes[f"{label.lower()}_nonzeros"]
+            share = nnz / cell_count if cell_count else 0.0
+            lines.append(f"  {label:<11} {nnz:>9} nonzeros, {share:.3%} of {cell_count}")
         lines.append(f"  Hessian kind: {self.hessian_kind}")
         lines += [f"  {g.kernel.name:<12} {len(g):>7} x {g.kernel}" for g in self.groups]
         return "\n".join(lines)

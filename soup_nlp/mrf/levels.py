@@ -6,7 +6,6 @@ same computation as processing them one after the other. An edge leads from the 
 colour up to that of its higher colour.
 """
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,37 +76,22 @@ def colours(n_nodes: int, edges: np.ndarray) -> np.ndarray:
 
 def plan_levels(colour: np.ndarray, edges: np.ndarray) -> list[Level]:
     """The levels of a colouring (N,) of edges (E, 2), first to last in the forward pass."""
-    n, count = len(colour), int(colour.max()) + 1
-    forwards = colour[edges[:, 0]] < colour[edges[:, 1]]
-    early = np.where(forwards, edges[:, 0], edges[:, 1])
-    late = np.where(forwards, edges[:, 1], edges[:, 0])
-    chains = np.maximum(np.bincount(early, minlength=n), np.bincount(late, minlength=n))
-    gamma = 1.0 / np.maximum(chains, 1)
-    nodes = np.argsort(colour, kind="stable")
-    cuts = np.searchsorted(colour[nodes], np.arange(count + 1))
-    position = np.empty(n, dtype=np.int64)
-    position[nodes] = np.arange(n) - cuts[colour[nodes]]
-    ups = _sides(early, late, forwards, colour, position)
-    downs = _sides(late, early, ~forwards, colour, position)
-    return [
-        Level(nodes[a:b], gamma[nodes[a:b], None], up, down)
-        for a, b, up, down in zip(cuts[:-1], cuts[1:], ups, downs)
-    ]
+    own = colour[edges]
+    other, levels = own[:, ::-1], []
+    for c in range(int(colour.max()) + 1):
+        nodes = np.flatnonzero(colour == c)
+        up, down = (_side(nodes, edges, (own == c) & far) for far in (other > c, other < c))
+        chains = np.maximum(*(np.bincount(s.node, minlength=len(nodes)) for s in (up, down)))
+        levels.append(Level(nodes, 1.0 / np.maximum(chains, 1)[:, None], up, down))
+    return levels
 
 
-def _sides(
-    near: np.ndarray, far: np.ndarray, head: np.ndarray, level: np.ndarray, position: np.ndarray
-) -> list[Side]:
-    """One :class:`Side` per level, of the edges seen from their ``near`` node (E,); ``head`` (E,)
-    says whether it comes first in its edge, ``position`` (N,) is that of a node in its level."""
-    ids = np.lexsort((position[near], level[near]))
-    cuts = np.searchsorted(level[near[ids]], np.arange(int(level.max()) + 2))
-    out = []
-    for a, b in itertools.pairwise(cuts):
-        members = ids[a:b]
-        node = position[near[members]]
-        linked, starts = np.unique(node, return_index=True)
-        by_axis = ((1, np.flatnonzero(head[members])), (2, np.flatnonzero(~head[members])))
-        parts = tuple(part for part in by_axis if part[1].size)
-        out.append(Side(members, node, far[members], parts, linked, starts))
-    return out
+def _side(nodes: np.ndarray, edges: np.ndarray, near: np.ndarray) -> Side:
+    """The edges of which one end (E, 2) is ``near``: among the nodes of a level."""
+    ids, end = np.nonzero(near)
+    node = np.searchsorted(nodes, edges[ids, end])
+    order = np.argsort(node, kind="stable")
+    ids, end, node = ids[order], end[order], node[order]
+    linked, starts = np.unique(node, return_index=True)
+    parts = tuple((axis + 1, np.flatnonzero(end == axis)) for axis in (0, 1))
+    return Side(ids, node, edges[ids, 1 - end], parts, linked, starts)

@@ -30,7 +30,6 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.refine.particles import (
-    KINDS,
     NEIGHBOURS,
     WALKS,
     PairCosts,
@@ -205,29 +204,23 @@ class Rounds:
         # single precision suffices: a choice is taken only where the exact energy falls
         return unary, self.pairs.tables(p, unit, np.float32)
 
-    def _draw(self, sweep: bool) -> tuple[Particles, list[str]]:
-        """The current belief, swept planes and proposals, and the kind of each."""
-        parts, kinds = [Particles.of(self.best)], ["current"]
-
-        def add(p: Particles, kind: str) -> None:
-            parts.append(p)
-            kinds.extend([kind] * p.shape[1])
-
+    def _draw(self, sweep: bool) -> Particles:
+        """The current belief, swept planes and proposals."""
+        parts = [Particles.of(self.best)]
         if sweep and self.photo is not None:
-            rng = self.proposer.rng
-            add(swept(self.best, self.data, self.photo, SWEPT, rng), "swept")
+            parts.append(swept(self.best, self.data, self.photo, SWEPT, self.proposer.rng))
         shares = WALKS if self.options.proposals == "walks" else {**WALKS, **NEIGHBOURS}
-        remaining = max(0, self.options.particles - len(kinds))
+        remaining = max(0, self.options.particles - sum(p.shape[1] for p in parts))
         near = self.proposer.near.shape[1]
         for kind, count in counts(shares, remaining, near).items():
             if count:
-                add(self.proposer.propose(self.best, kind, count), kind)
-        return parts[0].joined(*parts[1:]), kinds
+                parts.append(self.proposer.propose(self.best, kind, count))
+        return parts[0].joined(*parts[1:])
 
     def _round(self, sweep: bool, follow: Callable[..., bool]) -> Round:
         """Draw particles, choose among them, and go on from the choice if its energy is lower."""
         mark, data = time.perf_counter(), self.data
-        p, kinds = self._draw(sweep)
+        p = self._draw(sweep)
         unary, pairwise = self.costs(p)
         result = solve_trws(
             unary,
@@ -244,7 +237,6 @@ class Rounds:
         labels = result.labels if taken else np.zeros_like(result.labels)
         if taken:
             self.best, self.energy = new, energy
-        number = np.array([KINDS.index(k) for k in kinds])
         return Round(
             energy=dict(self.energy),
             mrf_energy=result.energy,
@@ -253,13 +245,5 @@ class Rounds:
             status=result.status,
             taken=taken,
             moved=int((labels > 0).sum()),
-            proposed=_by_kind(number, np.isfinite(unary).sum(axis=0)),
-            accepted=_by_kind(number, np.bincount(labels, minlength=len(number))),
             seconds=time.perf_counter() - mark,
         )
-
-
-def _by_kind(kind: NDArray[np.integer], count: NDArray[np.integer]) -> dict[str, int]:
-    """Sums of counts (L,) by kind (L,)."""
-    total = np.bincount(kind, count, len(KINDS)).astype(int)
-    return dict(zip(KINDS, total.tolist(), strict=True))

@@ -27,8 +27,6 @@ WALKS: Mapping[str, float] = {"walk_plane": 3, "walk_motion": 3, "walk_all": 2}
 """Kinds of random walks around the current belief, and their relative numbers."""
 NEIGHBOURS: Mapping[str, float] = {"neighbour_plane": 3, "neighbour_motion": 4, "neighbour_both": 5}
 """Kinds that take over the plane, the motion or both of a neighbour."""
-KINDS = ("current", "swept", *WALKS, *NEIGHBOURS)
-"""Kinds of particles by number."""
 STEP, WIDTH = 0.5, 1.2
 """Median of the steps of a walk in pixels, and the standard deviation of their logarithm: large and
 small steps are tried at once."""

@@ -1,7 +1,7 @@
 """Options of the refinement, and the records of its rounds."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -44,8 +44,6 @@ class Round:
         status: Status of TRW-S.
         taken: Whether the choice lowered E; if not, the belief stays.
         moved: Superpixels that left their current belief.
-        proposed: Feasible particles by kind.
-        accepted: Chosen particles by kind.
         seconds: Wall time.
     """
 
@@ -56,8 +54,6 @@ class Round:
     status: str
     taken: bool
     moved: int
-    proposed: Mapping[str, int] = field(repr=False)
-    accepted: Mapping[str, int] = field(repr=False)
     seconds: float
 
     def __str__(self) -> str:

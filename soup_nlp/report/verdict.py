@@ -46,8 +46,7 @@ RULES = {"none": "no scale", "affine": "one scale and shift each, of least squar
 """Words for rules of the scale of scores."""
 PAD = " " * 12
 ROUND = (
-    *("energy", "mrf_energy", "bound", "gap", "taken", "moved", "iterations", "status"),
-    *("seconds", "proposed", "accepted"),
+    *("energy", "mrf_energy", "bound", "gap", "taken", "moved", "iterations", "status", "seconds"),
 )
 """Entries of a round of the refinement in summary.json."""
 

@@ -82,9 +82,8 @@ class Functions:
 
     Attributes:
         oracle: (x, p) -> f, g.
-        grad_f: (x, p) -> f, gradient.
-        jac_g: (x, p) -> g, Jacobian.
-        hess_lag: (x, p, lam_f, lam_g) -> upper triangle of the Lagrangian's Hessian.
+        derivatives: Options of `nlpsol` that spare it the derivation: gradient, Jacobian, and the
+            upper triangle of the Lagrangian's Hessian.
     """
 
     def __init__(self, nlp: NLP) -> None:
@@ -93,19 +92,15 @@ class Functions:
         f = Output(ca.Sparsity.dense(1, 1), nlp.value)
         g = Output(ca.Sparsity.dense(nlp.ng, 1), nlp.constraints)
         gradient = Output(ca.Sparsity.dense(nlp.nx, 1), nlp.gradient)
-        jacobian = Output(nlp.jacobian_pattern.sparsity(), nlp.jacobian_nonzeros)
+        jacobian = Output(nlp.jacobian_pattern.sparsity, nlp.jacobian_nonzeros)
         hessian = Output(
-            nlp.hessian_pattern.sparsity(),
+            nlp.hessian_pattern.sparsity,
             lambda x, p, lam_f, lam_g: nlp.hessian_nonzeros(x, lam_g, float(lam_f[0]), p),
         )
+        more = {**at, "lam_f": 1, "lam_g": nlp.ng}
         self.oracle = Buffered("nlp", at, {"f": f, "g": g})
-        self.grad_f = Buffered("nlp_grad_f", at, {"f": f, "grad_f_x": gradient})
-        self.jac_g = Buffered("nlp_jac_g", at, {"g": g, "jac_g_x": jacobian})
-        self.hess_lag = Buffered(
-            "nlp_hess_l", {**at, "lam_f": 1, "lam_g": nlp.ng}, {"triu_hess_gamma_x_x": hessian}
-        )
-
-    @property
-    def derivatives(self) -> dict[str, ca.Function]:
-        """Options of `nlpsol` that spare it the derivation."""
-        return {"grad_f": self.grad_f, "jac_g": self.jac_g, "hess_lag": self.hess_lag}
+        self.derivatives: dict[str, ca.Function] = {
+            "grad_f": Buffered("nlp_grad_f", at, {"f": f, "grad_f_x": gradient}),
+            "jac_g": Buffered("nlp_jac_g", at, {"g": g, "jac_g_x": jacobian}),
+            "hess_lag": Buffered("nlp_hess_l", more, {"triu_hess_gamma_x_x": hessian}),
+        }

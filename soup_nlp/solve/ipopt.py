@@ -155,89 +155,82 @@ class _Iterations:
         )
 
 
-class Ipopt:
-    """Ipopt set up once for an NLP; call it with parameters and a start as often as needed."""
+def _solver(
+    functions: Functions, iterations: _Iterations, user: Mapping[str, Any], ipopt: dict[str, Any]
+) -> Any:
+    log_file = iterations.watch.log_file
+    if log_file:
+        # without its log where that cannot be opened
+        with suppress(OSError), open(log_file, "a"):
+            ipopt |= {"output_file": log_file, "file_print_level": 5, "file_append": "yes"}
+    options = {
+        "ipopt": ipopt,
+        **functions.derivatives,
+        "iteration_callback": iterations.callback,
+        "print_time": False,
+        "calc_lam_p": False,
+        "calc_multipliers": False,
+        "no_nlp_grad": True,
+        "show_eval_warnings": False,
+    }
+    try:
+        return ca.nlpsol("solver", "ipopt", functions.oracle, options)
+    except RuntimeError as error:
+        raise SolverError(
+            "Ipopt could not be set up",
+            where=iterations.nlp.name,
+            found=str(error).strip().splitlines()[-1],
+            hint="check the names of the options under solver" if user else None,
+        ) from error
 
-    def __init__(
-        self,
-        nlp: NLP,
-        options: Mapping[str, Any] | None = None,
-        below: Mapping[str, Any] = MappingProxyType({}),
-    ) -> None:
-        """Set up; `options` are the user's, `below` those of the stage that they replace."""
-        self.nlp = nlp
-        self.options, self.below = dict(options or {}), below
-        # CasADi does not keep a callback alive
-        self.functions = Functions(nlp)
 
-    def _solver(self, iterations: _Iterations, max_iter: int, tol: float) -> Any:
-        functions, log_file = self.functions, iterations.watch.log_file
-        ipopt: dict[str, Any] = {**DEFAULTS, "print_level": 0, "sb": "yes"}
-        ipopt |= {"max_iter": max_iter, "tol": tol, "dual_inf_tol": tol}
-        ipopt |= {**self.below, **self.options}
-        if log_file:
-            # without its log where that cannot be opened
-            with suppress(OSError), open(log_file, "a"):
-                ipopt |= {"output_file": log_file, "file_print_level": 5, "file_append": "yes"}
-        options = {
-            "ipopt": ipopt,
-            **functions.derivatives,
-            "iteration_callback": iterations.callback,
-            "print_time": False,
-            "calc_lam_p": False,
-            "calc_multipliers": False,
-            "no_nlp_grad": True,
-            "show_eval_warnings": False,
-        }
-        try:
-            return ca.nlpsol("solver", "ipopt", functions.oracle, options)
-        except RuntimeError as error:
-            raise SolverError(
-                "Ipopt could not be set up",
-                where=self.nlp.name,
-                found=str(error).strip().splitlines()[-1],
-                hint="check the names of the options under solver" if self.options else None,
-            ) from error
+def run_ipopt(
+    nlp: NLP,
+    options: Mapping[str, Any] = MappingProxyType({}),
+    below: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    x0: Float,
+    p: Float | None = None,
+    lam_x0: Float | None = None,
+    lam_g0: Float | None = None,
+    max_iter: int = 100,
+    tol: float = 1e-4,
+    seconds: float = np.inf,
+    stagnation: float = 0.0,
+    stage: str = "solve",
+    watch: Watch | None = None,
+) -> Stage:
+    """Solve an NLP from x0.
 
-    def __call__(
-        self,
-        *,
-        x0: Float,
-        p: Float | None = None,
-        lam_x0: Float | None = None,
-        lam_g0: Float | None = None,
-        max_iter: int = 100,
-        tol: float = 1e-4,
-        seconds: float = np.inf,
-        stagnation: float = 0.0,
-        stage: str = "solve",
-        watch: Watch | None = None,
-    ) -> Stage:
-        """Solve from x0.
+    Args:
+        nlp: The NLP.
+        options: Ipopt's by the user.
+        below: Options of the stage, which those of the user replace.
+        x0: (nx,) start.
+        p: (nt,) parameters theta; default the NLP's.
+        lam_x0: (nx,) start of the bound multipliers.
+        lam_g0: (ng,) start of the constraint multipliers.
+        max_iter: Iteration limit.
+        tol: Ipopt's tol and dual_inf_tol.
+        seconds: Limit of CPU time; the best iterate is kept.
+        stagnation: Relative change of f that ends the solve when it was smaller twice in a
+            row; 0 for none.
+        stage: Name for progress.
+        watch: Listener, stop event and log, to which Ipopt's own is appended.
 
-        Args:
-            x0: (nx,) start.
-            p: (nt,) parameters theta; default the NLP's.
-            lam_x0: (nx,) start of the bound multipliers.
-            lam_g0: (ng,) start of the constraint multipliers.
-            max_iter: Iteration limit.
-            tol: Ipopt's tol and dual_inf_tol.
-            seconds: Limit of CPU time; the best iterate is kept.
-            stagnation: Relative change of f that ends the solve when it was smaller twice in a
-                row; 0 for none.
-            stage: Name for progress.
-            watch: Listener, stop event and log, to which Ipopt's own is appended.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C, which ends the solve at the next iteration.
-        """
-        nlp = self.nlp
-        iterations = _Iterations(nlp, x0, stage, watch or Watch(), seconds, stagnation)
-        solver = self._solver(iterations, max_iter, tol)
-        given = {"p": nlp.thetas() if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
-        bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
-        with interruptible(numbers=raising()) as iterations.signalled:
-            out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
-        if iterations.signalled.is_set():
-            raise KeyboardInterrupt
-        return iterations.ended(solver.stats(), {k: np.asarray(v).ravel() for k, v in out.items()})
+    Raises:
+        KeyboardInterrupt: Ctrl-C, which ends the solve at the next iteration.
+    """
+    iterations = _Iterations(nlp, x0, stage, watch or Watch(), seconds, stagnation)
+    ipopt = {**DEFAULTS, "print_level": 0, "sb": "yes", "max_iter": max_iter, "tol": tol}
+    # CasADi does not keep a callback alive
+    functions = Functions(nlp)
+    every = {**ipopt, "dual_inf_tol": tol, **below, **options}
+    solver = _solver(functions, iterations, options, every)
+    given = {"p": nlp.thetas() if p is None else p, "lam_x0": lam_x0, "lam_g0": lam_g0}
+    bounds = {k: getattr(nlp, k) for k in ("lbx", "ubx", "lbg", "ubg")}
+    with interruptible(numbers=raising()) as iterations.signalled:
+        out = solver(x0=x0, **bounds, **{k: v for k, v in given.items() if v is not None})
+    if iterations.signalled.is_set():
+        raise KeyboardInterrupt
+    return iterations.ended(solver.stats(), {k: np.asarray(v).ravel() for k, v in out.items()})

@@ -27,7 +27,7 @@ from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Chart, Layout, MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp, exact_chart, majorant
-from soup_nlp.solve.ipopt import Ipopt, Stage
+from soup_nlp.solve.ipopt import Stage, run_ipopt
 from soup_nlp.solve.solver_options import Stages
 from soup_nlp.storage.progress import Watch
 
@@ -190,11 +190,14 @@ class Presolve:
         o, nlp = self.o, program.nlp
         nlp = nlp if hessian is None else replace(nlp, hessian_kind=hessian)
         keep = KEEP if o.coordinates == "tangent" else KEEP_IN_MATRICES
-        solver = Ipopt(nlp, o.ipopt, {**keep, **(options or {})})
+        below = {**keep, **(options or {})}
         for planned in stages:
             if self.stages and self._stopped():
                 break
-            stage = solver(
+            stage = run_ipopt(
+                nlp,
+                o.ipopt,
+                below,
                 x0=program.x,
                 lam_x0=program.lam_x,
                 lam_g0=program.lam_g,

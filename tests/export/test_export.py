@@ -193,7 +193,7 @@ def test_the_file_and_its_manifest_are_those_of_the_nlp(exported):
     # a start that is not stationary has no multipliers
     assert not any(line[0] in "dS" for line in (exported / "soup.nl").read_text().splitlines())
     assert manifest["sizes"]["variables"] == len(back.x0) == nlp.nx
-    assert manifest["sizes"]["jacobian_nonzeros"] == nlp.nnzj
+    assert manifest["sizes"]["jacobian_nonzeros"] == nlp.sizes()["jacobian_nonzeros"]
     close(back.x0, nlp.x0[v])
     rng = np.random.default_rng(0)
     x = np.clip(nlp.x0 + 0.05 * rng.normal(size=nlp.nx), nlp.lbx, nlp.ubx)

@@ -29,7 +29,7 @@ from soup_nlp.model.layout import MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp
 from soup_nlp.pipeline.case import prepare
-from soup_nlp.solve.ipopt import Ipopt
+from soup_nlp.solve.ipopt import run_ipopt
 from soup_nlp.solve.stages import solve_soup
 
 ENTRIES = [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)]
@@ -209,7 +209,7 @@ def smooth_answer(name: str, gauge: str, ratio: float) -> tuple[NLP, MatrixLayou
     soup, data = world(name, "pixels", False)
     f = form(gauge=gauge, depth_ratio=ratio, **WIDE)
     nlp, layout = build_matrix_nlp(disturbed(soup, 0.02), data, WEIGHTS, f)
-    stage = Ipopt(nlp)(x0=nlp.x0, tol=1e-3)
+    stage = run_ipopt(nlp, x0=nlp.x0, tol=1e-3)
     assert stage.converged, stage
     # it had something to do
     assert stage.iterations >= 3
@@ -257,7 +257,7 @@ def test_ipopt_gets_every_kind_of_bound(side):
         )
     bound = getattr(rest, side).copy()
     bound[k] = free + sign * 0.01
-    stage = Ipopt(replace(rest, **{side: bound}))(x0=x, tol=1e-3)
+    stage = run_ipopt(replace(rest, **{side: bound}), x0=x, tol=1e-3)
     found = stage.x[k] if side.endswith("x") else nlp.constraints(stage.x)[k]
     assert stage.converged, stage
     assert found == pytest.approx(bound[k], abs=1e-3)

@@ -55,19 +55,19 @@ def test_the_functions_that_ipopt_takes_are_casadis_derivatives(small_room, vari
     at, lam_f, lam_g = nlp.x0, 0.7, np.random.default_rng(3).normal(size=nlp.ng)
     oracle, values = make_oracle(nlp)
     theta = nlp.thetas(eps=0.05)
-    x, fast = ca.MX.sym("x", nlp.nx), Functions(nlp)
+    x, fast = ca.MX.sym("x", nlp.nx), Functions(nlp).derivatives
     f, g = oracle(x, np.concatenate([theta, values[len(theta) :]]))
     H = ca.hessian(lam_f * f + ca.dot(lam_g, g), x)[0]
     expected = ca.Function("e", [x], [f, ca.gradient(f, x), g, ca.jacobian(g, x), ca.triu(H)])(at)
     found = [
-        *fast.grad_f(at, theta),
-        *fast.jac_g(at, theta),
-        fast.hess_lag(at, theta, lam_f, lam_g),
+        *fast["grad_f"](at, theta),
+        *fast["jac_g"](at, theta),
+        fast["hess_lag"](at, theta, lam_f, lam_g),
     ]
     for a, b in zip(found, expected, strict=True):
         close(ca.densify(a), ca.densify(b))
-    assert fast.hess_lag.nnz_out(0) == nlp.nnzh
-    assert fast.hess_lag.sparsity_out(0).is_triu()
+    assert fast["hess_lag"].nnz_out(0) == nlp.sizes()["hessian_nonzeros"]
+    assert fast["hess_lag"].sparsity_out(0).is_triu()
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,6 @@ from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.refine import mppbp, particles
 from soup_nlp.refine.mppbp import length_slope, refine_soup
 from soup_nlp.refine.particles import (
-    KINDS,
     NEIGHBOURS,
     WALKS,
     PairCosts,
@@ -260,11 +259,9 @@ def test_no_round_raises_the_energy_or_violates_constraints(units):
     for r in done.rounds:
         assert r.bound <= r.mrf_energy + 1e-9
         assert r.gap >= -1e-9
-        assert sum(r.accepted.values()) == len(tiny.soup)
-        assert sum(r.proposed.values()) <= FEW.particles * len(tiny.soup)
+        assert 0 <= r.moved <= len(tiny.soup)
         if units == "pixels" and r.taken:
             assert r.mrf_energy == pytest.approx(r.energy["total"], rel=1e-5)
-    assert set(done.rounds[0].accepted) == set(KINDS)
 
 
 def test_the_same_seed_gives_the_same_soup_and_another_another():

@@ -15,7 +15,7 @@ from soup_nlp.errors import SolverError
 from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.functions import Functions
-from soup_nlp.solve.ipopt import Ipopt, Stage
+from soup_nlp.solve.ipopt import Stage, run_ipopt
 from soup_nlp.solve.kkt import optimality
 from soup_nlp.storage.progress import Progress, Watch
 
@@ -67,7 +67,7 @@ def rosenbrock(n: int, ubx: float = np.inf) -> NLP:
 
 
 def solve(nlp: NLP, **options) -> Stage:
-    return Ipopt(nlp)(x0=nlp.x0, **{"tol": 1e-8, **options})
+    return run_ipopt(nlp, x0=nlp.x0, **{"tol": 1e-8, **options})
 
 
 def test_hs071_is_solved_to_its_known_optimum():
@@ -106,7 +106,7 @@ def test_a_multiplier_of_the_wrong_sign_is_no_optimum():
 
 def test_hessian_of_an_unsorted_table_is_upper_triangular():
     nlp = rosenbrock(4)
-    assert Functions(nlp).hess_lag.sparsity_out(0).is_triu()
+    assert Functions(nlp).derivatives["hess_lag"].sparsity_out(0).is_triu()
     x = np.array([0.3, -0.5, 0.7, 1.2])
     H = nlp.hessian(x, np.zeros(0)).toarray()
     expected = np.zeros((4, 4))
@@ -163,18 +163,18 @@ def test_history_counts_and_call_times_are_kept():
 def test_a_wrong_ipopt_option_is_a_solver_error(options):
     nlp = hs071()
     with pytest.raises(SolverError) as caught:
-        Ipopt(nlp, options)(x0=nlp.x0)
+        run_ipopt(nlp, options, x0=nlp.x0)
     assert "textbook" in str(caught.value)
     assert "the names of the options" in str(caught.value)
     with pytest.raises(SolverError) as caught:
-        Ipopt(nlp, {}, options)(x0=nlp.x0)
+        run_ipopt(nlp, {}, options, x0=nlp.x0)
     assert "the names of the options" not in str(caught.value)
 
 
 def test_a_log_that_cannot_be_opened_is_left_out(tmp_path):
     nlp = hs071()
     log = tmp_path / "removed by another process" / "ipopt.log"
-    assert Ipopt(nlp)(x0=nlp.x0, watch=Watch(log_file=str(log))).converged
+    assert run_ipopt(nlp, x0=nlp.x0, watch=Watch(log_file=str(log))).converged
 
 
 def test_options_reach_ipopt(tmp_path, monkeypatch):
@@ -182,11 +182,11 @@ def test_options_reach_ipopt(tmp_path, monkeypatch):
     (tmp_path / "ipopt.opt").write_text("max_iter 0\nhsllib ./evil.so\n")
     monkeypatch.chdir(tmp_path)
     nlp, log = hs071(), tmp_path / "ipopt.log"
-    Ipopt(nlp, {"mu_init": 0.123})(x0=nlp.x0, watch=Watch(log_file=str(log)))
+    run_ipopt(nlp, {"mu_init": 0.123}, x0=nlp.x0, watch=Watch(log_file=str(log)))
     text = log.read_text()
     assert "Number of nonzeros" in text
     assert "lg(mu)" in text
-    stage = Ipopt(nlp, {"mu_init": 0.123})(x0=nlp.x0)
+    stage = run_ipopt(nlp, {"mu_init": 0.123}, x0=nlp.x0)
     assert stage.history["mu"][0] == pytest.approx(0.123)
     assert stage.converged
 

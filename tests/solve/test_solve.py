@@ -29,7 +29,7 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import HESSIANS
 from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.reweighting import in_pixels
-from soup_nlp.solve.ipopt import Ipopt
+from soup_nlp.solve.ipopt import run_ipopt
 from soup_nlp.solve.kkt import optimality
 from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import Solution, _near, solve_soup
@@ -139,7 +139,7 @@ def test_every_gauge_finds_the_same_world(room, solved, gauge):
 def test_the_claimed_multipliers_balance_the_gradient(room, solved):
     """Dual infeasibility from the NLP's own functions at the packed solution."""
     nlp, layout = build_matrix_nlp(room.start, room.data, WEIGHTS, form(eps=0.03, eps_pixel=0.03))
-    stage = Ipopt(nlp)(x0=nlp.x0, max_iter=0)
+    stage = run_ipopt(nlp, x0=nlp.x0, max_iter=0)
     far = optimality(nlp, stage.x, stage.lam_x, stage.lam_g)["dual_infeasibility"]
     solution = solved["unit-offset"]
     x = layout.pack(solution.soup)

@@ -18,7 +18,6 @@ from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.report.check import Stored, _constraints
 from soup_nlp.solve import stages
-from soup_nlp.solve.ipopt import Ipopt
 from soup_nlp.solve.kkt import optimality, warm_start
 from soup_nlp.solve.presolve import _rim
 from soup_nlp.solve.solver_options import Stages
@@ -61,10 +60,10 @@ def test_complementarity_counts_bounds_and_rows_on_both_sides(place, sign):
 
 
 def test_an_answer_that_violates_its_constraints_has_not_converged(monkeypatch):
-    tiny, call = Tiny(), Ipopt.__call__
+    tiny, call = Tiny(), stages.run_ipopt
 
-    def answered(self, **given):
-        stage = call(self, **given)
+    def answered(*args, **given):
+        stage = call(*args, **given)
         x, n = stage.x.copy(), stage.x[1:4].copy()
         # tilted about the anchor until a rim ray sees the plane too flat by `off`
         anchor, rim = tiny.data.rim_ray[0, 0], tiny.data.rim_ray[0, 1]
@@ -75,7 +74,7 @@ def test_an_answer_that_violates_its_constraints_has_not_converged(monkeypatch):
         x[1:4] = n
         return replace(stage, x=x, status="Solve_Succeeded", converged=True)
 
-    monkeypatch.setattr(Ipopt, "__call__", answered)
+    monkeypatch.setattr(stages, "run_ipopt", answered)
     options = Stages(presolve_iterations=0, max_iter=1)
     for off, status in ((0.9e-6, "Solve_Succeeded"), (1.1e-6, "Constraints_Violated")):
         found = stages.solve_soup(tiny.soup, tiny.data, PAPER, FORM, options)
