@@ -93,5 +93,6 @@ def _side(nodes: np.ndarray, edges: np.ndarray, near: np.ndarray) -> Side:
     order = np.argsort(node, kind="stable")
     ids, end, node = ids[order], end[order], node[order]
     linked, starts = np.unique(node, return_index=True)
-    parts = tuple((axis + 1, np.flatnonzero(end == axis)) for axis in (0, 1))
+    by_axis = ((axis + 1, np.flatnonzero(end == axis)) for axis in (0, 1))
+    parts = tuple(part for part in by_axis if part[1].size)
     return Side(ids, node, edges[ids, 1 - end], parts, linked, starts)

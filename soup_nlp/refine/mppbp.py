@@ -40,14 +40,12 @@ from soup_nlp.refine.particles import (
     neighbours,
     unary_costs,
 )
-from soup_nlp.refine.photometric import Photometric, swept
+from soup_nlp.refine.photometric import Photometric
 from soup_nlp.refine.records import Refined, RefineOptions, Round
 from soup_nlp.storage.progress import Progress, Watch
 
 TRWS_ITERATIONS, TRWS_GAP = 15, 1e-4
 """Most iterations of TRW-S in a round, and the relative gap at which it stops earlier."""
-SWEPT = 6
-"""Planes swept over depth among the particles of every superpixel, if images are used."""
 CONTRADICTED = 0.06
 """Share of superpixels whose flow the images contradict, below which there is one round: on such
 pairs four rounds give the same MRE as one."""
@@ -68,9 +66,8 @@ def refine_soup(
 ) -> Refined:
     """Lower the exact energy of a soup by particles; see the module.
 
-    With images the energy is that of `objective`. Where they contradict the flow of more than a
-    few superpixels, planes swept over depth under the commonest motions are among the particles of
-    the first round; otherwise there is only one round.
+    With images the energy is that of `objective`, and there is only one round where they contradict
+    the flow of few superpixels.
 
     Args:
         soup: Current belief. Planes that break visibility are first tilted until they do not.
@@ -169,7 +166,7 @@ class Rounds:
 
         while len(self.done) < most and not (slow or interrupted or over()):
             before = self.energy["total"]
-            self.done.append(self._round(sweep=not (agreed or self.done), follow=follow))
+            self.done.append(self._round(follow))
             # TRW-S answers Ctrl-C too with the best labels so far
             interrupted = self.done[-1].status == "interrupted" and time.process_time() <= deadline
             watch.say(f"refine {len(self.done)}: {self.done[-1]}")
@@ -204,23 +201,21 @@ class Rounds:
         # single precision suffices: a choice is taken only where the exact energy falls
         return unary, self.pairs.tables(p, unit, np.float32)
 
-    def _draw(self, sweep: bool) -> Particles:
-        """The current belief, swept planes and proposals."""
+    def _draw(self) -> Particles:
+        """The current belief and proposals."""
         parts = [Particles.of(self.best)]
-        if sweep and self.photo is not None:
-            parts.append(swept(self.best, self.data, self.photo, SWEPT, self.proposer.rng))
         shares = WALKS if self.options.proposals == "walks" else {**WALKS, **NEIGHBOURS}
-        remaining = max(0, self.options.particles - sum(p.shape[1] for p in parts))
+        remaining = max(0, self.options.particles - 1)
         near = self.proposer.near.shape[1]
         for kind, count in counts(shares, remaining, near).items():
             if count:
                 parts.append(self.proposer.propose(self.best, kind, count))
         return parts[0].joined(*parts[1:])
 
-    def _round(self, sweep: bool, follow: Callable[..., bool]) -> Round:
+    def _round(self, follow: Callable[..., bool]) -> Round:
         """Draw particles, choose among them, and go on from the choice if its energy is lower."""
         mark, data = time.perf_counter(), self.data
-        p = self._draw(sweep)
+        p = self._draw()
         unary, pairwise = self.costs(p)
         result = solve_trws(
             unary,

@@ -1,4 +1,4 @@
-"""E_photo, the difference between the images and superpixels' homographies; plane sweep.
+"""E_photo, the difference between the images and superpixels' homographies.
 
     E_photo = sum_i mean_s min(c_is, tau)
 
@@ -163,79 +163,3 @@ def photometric_term(
         contradicted=np.zeros(len(soup), bool),
     )
     return replace(photo, contradicted=photo.disagreeing(soup, data))
-
-
-# --- plane sweep ----------------------------------------------------------------------------------
-#
-# Proposals that do not depend on the flow: every superpixel is tried at evenly spaced steps along
-# its epipolar line, under each of the commonest motions and in two orientations, and scored by the
-# images alone.
-
-LEVELS = 64
-"""Number of depths."""
-MOTIONS, TRIED = 2, 64
-"""Motions under which planes are swept, and size of the sample of motions they are chosen from."""
-NEAREST = 1.5
-"""The nearest depth tried is that of the 2 % nearest superpixels over this."""
-STEEP = 0.08
-"""`-n . ray` below which an orientation is replaced by one parallel to the image."""
-CLIP_PX = 3.0
-"""Limit of the distance between two motions of a point, pixels."""
-
-
-def swept(
-    soup: Soup, data: EnergyData, photo: Photometric, keep: int, rng: np.random.Generator
-) -> Particles:
-    """(N, keep) particles of lowest photometric cost among the local minima over depth.
-
-    With y = R r a point at inverse depth mu comes to `(y + mu T)_xy / (y + mu T)_z`, which runs
-    along its epipolar line in proportion to `s = mu / (y_z + mu T_z)`: equal steps of s are equal
-    steps in pixels, and nearly the same depths for all superpixels. Motions, orientations and the
-    range of depths are those of `soup`.
-    """
-    n, ray = len(soup), data.anchor_ray
-    most = NEAREST / np.quantile(soup.depth_at(ray), 0.02)
-    frontal = np.broadcast_to([0.0, 0.0, -1.0], (n, 3))
-    tried, cost, unit = [], [], photo.unit(soup)
-    for turn, shift in zip(*common_motions(soup, data, MOTIONS, rng), strict=True):
-        # the nearest depth may lie behind a camera that moves forward: the line has no end then
-        last = most / max(1 + most * shift[2], 0.2)
-        s = (np.arange(LEVELS) + 0.5) / LEVELS * last
-        mu = s * (ray @ turn.T)[:, 2:] / np.maximum(1 - s * shift[2], 1e-6)
-        Z = 1 / np.maximum(mu, 1e-9)
-        for normal in (frontal, soup.n):
-            facing = -np.sum(normal * ray, axis=1)
-            slanted = np.where((facing < STEEP)[:, None], frontal, normal)
-            p = Particles(
-                np.broadcast_to(slanted[:, None], (n, LEVELS, 3)),
-                Z * -np.sum(slanted * ray, axis=1)[:, None],
-                np.broadcast_to(turn, (n, LEVELS, 3, 3)),
-                np.broadcast_to(shift, (n, LEVELS, 3)),
-            )
-            tried.append(p)
-            cost.append(photo.costs(p, unit))
-    value = np.stack(cost, axis=1)
-    sides = np.pad(value, ((0, 0), (0, 0), (1, 1)), constant_values=np.inf)
-    low = (value <= sides[..., :-2]) & (value <= sides[..., 2:])
-    value = np.where(low, value, np.inf).reshape(n, -1)
-    which = np.argsort(value, axis=1, kind="stable")[:, :keep]
-    return tried[0].joined(*tried[1:]).take(which)
-
-
-def common_motions(
-    soup: Soup, data: EnergyData, count: int, rng: np.random.Generator
-) -> tuple[Float, Float]:
-    """At most `count` present motions, (C, 3, 3) and (C, 3), under which most anchors move as under
-    their own; each by how much it lowers the sum of the limited distances after those before."""
-    pick = rng.choice(len(soup), min(TRIED, len(soup)), replace=False)
-    X = soup.points(data.anchor_ray)
-    moved = np.einsum("mij,nj->nmi", soup.R[pick], X) + soup.translation[pick]
-    # rays of the next camera
-    tried, actual = (y[..., :2] / np.maximum(y[..., 2:], 1e-9) for y in (moved, soup.moved(X)))
-    gap = np.linalg.norm(tried - actual[:, None], axis=-1)
-    error = np.minimum(float(data.K_next[0, 0]) * gap, CLIP_PX)
-    best, chosen = np.full((len(soup), 1), CLIP_PX), []
-    for _ in range(min(count, len(pick))):
-        chosen.append(int(np.minimum(best, error).sum(axis=0).argmin()))
-        best = np.minimum(best, error[:, chosen[-1:]])
-    return soup.R[pick[chosen]], soup.translation[pick[chosen]]

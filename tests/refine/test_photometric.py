@@ -8,7 +8,7 @@ import pytest
 
 from soup_nlp.data.census import census, census_at
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
@@ -23,9 +23,7 @@ from soup_nlp.refine.photometric import (
     SAMPLES,
     TAU,
     Photometric,
-    common_motions,
     photometric_term,
-    swept,
 )
 from soup_nlp.refine.records import RefineOptions
 
@@ -148,26 +146,6 @@ def test_weight_zero_leaves_the_images_out(scene):
     o = RefineOptions(photo=0)
     data = scene.data(scene.flow)
     assert photometric_term(scene.pair, scene.labels, scene.truth, data, o) is None
-
-
-def test_sweep_finds_depths_that_the_start_does_not_have(scene):
-    rng = np.random.default_rng(0)
-    start = scene.soup(np.exp(rng.uniform(np.log(0.8), np.log(3.0), scene.count)))
-    p = swept(start, scene.data(scene.flow), scene.look(start), 6, rng)
-    assert p.shape == (scene.count, 6)
-    gap = np.abs(np.log(p.D / -p.n[..., 2] / scene.truth.distance[:, None])).min(axis=1)
-    u = scene.seg.anchors[:, 0]
-    assert np.median(gap[u < 85]) < 0.05
-
-
-def test_common_motions_are_those_of_the_components(scene):
-    turn = rotation.exp(np.array([0.0, 0.05, 0.02]))
-    R = np.where(scene.near[:, None, None], turn, np.eye(3))
-    soup = replace(scene.truth, R=R)
-    rotations, shift = common_motions(soup, scene.data(scene.flow), 2, np.random.default_rng(0))
-    assert shift.shape == (2, 3)
-    order = np.argsort(rotations[:, 0, 2])
-    np.testing.assert_array_equal(rotations[order], [np.eye(3), turn])
 
 
 def test_images_repair_what_the_flow_says_wrongly(scene):
