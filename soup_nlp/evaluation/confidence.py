@@ -97,26 +97,17 @@ def flow_misfit(rec: Reconstruction, flow: Flow) -> Float:
     return np.asarray(np.bincount(flat, limited.ravel()) / np.bincount(flat))
 
 
-def _log(depth: Float) -> Float:
-    """Logarithm of depth; finite, since the answer of a foreign solver may have none."""
-    return np.log(np.clip(np.nan_to_num(depth), 1e-30, 1e30))
-
-
 def at_outlines(depth: Float) -> Float:
     """(H, W) steps of log depth near every pixel, which may belong to the surface on either side.
 
     With range(r) the range of log depth within r pixels, the step is `2 range(r) - range(2 r)`, 0
     on a constant slope.
     """
-    log_depth = _log(depth)
+    # finite, since the answer of a foreign solver may have none
+    log_depth = np.log(np.clip(np.nan_to_num(depth), 1e-30, 1e30))
     reach = max(1, round(OUTLINE_REACH * max(depth.shape)))
-
-    def extent(r: int) -> Float:
-        size = 2 * r + 1
-        most, least = (f(log_depth, size) for f in (ndimage.maximum_filter, ndimage.minimum_filter))
-        return np.asarray(most - least)
-
-    return np.maximum(2 * extent(reach) - extent(2 * reach), 0.0)
+    near, wide = (ndimage.morphological_gradient(log_depth, 2 * r + 1) for r in (reach, 2 * reach))
+    return np.maximum(2 * near - wide, 0.0)
 
 
 def with_prior(sigma: Float, prior: Float | float = FACTORS["prior"]) -> Float:

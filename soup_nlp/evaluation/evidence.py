@@ -6,25 +6,17 @@ systematic error determines the depth of a component only where neither a turn a
 depth explains it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import special
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.geometry.camera import project, rays
+from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
-from soup_nlp.start.bending import (
-    CLIP_PX,
-    PLAIN_TURN,
-    displaced,
-    fit_robustly,
-    least_gap,
-    trimmed_mean,
-    turned,
-)
+from soup_nlp.start.bending import CLIP_PX, at_one_depth, fit_turn, least_gap, trimmed_mean
 from soup_nlp.start.camera_error import (
     TRIED_ERRORS,
     CameraError,
@@ -32,8 +24,8 @@ from soup_nlp.start.camera_error import (
     camera_errors,
     likeliest,
 )
-from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.regions import SCENE
+from soup_nlp.start.views import Views
 
 LEAST_MEMBERS = 3
 """Least number of superpixels with flow of a component whose depth can be known."""
@@ -111,9 +103,16 @@ def evidence(
         rigid: (N,) True where the flow is that of a moving camera and may show its errors; None
             where none is sought.
     """
-    valid = data.pixel_weight.sum(axis=1) > 0.25
-    moved = soup.moved(soup.points(data.pixel_ray))
-    misfit = _error(project(data.K_next, moved), data)
+    views = Views(
+        data.pixel_ray,
+        rays(data.K_next, data.pixel_target),
+        data.pixel_weight * data.pixel_weight.shape[1],
+        data.anchor_ray,
+        np.ones(len(data)),
+        np.diag(data.K_next)[:2],
+    )
+    valid = views.weight.mean(axis=1) > 0.25
+    misfit = views.distance(soup.moved(soup.points(data.pixel_ray)))
     count = int(component.max()) + 1
     errors = np.full((3, count), np.nan)
     sigma = np.full(len(soup), np.inf)
@@ -122,16 +121,17 @@ def evidence(
     scene = valid & (component == SCENE)
     at = scene if rigid is None else scene & rigid
     if rigid is not None and at.any():
-        shown = camera_errors(_matches(data, at))
+        shown = camera_errors(views.subset(at).matches())
     acting = dict(shown)
     if focal_sigma and scene.any():
         # its deviation is known
-        guess = camera_error(_matches(data, scene), "focal length", focal_sigma)
+        guess = camera_error(views.subset(scene).matches(), "focal length", focal_sigma)
         acting[guess.kind] = guess._replace(density=tuple(special.softmax(-(TRIED_ERRORS**2) / 2)))
     squares = np.zeros(len(soup))
     if acting:
         still, point = component == SCENE, soup.points(data.anchor_ray)
-        target = rays(data.K_next, project(data.K_next, soup.moved(point)))
+        target = soup.moved(point)
+        target = target / target[:, 2:]
         seen = data.anchor_ray[still], target[still], point[still, 2]
         squares[still] = sum(error.squares(*seen) for error in acting.values())
         # other components stand in the scene
@@ -140,38 +140,9 @@ def evidence(
         at = np.flatnonzero((component == c) & valid)
         if len(at) < LEAST_MEMBERS:
             continue
-        errors[:, c] = *_without_depth(data, at), trimmed_mean(misfit[at])
+        part = views.subset(at)
+        each = fit_turn(part)[1], fit_turn(part, 6, at_one_depth)[1], misfit[at]
+        # a flow that is not known counts as the largest error
+        errors[:, c] = [trimmed_mean(np.fmin(error, CLIP_PX)) for error in each]
         sigma[component == c] = np.sqrt(squares[component == c])
     return Evidence(errors[0], errors[1], errors[2], noise, sigma, shown)
-
-
-def _matches(data: EnergyData, at: Mask) -> Matches:
-    """Correspondences by the flow of superpixels."""
-    ray, target = data.pixel_ray[at], rays(data.K_next, data.pixel_target[at])
-    weight = data.pixel_weight[at].ravel() / data.pixel_weight[at].max()
-    return Matches(ray.reshape(-1, 3), target.reshape(-1, 3), weight, data.K_next[0, 0])
-
-
-def _error(pixel: Float, data: EnergyData, at: Int | slice = slice(None)) -> Float:
-    """(N,) mean distance of pixels (N, S, 2) from the flow's targets, limited."""
-    distance = np.linalg.norm(pixel - data.pixel_target[at], axis=2)
-    distance = np.where(np.isfinite(distance), np.minimum(distance, CLIP_PX), CLIP_PX)
-    weight = data.pixel_weight[at]
-    return np.asarray(np.sum(weight * distance, axis=1) / np.maximum(weight.sum(axis=1), 1e-9))
-
-
-def _without_depth(data: EnergyData, at: Int, pixels: int = 2000) -> tuple[float, float]:
-    """Errors of superpixels `at` under the best turn alone and the best motion at equal depths."""
-    step = max(1, data.pixel_ray[at].shape[0] * data.pixel_ray.shape[1] // pixels)
-    weight = data.pixel_weight[at].ravel()[::step] * data.pixel_ray.shape[1]
-    target = rays(data.K_next, data.pixel_target[at].reshape(-1, 2)[::step])[:, :2]
-    scale = np.sqrt(weight)[:, None] * np.diag(data.K_next)[:2]
-
-    def error(matrix: Callable[[Float], Float], size: int, ray: Float) -> float:
-        point = ray.reshape(-1, ray.shape[-1])[::step]
-        x, _ = fit_robustly(matrix, size, point, target, scale)
-        return trimmed_mean(_error(project(data.K_next, ray @ matrix(x).T), data, at))
-
-    ray = data.pixel_ray[at]
-    at_one = np.insert(ray, 3, 1.0, axis=-1)
-    return error(turned, PLAIN_TURN, ray), error(displaced, 6, at_one)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csgraph
 
 from soup_nlp.arrays import Float, Int, Labels
 from soup_nlp.geometry.camera import pixel_grid, rays
@@ -241,16 +242,7 @@ def layers(coupled: sparse.csr_matrix, position: Float) -> list[Int]:
         position: (N, 2) positions; layers run across the longer side.
     """
     along = position[:, int(np.argmax(np.ptp(position, axis=0)))]
-    left, out = np.ones(len(position), bool), []
-    while left.any():
-        remaining = np.flatnonzero(left)
-        # as many as stand in a column
-        layer = remaining[
-            np.argsort(along[remaining], kind="stable")[: int(np.ceil(np.sqrt(len(remaining))))]
-        ]
-        while len(layer):
-            out.append(layer)
-            left[layer] = False
-            near = np.unique(coupled[layer].indices)
-            layer = near[left[near]]
-    return out
+    # as many as stand in a column
+    first = np.argsort(along, kind="stable")[: int(np.ceil(np.sqrt(len(along))))]
+    steps = csgraph.dijkstra(coupled, indices=first, unweighted=True, min_only=True)
+    return [np.flatnonzero(steps == k) for k in np.unique(steps)]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from soup_nlp.arrays import Float, Mask
+from soup_nlp.data.flow.consistency import SURE as SURE_FLOW
 from soup_nlp.data.formats.images import array_of, read_image
 from soup_nlp.data.formats.map_files import read_depth
 from soup_nlp.data.pair import Pair, Truth
@@ -170,17 +171,8 @@ def _map(values: object, what: str) -> Float:
 
 # --- one rigid motion for all pixels, which methods for dynamic scenes have to beat --------------
 
-MIN_CORRESPONDENCES = 8
-"""Fewest pixels with flow for which a motion is estimated."""
-
-SAMPLES = 8000
-"""Largest number of pixels for the motion."""
-
-INLIER = 1.0
-"""Largest Sampson distance of an inlier, pixels of the geometric mean focal length."""
-
-TIGHT = 0.1
-"""The motion is also estimated with this fraction of the inlier distance."""
+INLIER, TIGHT = 1.0, 0.1
+"""Sampson distances of an inlier, pixels, with which the motion is estimated."""
 
 FAR = 100.0
 """Depths beyond this multiple of the median depth count as unknown: there is no parallax left.
@@ -190,10 +182,9 @@ True depths of driving and indoor pairs reach 14 times their median."""
 def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
     """Depth under one rigid motion for the whole image, triangulated pixel by pixel.
 
-    The essential matrix comes from a subsample drawn with probability proportional to confidence
-    (RANSAC, then a robust refinement of the Sampson distance), with each frame's own camera. It is
-    estimated at the inlier distance and at a tenth of it, and the motion with the smaller Cauchy
-    cost is kept: in small images a moving component can lie within one pixel of a wrong motion.
+    The essential matrix (RANSAC, then a robust refinement of the Sampson distance) is estimated at
+    two inlier distances, and the motion with the smaller Cauchy cost is kept: in small images a
+    moving component can lie within one pixel of a wrong motion.
     Each pixel with confidence is then triangulated by itself without smoothing, so far points with
     little parallax can have wild depths; only those beyond `FAR` times the median are dropped.
 
@@ -202,41 +193,24 @@ def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
         confidence, the triangulated point is not in front of both cameras, or it is too far. None
         where there are too few pixels with flow, or no motion fits for lack of parallax.
     """
-    if pair.flow is None or np.count_nonzero(pair.flow.confidence) < MIN_CORRESPONDENCES:
+    if pair.flow is None:
         return None
+    matches = epipolar.flow_matches(pair, pair.flow.confidence > SURE_FLOW, seed)
+    tried = [epipolar.estimate(matches, distance) for distance in (INLIER, TIGHT)]
+    motions = [motion for motion in tried if motion is not None]
+    if not motions:
+        return None
+
+    def cost(motion: epipolar.Motion) -> float:
+        return float(matches.weight @ np.log1p((matches.distance(motion) / TIGHT) ** 2))
+
     used = pair.flow.confidence > 0
     at = pixel_grid(*pair.size)[used]
     r, q = rays(pair.K_ref, at), rays(pair.K_next, at + pair.flow.uv[used])
-    weight = pair.flow.confidence[used].astype(np.float64)
-    K, L = pair.K_ref, pair.K_next
-    focal = float(np.prod([K[0, 0], K[1, 1], L[0, 0], L[1, 1]]) ** 0.25)
-    pick = np.arange(len(weight))
-    if len(weight) > SAMPLES:
-        # weighted sampling without replacement (Efraimidis and Spirakis): the largest of u^(1/w)
-        key = np.log1p(-np.random.default_rng(seed).random(len(weight))) / weight
-        pick = np.sort(np.argpartition(-key, SAMPLES)[:SAMPLES])
-        weight = np.ones(len(weight))  # the draw has done the weighting
-    motion = _best_motion(epipolar.Matches(r[pick], q[pick], weight[pick], focal))
-    if motion is None:
-        return None
-    z, z_next = epipolar.triangulate(motion, r, q)
-    front = np.isfinite(z) & np.isfinite(z_next) & (z > 0) & (z_next > 0)
+    z, z_next = epipolar.triangulate(min(motions, key=cost), r, q)
+    front = (z > 0) & (z_next > 0)
     if front.any():
         front &= z <= FAR * np.median(z[front])
     depth = np.full(pair.size, np.nan)
     depth[used] = np.where(front, z, np.nan)
     return depth
-
-
-def _best_motion(matches: epipolar.Matches) -> epipolar.Motion | None:
-    """The motion of correspondences with the smallest Cauchy cost, or None where there is none."""
-    best, lowest = None, np.inf
-    for distance in (INLIER, TIGHT * INLIER):
-        motion = epipolar.estimate(matches, distance)
-        if motion is None or not (np.isfinite(motion.R).all() and np.isfinite(motion.t).all()):
-            continue
-        off = matches.distance(motion) / (TIGHT * INLIER)
-        cost = float(np.sum(matches.weight * np.log1p(off * off)))
-        if cost < lowest:
-            best, lowest = motion, cost
-    return best

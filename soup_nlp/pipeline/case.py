@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from soup_nlp.arrays import Mask
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.flow.borders import follow_depth, follow_flow
 from soup_nlp.data.flow.consistency import SURE
@@ -15,7 +14,6 @@ from soup_nlp.data.flow.sources import is_named
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.working_size import resized_flow, working_size
-from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.superpixels import Labels, check_count, segment
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
@@ -25,11 +23,11 @@ from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.solver_options import ITERATIONS, Stages
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.camera_error import camera_error
-from soup_nlp.start.epipolar import Matches, estimate
+from soup_nlp.start.epipolar import estimate, flow_matches
 from soup_nlp.start.given_depth import GivenDepth, by_prior
 from soup_nlp.start.prior_evidence import JUDGED_PIECES, LEAST_SIGMA, PriorEvidence, judged
 from soup_nlp.start.propose import Start, most_usual, propose
-from soup_nlp.start.regions import ORIGINS, TOO_FAST, covering
+from soup_nlp.start.regions import ORIGINS, covering
 from soup_nlp.start.views import FlowFit, SeededStart
 from soup_nlp.storage.progress import Watch
 from soup_nlp.storage.system import require_memory
@@ -217,7 +215,7 @@ def build_energy(
         # nothing is measured: terms on shape must not undo what is drawn
         drawn, one = np.log(start.soup.depth_at(data.anchor_ray)), np.ones(len(seg))
         prior = drawn, one, LEAST_SIGMA * one
-    placed = np.isin(start.origin, [ORIGINS.index("occlusion"), TOO_FAST])
+    placed = start.origin == ORIGINS.index("occlusion")
     known = Known(start.component, bends, start.variance, start.noise, start.order, placed, prior)
     data = weighted(data, start.soup, known, e)
     if e.units == "paper":
@@ -233,8 +231,6 @@ LEAST_SHARE = 0.003
 """Least share of pixels that stand still for the search for a layer."""
 LEAST_FLOW = 2.0
 """Median displacement and parallax, pixels, below which the camera may be at rest, or turn only."""
-PIXELS = 6000
-"""Largest number of pixels to which the camera's motion is fitted."""
 
 
 def with_flow(problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] | None) -> Pair:
@@ -276,7 +272,7 @@ def see_through(pair: Pair, seed: int = 0) -> Flow | None:
         return None
     if np.median(np.linalg.norm(flow.uv[sure], axis=1)) < LEAST_FLOW:
         return None
-    motion = estimate(_matches(pair, sure & ~at_rest, seed))
+    motion = estimate(flow_matches(pair, sure & ~at_rest, seed))
     if motion is None:
         return None
     return corrected(pair, motion.R, motion.t)
@@ -287,7 +283,7 @@ def search_again(pair: Pair, seed: int = 0) -> Flow:
     unless the camera is at rest or turns only: then its lines are chance."""
     flow = pair.flow
     assert flow is not None
-    matches = _matches(pair, flow.confidence > SURE, seed)
+    matches = flow_matches(pair, flow.confidence > SURE, seed)
     motion = estimate(matches)
     if motion is None:
         return flow
@@ -296,18 +292,6 @@ def search_again(pair: Pair, seed: int = 0) -> Flow:
     if np.median(matches.focal * parallax) < LEAST_FLOW:
         return flow
     return searched(pair, motion.R, motion.t)
-
-
-def _matches(pair: Pair, which: Mask, seed: int) -> Matches:
-    """Correspondences by the flow of at most `PIXELS` of the pixels `which` (H, W)."""
-    assert pair.flow is not None
-    v, u = np.nonzero(which)
-    pick = np.random.default_rng(seed).permutation(len(v))[:PIXELS]
-    pixel = np.stack([u, v], axis=-1)[pick].astype(float)
-    move = pair.flow.uv[v, u][pick].astype(float)
-    ends = rays(pair.K_ref, pixel), rays(pair.K_next, pixel + move)
-    weight = pair.flow.confidence[v, u][pick].astype(float)
-    return Matches(*ends, weight, float(pair.K_next[0, 0]))
 
 
 # --- memory, estimated before a solve ---------------------------------------------------------

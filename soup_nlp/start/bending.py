@@ -21,13 +21,12 @@ from soup_nlp.start.labelling import (
     LEAST_GAP_PX,
     LEAST_SHARED,
     MOTION_PIXELS,
-    PIECE_SIZE,
     Labelling,
     candidates,
     dominant,
 )
-from soup_nlp.start.regions import connected_labels, connected_pieces, numbered
-from soup_nlp.start.views import JUMP_PX, FlowFit, Views
+from soup_nlp.start.regions import connected_pieces
+from soup_nlp.start.views import FlowFit, Views
 
 REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
@@ -94,6 +93,13 @@ def displaced(x: Float) -> Float:
     return np.concatenate([R, T], axis=-1)
 
 
+def at_one_depth(x: Float) -> Float:
+    """Matrices (..., 3, 3) that move rays as points at depth 1, by parameters of `displaced`."""
+    move = displaced(x)
+    # the third component of a ray is 1
+    return move[..., :3] + move[..., 3:] * np.array([0.0, 0.0, 1.0])
+
+
 CLIP_PX = 3.0
 """Limit of a superpixel's error where explanations are compared, pixels."""
 
@@ -138,24 +144,17 @@ def fit_robustly(
     return x @ free, miss(x).reshape(2, -1).T
 
 
-def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
+def fit_turn(
+    views: Views, size: int = PLAIN_TURN, matrix: Callable[[Float], Float] = turned
+) -> tuple[Float, Float]:
     """Rotation of the turn that explains a flow best, and (N,) mean error of that turn, pixels.
 
-    The first `size` parameters of `turned` are free.
+    The first `size` parameters of the matrices (..., 3, 3), `turned` or `at_one_depth`, are free.
     """
     ray, target, weight, _ = views.matches(2 * MOTION_PIXELS)
     scale = np.sqrt(weight)[:, None] * views.focal
-    x, _ = fit_robustly(turned, size, ray, target[:, :2], scale)
-    return rotation.exp(x[:3]), views.distance(views.ray @ turned(x).T)
-
-
-def moving_pieces(flow: FlowFit) -> Int:
-    """(N,) connected piece of what moves before a camera that turns at most; 0 is what the turn
-    explains, and pieces with too few superpixels whose flow is usable."""
-    still = fit_turn(flow.views)[1] < JUMP_PX
-    piece = connected_labels(~flow.seg.across(still) & (flow.jump < JUMP_PX), flow.seg)
-    still |= np.bincount(piece, flow.views.usable)[piece] < PIECE_SIZE
-    return numbered(np.where(still, -1, piece))
+    x, _ = fit_robustly(matrix, size, ray, target[:, :2], scale)
+    return rotation.exp(x[:3]), views.distance(views.ray @ matrix(x).T)
 
 
 LEAST_SURFACE = 0.06

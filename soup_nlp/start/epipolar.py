@@ -17,7 +17,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.camera import rays
 
 LEAST_MATCHES = 8
 """Least number of correspondences that determine a motion, or tell anything of a depth."""
@@ -90,7 +92,10 @@ class Matches(NamedTuple):
 
     def distance(self, motion: Motion) -> Float:
         """(M,) Sampson distance to a motion, pixels."""
-        return sampson(motion.essential(), self.ray, self.target, self.focal)
+        E, r, q = motion.essential(), self.ray.T, self.target.T
+        by_q, by_r = E @ r, E.T @ q
+        squared = np.sum(by_q[:2] ** 2 + by_r[:2] ** 2, axis=0)
+        return self.focal * np.sum(q * by_q, axis=0) / np.sqrt(np.maximum(squared, 1e-24))
 
     def slope(self, motion: Motion) -> Float:
         """(9, M) derivative of `distance` by the essential matrix, row by row."""
@@ -105,11 +110,20 @@ class Matches(NamedTuple):
         return self.focal / np.sqrt(squared) * by_E.reshape(9, -1)
 
 
-def sampson(E: Float, r: Float, q: Float, focal: float = 1.0) -> Float:
-    """(M,) Sampson distance of rays r, q (M, 3) under E (3, 3), times focal: pixels."""
-    by_q, by_r = E @ r.T, E.T @ q.T
-    squared = np.sum(by_q[:2] ** 2 + by_r[:2] ** 2, axis=0)
-    return focal * np.sum(q.T * by_q, axis=0) / np.sqrt(np.maximum(squared, 1e-24))
+PIXELS = 6000
+"""Largest number of pixels to which the motion of a whole image is fitted."""
+
+
+def flow_matches(pair: Pair, which: Mask, seed: int) -> Matches:
+    """Correspondences by the flow of at most `PIXELS` of the pixels `which` (H, W)."""
+    assert pair.flow is not None
+    v, u = np.nonzero(which)
+    pick = np.random.default_rng(seed).permutation(len(v))[:PIXELS]
+    pixel = np.stack([u, v], axis=-1)[pick].astype(float)
+    move = pair.flow.uv[v, u][pick].astype(float)
+    ends = rays(pair.K_ref, pixel), rays(pair.K_next, pixel + move)
+    weight = pair.flow.confidence[v, u][pick].astype(float)
+    return Matches(*ends, weight, float(pair.K_next[0, 0]))
 
 
 def estimate(matches: Matches, threshold: float = 1.0) -> Motion | None:
@@ -137,12 +151,9 @@ def essential_motion(matches: Matches, threshold: float | None) -> Motion | None
         )
     except cv2.error:
         return None
-    if E is None or E.shape[0] < 3 or not np.isfinite(E).all():
+    if E is None or E.shape != (3, 3) or not np.isfinite(E).all():
         return None
-    # several solutions come stacked: keep the one with the smallest robust distance
-    stack = E[: 3 * (len(E) // 3)].reshape(-1, 3, 3)
-    best = min(stack, key=lambda e: np.mean(np.minimum(np.abs(sampson(e, r, q, focal)), 3.0)))
-    R1, R2, t = cv2.decomposeEssentialMat(best)
+    R1, R2, t = cv2.decomposeEssentialMat(E)
 
     def in_front(motion: Motion) -> int:
         z, z_next = triangulate(motion, r, q)

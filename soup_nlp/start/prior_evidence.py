@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from scipy import ndimage, special
 
 from soup_nlp.arrays import Float, Image, Int, Mask
@@ -184,12 +185,6 @@ def without_gaps(pair: Pair, seg: Segmentation) -> tuple[Float, Mask, Float]:
     return value, with_value, np.where(valid, prior, value[seg.labels])
 
 
-def ranks(values: Float) -> Float:
-    """(N,) ranks of numbers; equal ones share their mean rank."""
-    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
-    return np.asarray((np.cumsum(count) - (count - 1) / 2)[place])
-
-
 def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorEvidence:
     """Evidence of flow and image for the depth prior of a pair, whose kind is found if it is None.
 
@@ -203,11 +198,11 @@ def judged(start: Start, pair: Pair, flow: FlowFit, kind: Kind | None) -> PriorE
     tells = relief > least_gap(start.noise) / 3 and known.sum() >= LEAST_MATCHES
     sure = known & ~start.interpolated
     if tells and sure.sum() >= LEAST_MATCHES:
-        far = ranks(start.soup.depth_at(anchor)[sure]), ranks(value[sure])
+        far = start.soup.depth_at(anchor)[sure], value[sure]
     else:
         # lower parts of an image are mostly nearer
-        far = ranks(-anchor[:, 1]), ranks(value)
-    kind = kind or ("inverse" if np.cov(*far)[0, 1] < 0 else "relative")
+        far = -anchor[:, 1], value
+    kind = kind or ("inverse" if np.cov(*map(scipy.stats.rankdata, far))[0, 1] < 0 else "relative")
     log_depth, ratio, gap = as_log_depth(kind, value), np.nan, np.inf
     if tells:
         at = np.flatnonzero(known)
@@ -254,7 +249,11 @@ def edge_margin(values: Float, image: Image) -> float:
     if np.ptp(small) < 1e-9:
         return -np.inf
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(float), (0, 0), 1.5)
-    edges, steps = (_ordinal(v) for v in (resized(_gradient(grey)), _gradient(small)))
+    gradients = resized(_gradient(grey)), _gradient(small)
+    # ranks from -1/2 to 1/2; equal values in the order of the array
+    edges, steps = (
+        (scipy.stats.rankdata(v, "ordinal").reshape(v.shape) - 1) / v.size - 0.5 for v in gradients
+    )
     superpixel = segment(resized(image), JUDGED_PIECES)
     count = np.maximum(np.bincount(superpixel.ravel()), 1)
 
@@ -287,9 +286,3 @@ def edge_margin(values: Float, image: Image) -> float:
 def _gradient(values: Float) -> Float:
     """(H, W) length of the gradient."""
     return np.hypot(*(cv2.Sobel(values, cv2.CV_64F, x, 1 - x, ksize=3) for x in (1, 0)))
-
-
-def _ordinal(values: Float) -> Float:
-    """Ranks of all values, from -1/2 to 1/2; equal values in the order of the array."""
-    rank = np.argsort(np.argsort(values, axis=None, kind="stable"))
-    return rank.reshape(values.shape) / values.size - 0.5

@@ -13,7 +13,6 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import (
     constant_depth,
     discontinuous,
-    moving_pieces,
     surface_motions,
     turn_alone,
 )
@@ -195,8 +194,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         start = replace(
             start, surface=surface, bends=every, unexplained=jumping, at_rest=turn is not None
         )
-        part = _scene_first(surface) if turn is None else moving_pieces(flow)
-        return _ordered(flow, start, part, contrast)
+        return _ordered(flow, start, _scene_first(surface), contrast)
     choice, covariance = with_least_relief(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
     soup, interpolated = _with_depth(rigid, choice, wrong)
@@ -215,7 +213,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     component = _scene_first(component, ~fixed)
     floor = ground(flow, 1 / soup.depth_at(views.anchor), reliable & (component == SCENE))
     order = vote(contrast, component, seg)
-    scale, origin = scaled(flow, soup, component, order, fixed, floor)
+    scale, origin = scaled(flow, soup, component, order, fixed)
     soup = replace(soup, lam=soup.lam * scale)
     soup, lifted = on_ground(flow, soup, floor, reliable, component)
     wrong = (wrong | lifted) & ~bends
@@ -237,7 +235,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         unexplained=jumping | (wrong & large),
         wrong=wrong,
         noise=limited_noise(error[~bends]),
-        order=held(flow, soup, component, origin, order, contrast),
+        order=held(flow, origin, order, contrast),
     )
 
 
@@ -249,7 +247,7 @@ def _ordered(flow: FlowFit, start: Start, part: Int, contrast: Float) -> Start:
     soup = replace(start.soup, lam=start.soup.lam * scale).normalised()
     origin = np.where(moved, ORIGINS.index("occlusion"), 0)
     component = numbered(np.where(moved, part, SCENE))
-    stays = held(flow, soup, component, origin, order, contrast)
+    stays = held(flow, origin, order, contrast)
     part = part if start.at_rest else component
     return replace(start, soup=soup, origin=origin, component=component, part=part, order=stays)
 

@@ -1,16 +1,13 @@
 """The linear program of scales: its minimum, and what decides a scale."""
 
 import numpy as np
-import pytest
 from helpers_start import facing, flow_of, squares
 
 from soup_nlp.geometry import camera
-from soup_nlp.start.regions import ORIGINS, TOO_FAST
+from soup_nlp.start.regions import ORIGINS
 from soup_nlp.start.scales import (
-    FREE_DISPLACEMENT,
     LEAST_STEP_IN_FRONT,
     Rows,
-    held,
     minimum,
     scaled,
 )
@@ -18,20 +15,15 @@ from soup_nlp.start.scales import (
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 HANGS = [[0] * 5, [0, 0, 1, 0, 0], [0] * 5, [0] * 5]
 STANDS = [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0] * 5]
-CUT_OFF = [[0] * 5, [0, 0, 1, 0, 0], [0, 0, 1, 0, 0], [0, 0, 1, 0, 0]]
 
 
-def found(z, component, far=0.5, floor=0.0, order=None, **options):
-    """Log scale and origin of component 1, whose planes are at depth 1 in its own unit.
-
-    There it moves by `far` where the scene moves by 1.
-    """
+def found(z, component, order=None, **options):
+    """Log scale and origin of component 1, whose planes are at depth 1 in its own unit."""
     label = np.ravel(component)
     flow = flow_of(squares(*np.shape(component)), K=K, **options)
-    moved = np.where(label, far, 1.0)[:, None] * [1.0, 0.0, 0.0]
-    soup = facing(np.where(label == 1, 1.0, np.ravel(z)), moved)
+    soup = facing(np.where(label == 1, 1.0, np.ravel(z)), np.array([1.0, 0.0, 0.0]))
     says = np.zeros(len(flow.seg.pairs)) if order is None else order(label, flow.seg)
-    scale, origin = scaled(flow, soup, label, says, floor=np.full(len(soup), floor))
+    scale, origin = scaled(flow, soup, label, says)
     assert (scale[label == 0] == 1).all()
     assert (origin[label == 0] == ORIGINS.index("reference")).all()
     return float(np.log(scale[label == 1][0])), ORIGINS[origin[label == 1][0]]
@@ -79,28 +71,6 @@ def test_what_is_before_a_wall_is_not_behind_it():
     np.testing.assert_allclose(log_scale, np.log(4), rtol=1e-6)
 
 
-def test_what_contact_would_make_too_fast_moves_little_farther_than_the_scene():
-    """It touches the wall, where it would move eight times as far as the scene."""
-    wall = np.full((4, 5), 8.0)
-    log_scale, origin = found(wall, CUT_OFF, far=1.0)
-    assert origin == "too fast"
-    np.testing.assert_allclose(log_scale, FREE_DISPLACEMENT, atol=1e-6)
-    log_scale, origin = found(wall, HANGS, far=1e-3)
-    assert origin == "contact below"
-    np.testing.assert_allclose(log_scale, np.log(8), rtol=1e-6)
-
-
-def test_what_is_too_fast_covers_all_that_it_touches():
-    label = np.ravel(CUT_OFF)
-    flow = flow_of(squares(4, 5), K=K)
-    soup, origin = facing(np.where(label, 1.0, 8.0), np.ones(3)), np.where(label, TOO_FAST, 0)
-    ends = label[flow.seg.pairs]
-    none = np.zeros(len(ends))
-    order = held(flow, soup, label, origin, none, none)
-    np.testing.assert_array_equal(order, ends[:, 1] - ends[:, 0])
-    assert held(flow, soup, label, 0 * origin, none, none) is None
-
-
 def covers(label, seg):
     """Component 1 covers all that it touches."""
     ends = label[seg.pairs]
@@ -109,18 +79,10 @@ def covers(label, seg):
 
 def test_what_covers_is_in_front_of_all_but_what_it_stands_on():
     wall = np.full((4, 5), 8.0)
-    log_scale, origin = found(wall, HANGS, far=1e-3, order=covers, upright=False)
+    log_scale, origin = found(wall, HANGS, order=covers, upright=False)
     assert origin == "occlusion"
     np.testing.assert_allclose(log_scale, np.log(8) - LEAST_STEP_IN_FRONT, rtol=1e-6)
     wall[-1] = 4.0
-    log_scale, origin = found(wall, STANDS, far=1e-3, order=covers)
+    log_scale, origin = found(wall, STANDS, order=covers)
     assert origin == "contact below"
     np.testing.assert_allclose(log_scale, np.log(4), rtol=1e-6)
-
-
-@pytest.mark.parametrize(("floor", "expected"), [(0.0, np.log(8)), (0.25, np.log(4))])
-def test_nothing_is_below_the_ground(floor, expected):
-    """The ground is at depth 4 everywhere, or unknown."""
-    log_scale, origin = found(np.full((4, 5), 8.0), HANGS, far=1e-3, floor=floor)
-    assert origin == ("ground" if floor else "contact below")
-    np.testing.assert_allclose(log_scale, expected, rtol=1e-6)

@@ -11,10 +11,8 @@ from soup_nlp.start.bending import constant_depth, displaced, fit_robustly, turn
 from soup_nlp.start.epipolar import (
     Matches,
     Motion,
-    estimate,
     fit_translation,
     refine_near,
-    sampson,
 )
 from soup_nlp.start.views import Views, affine_flow
 
@@ -148,19 +146,6 @@ def test_the_derivative_of_a_robust_fit_is_that_of_differences(monkeypatch, matr
     for k, along in enumerate(step * np.eye(size)):
         change = (seen["miss"](way + along) - seen["miss"](way - along)) / (2 * step)
         np.testing.assert_allclose(seen["by_x"][:, k], change, atol=1e-6 * np.abs(change).max())
-
-
-@pytest.mark.parametrize("position", [0, 1, 2])
-def test_the_essential_matrix_that_explains_most_is_taken(monkeypatch, position):
-    m, r, q = rigid(100)
-    others = [perturbed(m, 0.3, 0.8, seed).essential() for seed in (5, 6)]
-    stack = np.concatenate(np.insert(np.stack(others), position, m.essential(), axis=0))
-    monkeypatch.setattr(epipolar.cv2, "findEssentialMat", lambda *a, **k: (stack, None))
-    monkeypatch.setattr(epipolar, "refine", lambda motion, *a: motion)
-    motion = estimate(Matches(r, q, np.ones(100), FOCAL))
-    assert motion is not None
-    assert np.abs(sampson(motion.essential(), r, q, FOCAL)).max() < 1e-6
-    assert max(off(m, motion)) < 1e-6
 
 
 # --- planes --------------------------------------------------------------------------------------
