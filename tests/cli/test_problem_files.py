@@ -37,9 +37,9 @@ def test_a_dumped_problem_is_the_same_problem(path, tmp_path, capsys):
 
 def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path):
     path = tmp_path / "p.yaml"
-    path.write_text(f"{MOTORCYCLE}seed: +10\nname: no\noutput: {{min_confidence: 1e-3}}\n")
+    path.write_text(f"{MOTORCYCLE}seed: +10\nname: no\nsolver: {{max_seconds: 1e3}}\n")
     problem = load_problem(path)
-    assert (problem.seed, problem.name, problem.output.min_confidence) == (10, "no", 1e-3)
+    assert (problem.seed, problem.name, problem.solver.max_seconds) == (10, "no", 1e3)
 
 
 ODD = ("!!bool 5", "!!python/name:os.abort", "&b [*b]", "[&b 1, *b]")
