@@ -6,43 +6,29 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from soup_nlp.batches.run import batch
-    from soup_nlp.config.problem import Problem, load_problem, make_problem
-    from soup_nlp.data.pair import Flow, Pair, Truth
-    from soup_nlp.errors import SoupError
-    from soup_nlp.evaluation.scoring import evaluate
-    from soup_nlp.export.symbolic import nlp
-    from soup_nlp.geometry.constraints import constraints
-    from soup_nlp.geometry.soup import Reconstruction, Soup
-    from soup_nlp.report.folder import WritableRun as Run
-    from soup_nlp.report.folder import run, solve_pair
-    from soup_nlp.report.result import Result
-    from soup_nlp.sequence.folder import load
-    from soup_nlp.sequence.solve import solve_chain as chain
-    from soup_nlp.storage.versions import __version__
+    from soup_nlp.batches.run import batch as batch
+    from soup_nlp.config.problem import Problem as Problem
+    from soup_nlp.config.problem import load_problem as load_problem
+    from soup_nlp.config.problem import make_problem as make_problem
+    from soup_nlp.data.pair import Flow as Flow
+    from soup_nlp.data.pair import Pair as Pair
+    from soup_nlp.data.pair import Truth as Truth
+    from soup_nlp.errors import SoupError as SoupError
+    from soup_nlp.evaluation.scoring import evaluate as evaluate
+    from soup_nlp.export.symbolic import nlp as nlp
+    from soup_nlp.geometry.constraints import constraints as constraints
+    from soup_nlp.geometry.soup import Reconstruction as Reconstruction
+    from soup_nlp.geometry.soup import Soup as Soup
+    from soup_nlp.report.folder import WritableRun
+    from soup_nlp.report.folder import run as run
+    from soup_nlp.report.folder import solve_pair as solve_pair
+    from soup_nlp.report.result import Result as Result
+    from soup_nlp.sequence.folder import load as load
+    from soup_nlp.sequence.solve import solve_chain
+    from soup_nlp.storage.versions import __version__ as __version__
 
-__all__ = [
-    "Flow",
-    "Pair",
-    "Problem",
-    "Reconstruction",
-    "Result",
-    "Run",
-    "Soup",
-    "SoupError",
-    "Truth",
-    "__version__",
-    "batch",
-    "chain",
-    "constraints",
-    "evaluate",
-    "load",
-    "load_problem",
-    "make_problem",
-    "nlp",
-    "run",
-    "solve_pair",
-]
+    Run = WritableRun
+    chain = solve_chain
 
 _HOMES = {
     "Flow": "data.pair",
@@ -68,6 +54,8 @@ _HOMES = {
 }
 """Module of every public name, and its name there if it is another one; imported on first use."""
 
+__all__ = sorted(_HOMES)
+
 
 def __getattr__(name: str) -> Any:
     """A public name, from its module."""
@@ -81,4 +69,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """The public names."""
-    return sorted(__all__)
+    return __all__

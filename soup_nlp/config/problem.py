@@ -26,7 +26,6 @@ from soup_nlp.schema.section import (
     Positive,
     Section,
     Seed,
-    Share,
     Whole,
     explain,
     nearest,
@@ -69,8 +68,6 @@ class OutputOptions(Section):
 
     page: bool = True
     """Write report.html, the page with the 3D view."""
-    min_confidence: Share = 0.5
-    """Least confidence, 1 - sigma / 0.5, of the points in clouds and meshes; 0 keeps all."""
 
 
 def title(text: object) -> str:
@@ -275,7 +272,7 @@ USUAL = (
     "solver.max_iter", "solver.max_seconds",
     "refine.enabled", "refine.from_start", "refine.rounds", "refine.particles",
     "refine.max_seconds",
-    "output.page", "output.min_confidence",
+    "output.page",
 )  # fmt: skip
 """Keys that users turn; `soup-nlp show` prints them and those that differ from their defaults."""
 

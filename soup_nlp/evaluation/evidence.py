@@ -66,23 +66,6 @@ class Evidence:
         """(C,) True where the depth of a component is a guess, see `least_gap`."""
         return ~(self.gap >= least_gap(self.noise))
 
-    def rows(self) -> list[dict[str, float | bool | None]]:
-        """A row for every component: errors in pixels, the gap in units of the noise, whether its
-        depth is a guess; None where the flow is unknown."""
-        names = ("turn", "constant", "solution", "gap")
-        return [
-            {
-                **{f"{k}_px": _finite_or_none(getattr(self, k)[c]) for k in names},
-                "gap_in_noise": _finite_or_none(self.gap[c] / self.noise),
-                "guess": bool(self.guess[c]),
-            }
-            for c in range(len(self.turn))
-        ]
-
-
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
 
 def evidence(
     soup: Soup,

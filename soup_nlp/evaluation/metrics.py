@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError, repr_of
@@ -240,27 +240,3 @@ def sample_at_points(depth: ArrayLike, points: ArrayLike) -> tuple[Float, Float]
     out = np.full(len(at), np.nan)
     out[inside] = z[v[inside].astype(np.intp), u[inside].astype(np.intp)]
     return out, at[:, 2].copy()
-
-
-def component_overlaps(estimate: ArrayLike, true: ArrayLike) -> dict[int, tuple[int, float]]:
-    """The estimated component that overlaps each true one most, and their intersection over union.
-
-    Args:
-        estimate: (H, W) labels from 0.
-        true: (H, W) true labels from 0; negative labels are unknown and not compared.
-    """
-    a, b = np.asarray(estimate), np.asarray(true)
-    labelled = b >= 0
-    if not labelled.any():
-        return {}
-    share = overlap_shares(b[labelled], a[labelled])
-    return {int(k): (int(share[k].argmax()), float(share[k].max())) for k in np.unique(b[labelled])}
-
-
-def overlap_shares(first: NDArray[np.integer], second: NDArray[np.integer]) -> Float:
-    """(A, B) intersection over union of the labels 0..A-1 and 0..B-1 of the same pixels (M,)."""
-    count = int(second.max()) + 1
-    flat, size = first.astype(np.int64) * count + second, count * (int(first.max()) + 1)
-    shared = np.bincount(flat, minlength=size).reshape(-1, count)
-    union = shared.sum(axis=0) + shared.sum(axis=1, keepdims=True) - shared
-    return np.asarray(shared / np.maximum(union, 1))

@@ -181,7 +181,7 @@ def constraints(
     Raises:
         DataError: an array is missing, or has another shape.
     """
-    make = "constraints(dict(lam=lam, n=n, d=d, R=R, t=t)), or run.constraints of a run or result"
+    make = "constraints(dict(lam=lam, n=n, d=d, R=R, t=t)), or run.constraints of a run"
     expect(soup, (Soup, Mapping), "soup", make)
     state = vars(soup) if isinstance(soup, Soup) else soup
     count = np.size(state["lam"]) if "lam" in state else 0

@@ -56,18 +56,14 @@ def write_formats(folder: Path, chain: Chain, names: Sequence[str]) -> list[str]
 
 def check_formats(names: Sequence[str]) -> list[str]:
     """Check names of formats and return them without repetitions; ConfigError for unknown ones."""
-    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+    known = isinstance(names, list | tuple) and all(
+        isinstance(name, str) and name in FORMATS for name in names
+    )
+    if not known or not names:
         raise ConfigError(
-            "formats are no list of names",
+            "unknown format, or none",
             found=printable(repr_of(names), 60),
             expected=f"a list of {', '.join(FORMATS)}",
-        )
-    wrong = [name for name in names if name not in FORMATS]
-    if wrong or not names:
-        raise ConfigError(
-            "unknown format" if wrong else "no format is named",
-            found=", ".join(map(repr, wrong)) or None,
-            expected=", ".join(FORMATS),
         )
     return list(dict.fromkeys(names))
 

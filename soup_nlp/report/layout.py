@@ -246,12 +246,6 @@ class Shares(TypedDict):
     median_sigma: Number
 
 
-class Sizes(TypedDict):
-    """Sizes of the problem."""
-
-    superpixels: int
-
-
 class Summary(TypedDict):
     """Entries of summary.json that are read back."""
 
@@ -265,8 +259,6 @@ class Summary(TypedDict):
     answer_residuals: dict[str, Number]
     metrics: dict[str, Scores]
     truth_unit: str | None
-    seconds: dict[str, float]
-    sizes: Sizes
     certainty: Shares
     verdict: list[str]
 

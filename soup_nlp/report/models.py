@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.errors import DataError, printable
+from soup_nlp.evaluation.confidence import MIN_CONFIDENCE
 from soup_nlp.geometry.camera import project
 from soup_nlp.geometry.surface import triangles, whole_cells
 from soup_nlp.report.chain import AXES, Chain, Frame, Lazy
@@ -79,7 +80,7 @@ def write_points(path: Path, frame: Frame) -> None:
         f"unit: {frame.unit}",
         "component: what moves as one, 0 is the background",
         f"{keep.mean():.1%} of the pixels: without hidden ones, those at jumps of the depth, and"
-        " those of less confidence than output.min_confidence",
+        f" those of less confidence than {MIN_CONFIDENCE:g}",
     ]
     write_ply(path, frame.points[keep], frame.image[keep], frame.normals[keep], scalars, comments)
 

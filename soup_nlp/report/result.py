@@ -13,11 +13,10 @@ from PIL.Image import fromarray
 
 from soup_nlp.arrays import Float, Image, Mask
 from soup_nlp.errors import DataError
-from soup_nlp.evaluation.confidence import KINDS, MIN_CONFIDENCE, NO_CONFIDENCE
+from soup_nlp.evaluation.confidence import KINDS, MOST_SIGMA
 from soup_nlp.evaluation.metrics import DepthMetrics
 from soup_nlp.evaluation.scoring import DEPTHS
 from soup_nlp.geometry.components import Components, find_components
-from soup_nlp.geometry.constraints import Constraints, constraints
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import inverse_depth
 from soup_nlp.geometry.rotation import RigidMotion
@@ -48,7 +47,6 @@ class Result:
         components: Rigid components with their motions.
         metrics: Scores against the truth, as those of a `Run`.
         kind: (H, W) by what the depth of the reference frame is known, an index of `KINDS`.
-        min_confidence: Smallest confidence of points in clouds.
     """
 
     tree: ReadTree
@@ -57,7 +55,6 @@ class Result:
     components: Components
     metrics: Mapping[str, DepthMetrics]
     kind: Image
-    min_confidence: float = MIN_CONFIDENCE
 
     def __repr__(self) -> str:
         h, w = self.images[0].shape[:2]
@@ -180,12 +177,6 @@ class Result:
         return np.asarray(self.tree["start"]["bends"], bool)
 
     @property
-    def constraints(self) -> Constraints:
-        """Residuals of the delivered soup by kind of constraint, recomputed from its arrays."""
-        facing = float(self.tree["weights"]["min_facing"])
-        return constraints(self.tree["solution"], self.tree["energy"]["rim_ray"], facing)
-
-    @property
     def soup(self) -> Soup:
         """Planes and motions of the superpixels."""
         return self.reconstruction.soup
@@ -209,9 +200,7 @@ class Result:
     @cached_property
     def sure(self) -> Mask:
         """(H, W) pixels of clouds: visible in both frames, confident, not at a depth jump."""
-        confidence = np.maximum(1.0 - self.sigma / NO_CONFIDENCE, 0.0)
-        known = confidence >= self.min_confidence
-        return known & ~hidden(self.reconstruction) & ~at_jumps(*self.surface)
+        return (self.sigma <= MOST_SIGMA) & ~hidden(self.reconstruction) & ~at_jumps(*self.surface)
 
     @property
     def static(self) -> Mask:
@@ -228,7 +217,6 @@ def result_of(run: Run, summary: Mapping[str, Any]) -> Result:
         components=run.components,
         metrics=run.metrics,
         kind=run.confidence.kind,
-        min_confidence=run.problem.output.min_confidence,
     )
 
 

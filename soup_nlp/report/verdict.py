@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from soup_nlp.evaluation.confidence import KINDS
-from soup_nlp.evaluation.metrics import DepthMetrics, component_overlaps, skill
+from soup_nlp.evaluation.metrics import DepthMetrics, skill
 from soup_nlp.evaluation.scoring import SURE
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.pipeline.record import Run
@@ -45,10 +45,6 @@ TITLES = {
 RULES = {"none": "no scale", "affine": "one scale and shift each, of least squares"}
 """Words for rules of the scale of scores."""
 PAD = " " * 12
-ROUND = (
-    *("energy", "mrf_energy", "bound", "gap", "taken", "moved", "iterations", "status", "seconds"),
-)
-"""Entries of a round of the refinement in summary.json."""
 
 
 def verdict(
@@ -185,10 +181,6 @@ def summary(run: Run) -> dict[str, Any]:
     s, r, full, truth = run.solution, run.refined, run.full, run.pair.truth
     constant = run.metrics["constant"].mre if "constant" in run.metrics else np.nan
     facing = run.problem.formulation.min_facing
-    components: dict[str, Any] = {"count": len(run.components)}
-    if truth is not None and truth.components is not None:
-        overlaps = component_overlaps(run.components.of_pixel, truth.components).items()
-        components["truth"] = {str(k): {"component": c, "iou": iou} for k, (c, iou) in overlaps}
     return {
         "name": run.problem.name,
         "problem_hash": run.problem.digest(),
@@ -209,7 +201,7 @@ def summary(run: Run) -> dict[str, Any]:
             "start": r.energy_start,
             "begin": r.energy_begin,
             "end": r.energy,
-            "rounds": [{key: getattr(one, key) for key in ROUND} for one in r.rounds],
+            "rounds": [{**vars(one), "gap": one.gap} for one in r.rounds],
         },
         "metrics": {
             # the constant depth is scored on the reference frame only
@@ -217,7 +209,7 @@ def summary(run: Run) -> dict[str, Any]:
             for k, m in run.metrics.items()
         },
         "truth_unit": None if truth is None else truth.unit,
-        "components": components,
+        "components": {"count": len(run.components)},
         "expected": run.problem.expected.model_dump(),
         "seconds": run.seconds,
         "iterations": {stage.name: stage.iterations for stage in s.stages},
@@ -242,7 +234,6 @@ def summary(run: Run) -> dict[str, Any]:
             "median_error_px": float(np.median(run.start.error)),
         },
         "certainty": certainty(run),
-        "evidence": run.confidence.evidence.rows(),
         **({} if run.given is None else {"depth_prior": run.given.as_dict()}),
         "flow": str(run.pair.flow),
         "versions": versions(),

@@ -6,11 +6,11 @@ from itertools import count
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.errors import DataError
-from soup_nlp.evaluation.metrics import overlap_shares
 from soup_nlp.geometry.superpixels import Labels
 from soup_nlp.report.chain import STILL, Brief, Chain, Lazy, Link
 from soup_nlp.report.result import Result
@@ -127,6 +127,15 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
     share[share < LEAST_OVERLAP] = 0
     matched = zip(*linear_sum_assignment(share, maximize=True))
     return {int(i): int(k) for i, k in matched if share[i, k] > 0}
+
+
+def overlap_shares(first: NDArray[np.integer], second: NDArray[np.integer]) -> Float:
+    """(A, B) intersection over union of the labels 0..A-1 and 0..B-1 of the same pixels (M,)."""
+    count = int(second.max()) + 1
+    flat, size = first.astype(np.int64) * count + second, count * (int(first.max()) + 1)
+    shared = np.bincount(flat, minlength=size).reshape(-1, count)
+    union = shared.sum(axis=0) + shared.sum(axis=1, keepdims=True) - shared
+    return np.asarray(shared / np.maximum(union, 1))
 
 
 def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:

@@ -33,22 +33,16 @@ def as_path(
     name: object, what: str = "file", *, error: type[SoupError] = DataError, home: bool = False
 ) -> Path:
     """A name as a path; `~` stands for the home folder if `home` is set."""
-    if not isinstance(name, str | os.PathLike) or isinstance(os.fspath(name), bytes):
+    try:
+        path: Any = name
+        if b"\0" in os.fsencode(path):
+            raise ValueError("a NUL character")
+        return Path(path).expanduser() if home else Path(path)
+    except (TypeError, ValueError, RuntimeError) as problem:
         raise error(
             f"{what} is not named by a path",
-            found=f"{type(name).__name__} {printable(name, 60)}",
-            expected="text or a pathlib.Path",
-        )
-    try:
-        if b"\0" in os.fsencode(name):
-            raise ValueError("a NUL character")
-        return Path(name).expanduser() if home else Path(name)
-    except (ValueError, RuntimeError) as problem:
-        raise error(
-            f"name of {what} is no name of a file",
-            where=name,
-            found=problem,
-            expected="characters that file systems have, without NUL",
+            found=f"{type(name).__name__} {printable(name, 60)}: {problem}",
+            expected="text or a pathlib.Path, of characters that file systems have",
         ) from None
 
 
@@ -135,19 +129,10 @@ _adapter: Callable[[Any], TypeAdapter[Any]] = lru_cache(TypeAdapter)
 """Validator of a type; making one takes tens of milliseconds."""
 
 
-def fits(value: object, kind: Any) -> bool:
-    """Whether a value of JSON has a type, such as a TypedDict; further entries stay."""
-    try:
-        _adapter(kind).validate_python(value, strict=True)
-    except ValidationError:
-        return False
-    return True
-
-
 def read_json(
     path: PathLike, what: str, kind: type[Kind], *, error: type[SoupError] = DataError
 ) -> Kind:
-    """The value of a JSON file, see `parse_json`, which must have a type, see `fits`."""
+    """The value of a JSON file, see `parse_json`, which must have a type; further entries stay."""
     try:
         value: Kind = parse_json(read_text(path, what, error=error))
         _adapter(kind).validate_python(value, strict=True)

@@ -1,13 +1,15 @@
 """Results as HDF5, with units for every array.
 
-Reading rejects links and checks sizes before it allocates memory.
+Reading leaves links out and checks sizes before it allocates memory.
 """
 
 import json
 import platform
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
+from functools import reduce
 from io import BytesIO
+from operator import getitem
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
@@ -16,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from soup_nlp.errors import DataError
-from soup_nlp.storage.files import PathLike, plain, require_file, write_bytes
+from soup_nlp.storage.files import PathLike, require_file, write_bytes
 from soup_nlp.storage.system import require_memory
 from soup_nlp.storage.versions import versions
 
@@ -27,7 +29,7 @@ FORMAT = ("v110", "v110")
 """Version of the HDF5 format: the oldest one with checksums of all parts."""
 
 Tree: TypeAlias = Mapping[str, Any]
-"""Numbers, texts and arrays of them by name, in nested mappings."""
+"""Numbers and arrays of them by name, in nested mappings."""
 
 COMPRESS_ABOVE = 64 * 1024
 """Arrays with more bytes are compressed (gzip level 1 after a byte shuffle)."""
@@ -70,7 +72,7 @@ def row_of(rows: Mapping[str, Row], path: str) -> Row | None:
 def write_h5(
     path: PathLike,
     tree: Tree,
-    attrs: Mapping[str, object],
+    attrs: Mapping[str, str],
     rows: Mapping[str, Row] = MappingProxyType({}),
 ) -> None:
     """Write a result file.
@@ -79,18 +81,19 @@ def write_h5(
         path: File to write; its folder must exist.
         tree: The arrays. Each becomes a dataset with the attributes `units`, `description` and
             `shape_letters`, each mapping a group.
-        attrs: Root attributes, without None, beside `schema`, `versions` and `machine`; what has no
-            type of HDF5 is JSON text.
+        attrs: Root attributes beside `schema`, `versions` and `machine`.
         rows: Descriptions of the arrays, see `parse_table`.
     """
-    about = {"schema": SCHEMA, "versions": json.dumps(versions()), "machine": platform.platform()}
+    about = {"versions": json.dumps(versions()), "machine": platform.platform()}
     try:
         # written in memory, since HDF5 would end the process on a full disk
         image = BytesIO()
         with h5py.File(image, "w", track_order=True, libver=FORMAT) as file:
-            for key, value in (dict(attrs) | about).items():
-                if value is not None:
-                    _write_attribute(file, key, value)
+            file.attrs["schema"] = SCHEMA
+            for key, text in {**attrs, **about}.items():
+                # of fixed length, since HDF5 has no checksum for variable length
+                data = text.encode()
+                file.attrs.create(key, data, dtype=h5py.string_dtype(length=max(1, len(data))))
             _write_group(file, tree, rows)
     except (OSError, TypeError, ValueError, RuntimeError) as error:
         raise DataError("cannot write the HDF5 file", where=path, found=error) from error
@@ -102,23 +105,10 @@ def _write_group(group: h5py.Group, tree: Tree, rows: Mapping[str, Row]) -> None
         if isinstance(item, Mapping):
             _write_group(group.require_group(name), item, rows)
             continue
-        data = np.asarray(item)
-        if data.dtype.kind == "U":
-            data = np.char.encode(data, "utf-8")
-            data = data.astype(h5py.string_dtype(length=max(1, data.dtype.itemsize)))
-        array = _write_array(group, name, data)
+        array = _write_array(group, name, np.asarray(item))
         row = row_of(rows, array.name.removeprefix("/")) or Row()
         described = {"units": row.unit, "description": row.text, "shape_letters": row.axes}
         array.attrs.update(described)
-
-
-def _write_attribute(file: h5py.File, key: str, value: object) -> None:
-    if isinstance(value, bool | int | float | np.generic):
-        file.attrs[key] = value
-        return
-    text = (value if isinstance(value, str) else json.dumps(plain(value))).encode()
-    # text of fixed length, since HDF5 has no checksum for variable length
-    file.attrs.create(key, text, dtype=h5py.string_dtype(length=max(1, len(text))))
 
 
 def _write_array(group: h5py.Group, name: str, data: NDArray[Any]) -> h5py.Dataset:
@@ -150,69 +140,59 @@ BROKEN = (OSError, RuntimeError, KeyError, TypeError, ValueError, AttributeError
 
 
 def read_h5(path: PathLike) -> ReadTree:
-    """All arrays of a result file, as nested dicts of numpy arrays (text as str or object arrays).
+    """All arrays of a result file, as nested dicts of numpy arrays.
 
-    A file that is damaged, holds a link or a type that no result has, or does not fit into memory
-    is a DataError.
+    Links are left out, and an object with two names has one of them. A file that is damaged, holds
+    a type that no result has, or does not fit into memory is a DataError.
     """
     require_file(path, "result file")
-    try:
-        # file systems of clusters often have no locks
-        with h5py.File(path, "r", locking=False) as file:
-            return _read_group(file, {})
-    except BROKEN as error:
-        what, expected = "file is not a readable HDF5 file", "a result file written by soup_nlp"
-        raise DataError(what, where=path, found=error, expected=expected) from error
-
-
-def _read_group(group: h5py.Group, seen: dict[object, int], level: int = 0) -> ReadTree:
-    """Arrays of a group; `seen` are bytes by the place of the objects that were read."""
     out: ReadTree = {}
-    for name in group:
-        link: Any = group.get(name, getlink=True)
-        item: Any = None
-        odd = "" if isinstance(link, h5py.HardLink) else type(link).__name__
-        if not odd:
-            item = group[name]
-            odd = "groups within groups" if level > DEEPEST else _odd(item, seen)
-        where = f"{group.file.filename}, {group.name.rstrip('/')}/{name}"
-        if odd:
+    sizes: list[int] = []
+
+    def read(name: str, item: Any) -> None:
+        """Read an object; h5py comes to each of them once, to groups before what is in them."""
+        *above, last = name.split("/")
+        place = reduce(getitem, above, out)
+        if isinstance(item, h5py.Group) and len(above) < DEEPEST:
+            place[last] = {}
+            return
+        where = f"{path}, /{name}"
+        if odd := _odd(item, sizes):
             raise DataError(
                 "result holds what no result has",
                 where=where,
                 found=odd,
-                expected=f"numbers or text under one name, in at most {DEEPEST} levels of groups",
+                expected=f"numbers, in at most {DEEPEST} levels of groups",
             )
-        if isinstance(item, h5py.Group):
-            out[name] = _read_group(item, seen, level + 1)
-        else:
-            if item.nbytes > LARGE:
-                require_memory(item.nbytes, "an array", where, "the file may be damaged")
-            text = h5py.check_string_dtype(item.dtype)
-            out[name] = np.asarray((item.asstr() if text else item)[()])
+        if item.nbytes > LARGE:
+            require_memory(item.nbytes, "an array", where, "the file may be damaged")
+        place[last] = np.asarray(item[()])
+
+    try:
+        # file systems of clusters often have no locks
+        with h5py.File(path, "r", locking=False) as file:
+            file.visititems(read)
+    except BROKEN as error:
+        what, expected = "file is not a readable HDF5 file", "a result file written by soup_nlp"
+        raise DataError(what, where=path, found=error, expected=expected) from error
     return out
 
 
-def _odd(item: Any, seen: dict[object, int]) -> str:
-    """What no result has of an object; empty for nothing."""
-    place = h5py.h5o.get_info(item.id).addr
-    if place in seen:
-        return "an object under two names"
-    seen[place] = 0
+def _odd(item: Any, sizes: list[int]) -> str:
+    """What no result has of an object; empty for nothing. `sizes` are bytes of all arrays."""
     if isinstance(item, h5py.Group):
-        return ""
+        return "groups within groups"
     if not isinstance(item, h5py.Dataset):
         return type(item).__name__
     if item.shape is None or item.external or item.is_virtual:
         return "an array without values of its own"
-    if item.dtype.kind not in "fiub" and not h5py.check_string_dtype(item.dtype):
+    if item.dtype.kind not in "fiub":
         return f"type {item.dtype}"
     stored, whole = item.id.get_storage_size(), item.file.id.get_filesize()
-    seen[place] = item.nbytes
+    sizes.append(item.nbytes)
     if item.nbytes > MOST_COMPRESSION * stored:
         return f"{item.nbytes} bytes of which {stored} are stored"
-    arrays = sum(seen.values())
-    return f"arrays of {arrays} bytes in {whole}" if arrays > MOST_OF_FILE * whole else ""
+    return f"arrays of {sum(sizes)} bytes in {whole}" if sum(sizes) > MOST_OF_FILE * whole else ""
 
 
 def require(tree: Mapping[str, Any], name: str) -> NDArray[Any]:

@@ -169,7 +169,7 @@ def test_what_cannot_be_converted_is_refused(saved, tmp_path, capsys):
         ([str(out), "--to", "npy"], "files"),
         ([str(out), "--to", "ply"], "files"),
         ([str(out), "--to", "obj"], "unknown format"),
-        ([str(out), "--to", ","], "no format"),
+        ([str(out), "--to", ","], "unknown format, or none"),
         ([str(out), "--to", ""], "an argument is empty"),
         ([str(foreign), "--to", "glb"], "result"),
     ):

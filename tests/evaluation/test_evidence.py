@@ -111,7 +111,7 @@ def test_a_component_without_flow_is_a_guess(small_room):
     weight = np.where(component[:, None] == 1, 0.0, data.pixel_weight)
     result = evidence(soup, replace(data, pixel_weight=weight), component, NOISE)
     assert result.guess.tolist() == [False, True]
-    assert result.rows()[1]["turn_px"] is None
+    assert np.isnan(result.turn[1])
     assert np.isinf(result.sigma[component == 1]).all()
 
 

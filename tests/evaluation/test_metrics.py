@@ -11,7 +11,6 @@ from soup_nlp.evaluation import recompute
 from soup_nlp.evaluation.metrics import (
     UNSCALED,
     Convention,
-    component_overlaps,
     depth_metrics,
     sample_at_points,
     skill,
@@ -130,11 +129,3 @@ def test_sampling_takes_the_nearest_pixel():
 def test_bad_input(score, words):
     with pytest.raises(DataError, match=words):
         score()
-
-
-def test_overlaps_of_components():
-    true = np.array([[0, 0, 0, 0], [0, 1, 1, -1], [2, 2, 2, 2]])
-    estimate = np.array([[0, 0, 0, 0], [3, 3, 3, 3], [0, 0, 2, 2]])
-    # label 3 covers both pixels of component 1 and one more pixel that is known
-    assert component_overlaps(estimate, true) == {0: (0, 4 / 7), 1: (3, 2 / 3), 2: (2, 0.5)}
-    assert component_overlaps(estimate, np.full((3, 4), -1)) == {}

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from helpers_model import K_NEXT, K_REF, motion, plane_pose, plane_soup, plane_world, random_soup
+from helpers_model import K_NEXT, K_REF, motion, plane_soup, plane_world, random_soup
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from soup_nlp.data.scenes.catalogue import placed
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.plane import (
     about_anchor,
@@ -162,8 +163,8 @@ def test_normalised_knows_no_gauge_and_no_scale(seed, scale):
 @pytest.mark.parametrize(
     ("pose", "move"),
     [
-        (plane_pose(3.0), motion((0, 0, 0), (0.2, 0, 0))),
-        (plane_pose(2.0, yaw=30, pitch=-15), motion((1.0, -2.0, 0.5), (0.05, -0.02, 0.1))),
+        (placed(0, 0, 3.0), motion((0, 0, 0), (0.2, 0, 0))),
+        (placed(0, 0, 2.0, yaw=30, pitch=-15), motion((1.0, -2.0, 0.5), (0.05, -0.02, 0.1))),
     ],
 )
 def test_reconstruction_of_a_rendered_plane_is_exact(pose, move):

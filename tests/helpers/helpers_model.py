@@ -186,11 +186,6 @@ def exact_terms(x: Float, data: EnergyData, weights: Weights, layout: Layout) ->
 # --- worlds with known truth ---------------------------------------------------------------------
 
 
-def plane_pose(z: float, yaw: float = 0.0, pitch: float = 0.0) -> Float:
-    """Pose of an infinite plane that crosses the optical axis at depth z (degrees)."""
-    return placed(0, 0, z, yaw, pitch)
-
-
 def motion(turn_deg: tuple[float, float, float], shift: tuple[float, float, float]) -> Float:
     """(4, 4) next_from_ref."""
     return about(turn=turn_deg, shift=shift)
@@ -238,9 +233,9 @@ def corner_scene(move: Float, component: Float | None = None, turn: float = 0.0)
         turn: Turns the wedge about its edge, degrees.
     """
     room = (
-        Part(Plane(), plane_pose(6.0, yaw=35), GREY),
-        Part(Plane(), plane_pose(6.0, yaw=-45), GREY),
-        Part(Plane(), plane_pose(0.0, pitch=-90) @ shift(0, 0, -1.2), GREY),
+        Part(Plane(), placed(0, 0, 6.0, yaw=35), GREY),
+        Part(Plane(), placed(0, 0, 6.0, yaw=-45), GREY),
+        Part(Plane(), placed(0, 0, 0.0, pitch=-90) @ placed(0, 0, -1.2), GREY),
     )
     components = [Body(room)]
     if component is not None:
@@ -248,17 +243,10 @@ def corner_scene(move: Float, component: Float | None = None, turn: float = 0.0)
         wedge = []
         for side in (-1.0, 1.0):
             yaw = turn + side * 40.0
-            pose = plane_pose(3.0, yaw=yaw) @ shift(side * 0.7, 0, 0)
+            pose = placed(0, 0, 3.0, yaw=yaw) @ placed(side * 0.7, 0, 0)
             wedge.append(Part(half, pose, GREY))
         components.append(Body(tuple(wedge), component))
     return Scene(tuple(components), np.eye(4), move)
-
-
-def shift(x: float, y: float, z: float) -> Float:
-    """(4, 4) translation."""
-    out = np.eye(4)
-    out[:3, 3] = x, y, z
-    return out
 
 
 def cut_by_part(
@@ -307,10 +295,10 @@ def assert_same_soup(a: Soup, b: Soup, tolerance: float = 1e-12) -> None:
 
 
 WORLDS = {
-    "fronto-parallel, sideways": (plane_pose(2.0), motion((0, 0, 0), (0.1, 0.03, 0))),
-    "fronto-parallel, turning": (plane_pose(3.0), motion((0.5, -1, 2), (0.1, 0.03, 0.2))),
-    "slanted": (plane_pose(2.5, yaw=25, pitch=-30), motion((1, 0.5, -1), (0.02, 0.1, -0.1))),
-    "at rest": (plane_pose(2.0, yaw=10), motion((0, 0, 0), (0, 0, 0))),
+    "fronto-parallel, sideways": (placed(0, 0, 2.0), motion((0, 0, 0), (0.1, 0.03, 0))),
+    "fronto-parallel, turning": (placed(0, 0, 3.0), motion((0.5, -1, 2), (0.1, 0.03, 0.2))),
+    "slanted": (placed(0, 0, 2.5, yaw=25, pitch=-30), motion((1, 0.5, -1), (0.02, 0.1, -0.1))),
+    "at rest": (placed(0, 0, 2.0, yaw=10), motion((0, 0, 0), (0, 0, 0))),
 }
 
 

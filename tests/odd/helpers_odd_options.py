@@ -66,8 +66,8 @@ def number_cases() -> Iterator[Case]:
         numbers = ("nan", "inf", "1e300", "0", "-1", "x")
         yield from cases(f"compare {option}={{}}", line, numbers)
     shown = ("-0.1", "1.1", ".nan", "word", "[]", "null")
-    line = "show {p} --set output.min_confidence={x}"
-    yield from cases("min_confidence {}", line, shown)
+    line = "show {p} --set energy.leak_arap={x}"
+    yield from cases("leak_arap {}", line, shown)
 
 
 def depth_png(o: Path) -> Path:

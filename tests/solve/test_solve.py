@@ -11,13 +11,12 @@ from helpers_model import (
     PAPER,
     disturbed,
     motion,
-    plane_pose,
     plane_soup,
     plane_world,
     with_true_flow,
 )
 
-from soup_nlp.data.scenes.catalogue import render_scene
+from soup_nlp.data.scenes.catalogue import placed, render_scene
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
@@ -222,7 +221,7 @@ def test_a_limit_gives_a_whole_solution(room, limit, status):
 
 @pytest.fixture(scope="module")
 def slanted() -> tuple[Soup, EnergyData]:
-    pose, move = plane_pose(2.5, yaw=25, pitch=-30), motion((1, 0.5, -1), (0.2, 0.1, -0.1))
+    pose, move = placed(0, 0, 2.5, yaw=25, pitch=-30), motion((1, 0.5, -1), (0.2, 0.1, -0.1))
     pair = plane_world(pose, move, 96, 72)
     labels = segment(pair.image_ref, 20, "grid")
     seg = build_segmentation(labels, pair.image_ref, neighbours=6, boundary_samples=2)
@@ -282,7 +281,7 @@ def test_the_constrained_nlp_is_solved_from_the_start_without_tangent_stages(roo
 
 
 def test_one_superpixel_is_solved():
-    pose, move = plane_pose(2.0, yaw=20), motion((0, 1, 0), (0.2, 0, 0))
+    pose, move = placed(0, 0, 2.0, yaw=20), motion((0, 1, 0), (0.2, 0, 0))
     pair = plane_world(pose, move, 64, 48)
     seg = build_segmentation(np.zeros((48, 64), np.int32), pair.image_ref)
     truth = plane_soup(pose, move, 1)

@@ -4,11 +4,12 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
-from helpers_model import motion, plane_pose, plane_world
+from helpers_model import motion, plane_world
 from helpers_start import CAMERA, CORNER_K, WEDGE, corner, fitted
 from helpers_truth import majority
 
 from soup_nlp.data.pair import Flow, Pair
+from soup_nlp.data.scenes.catalogue import placed
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.constraints import constraints
@@ -279,7 +280,7 @@ PLANE_LABELS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PLANE_LABELS)
 def test_one_plane_in_superpixels_of_any_shape_is_finite(name):
-    pair = plane_world(plane_pose(3.0, yaw=20, pitch=10), CAMERA, 64, 48)
+    pair = plane_world(placed(0, 0, 3.0, yaw=20, pitch=10), CAMERA, 64, 48)
     labels = PLANE_LABELS[name](pair.image_ref)
     neighbours = min(8, int(labels.max()))
     seg = build_segmentation(labels, pair.image_ref, neighbours=max(1, neighbours))
