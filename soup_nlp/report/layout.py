@@ -29,7 +29,6 @@ input/confidence          1     H,W     of the flow, 0 is unused
 segmentation/labels       1     H,W     superpixel of every pixel
 segmentation/anchors      px    N,2     centroids (u, v)
 segmentation/sizes        px    N       pixels of every superpixel
-segmentation/radius       px    N       root mean square distance from the anchor
 segmentation/knn          1     N,K     nearest anchors, nearest first
 segmentation/edge_multiplicity  1  L    directions of the K-NN edges, the first L of energy/edges
 segmentation/boundary     px    P,B,2   sampled shared boundary points (u, v)
