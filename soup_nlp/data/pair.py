@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, FloatMap, Image, Mask
+from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.formats.camera_files import CameraLike, camera_of
 from soup_nlp.data.formats.cameras import estimated_cameras
 from soup_nlp.data.formats.images import ImageLike, array_of, image_of, is_path, read_images
@@ -110,7 +110,6 @@ _PARTS = {
     "depth_ref": ("(H, W)", "fiu"),
     "depth_next": ("(H, W)", "fiu"),
     "flow": ("(H, W, 2)", "fiu"),
-    "occluded": ("(H, W)", "b"),
     "components": ("(H, W)", "iu"),
     "motions": ("(B, 4, 4)", "fiu"),
     "points": ("(M, 3)", "fiu"),
@@ -127,7 +126,6 @@ class Truth:
         depth_ref: (H, W) z of the reference frame in `unit`; NaN where unknown.
         depth_next: (H', W') z of the next frame; NaN where unknown.
         flow: (H, W, 2) true flow, pixels; NaN where unknown.
-        occluded: (H, W) bool, True for reference pixels that are not visible in the next frame.
         components: (H, W) int component of the reference pixels, -1 for none.
         motions: (B, 4, 4) next_from_ref of each component, in `unit`.
         points: (M, 3) sparse truth (u, v, z) of the reference frame, sub-pixel.
@@ -138,7 +136,6 @@ class Truth:
     depth_ref: Float | None = None
     depth_next: Float | None = None
     flow: Float | None = None
-    occluded: Mask | None = None
     components: NDArray[np.int32] | None = None
     motions: Float | None = None
     points: Float | None = None
@@ -151,7 +148,7 @@ class Truth:
             value = getattr(self, name)
             if value is None:
                 continue
-            expected = f"{axes} array of {'True and False' if kinds == 'b' else 'numbers'}"
+            expected = f"{axes} array of numbers"
             where, what = f"truth.{name}", "part of the truth"
             hint = "soup_nlp.Truth(depth_ref=array); files are read by a problem's input"
             made = array_of(value, what, where, expected, kinds, axes, hint)
