@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from soup_nlp.arrays import Float, FloatMap, Image, Mask
+from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.formats.camera_files import CameraLike, camera_of
 from soup_nlp.data.formats.cameras import estimated_cameras
 from soup_nlp.data.formats.images import ImageLike, array_of, image_of, is_path, read_images
@@ -18,9 +18,6 @@ from soup_nlp.errors import DataError, expect, one_line, printable, repr_of
 
 SHORTEST = 0.05
 """Smallest focal length relative to the side of the image (168 degrees of view)."""
-
-LARGEST = 1e100
-"""Largest number in a truth, so that sums of squares stay finite."""
 
 
 def check_size(
@@ -113,7 +110,6 @@ _PARTS = {
     "depth_ref": ("(H, W)", "fiu"),
     "depth_next": ("(H, W)", "fiu"),
     "flow": ("(H, W, 2)", "fiu"),
-    "occluded": ("(H, W)", "b"),
     "components": ("(H, W)", "iu"),
     "motions": ("(B, 4, 4)", "fiu"),
     "points": ("(M, 3)", "fiu"),
@@ -130,7 +126,6 @@ class Truth:
         depth_ref: (H, W) z of the reference frame in `unit`; NaN where unknown.
         depth_next: (H', W') z of the next frame; NaN where unknown.
         flow: (H, W, 2) true flow, pixels; NaN where unknown.
-        occluded: (H, W) bool, True for reference pixels that are not visible in the next frame.
         components: (H, W) int component of the reference pixels, -1 for none.
         motions: (B, 4, 4) next_from_ref of each component, in `unit`.
         points: (M, 3) sparse truth (u, v, z) of the reference frame, sub-pixel.
@@ -141,7 +136,6 @@ class Truth:
     depth_ref: Float | None = None
     depth_next: Float | None = None
     flow: Float | None = None
-    occluded: Mask | None = None
     components: NDArray[np.int32] | None = None
     motions: Float | None = None
     points: Float | None = None
@@ -154,21 +148,11 @@ class Truth:
             value = getattr(self, name)
             if value is None:
                 continue
-            expected = f"{axes} array of {'True and False' if kinds == 'b' else 'numbers'}"
+            expected = f"{axes} array of numbers"
             where, what = f"truth.{name}", "part of the truth"
             hint = "soup_nlp.Truth(depth_ref=array); files are read by a problem's input"
             made = array_of(value, what, where, expected, kinds, axes, hint)
-            # float32 cannot be compared with a limit beyond its range
             made = made.astype(np.float64) if made.dtype.kind == "f" else made
-            most = np.abs(made[np.isfinite(made)]).max(initial=0)
-            if most > LARGEST:
-                raise DataError(
-                    f"{what} has numbers whose squares overflow",
-                    where=where,
-                    found=f"{most:g}",
-                    expected=f"at most {LARGEST:g}",
-                    hint="NaN marks what is unknown",
-                )
             object.__setattr__(self, name, made)
 
     def known(self) -> list[str]:

@@ -1,6 +1,6 @@
 """The constraints of a soup, as residuals that anyone can test: the one definition of them."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -109,37 +109,16 @@ def table(kinds: Iterable[Kind]) -> str:
     return "\n".join([f"{head}{'':<8}worst superpixels", *map(str, kinds)])
 
 
-@dataclass(frozen=True, eq=False)
-class Constraints(Mapping[str, Kind]):
+class Constraints(dict[str, Kind]):
     """Residuals of a soup by kind; prints itself as a table.
 
     `c["so3"].largest`, `c["so3"].worst`, `c.within(1e-6)`, `dict(c.largest)`.
     """
 
-    kinds: tuple[Kind, ...]
-
-    def __getitem__(self, name: str) -> Kind:
-        return {k.name: k for k in self.kinds}[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return (k.name for k in self.kinds)
-
-    def __len__(self) -> int:
-        return len(self.kinds)
-
     @property
     def largest(self) -> dict[str, float]:
         """Largest violation of every kind."""
-        return {k.name: k.largest for k in self.kinds}
-
-    @property
-    def worst(self) -> tuple[str, int, float]:
-        """Kind, superpixel (-1: none) and residual of what exceeds its limit by the largest factor.
-
-        A kind without a limit counts where it is violated at all.
-        """
-        first = max(self.kinds, key=lambda k: k.largest / max(k.limit, 1e-16))
-        return first.name, *(first.worst[0] if first.worst else (-1, first.largest))
+        return {name: k.largest for name, k in self.items()}
 
     def within(self, tol: float | None = None) -> bool:
         """Whether every violation is at most `tol`; by default within the limits of our answers.
@@ -148,12 +127,12 @@ class Constraints(Mapping[str, Kind]):
         0 for positive: lam and d are above 0, whatever `tol` is.
         """
         return all(
-            k.largest <= (tol if tol is not None and k.limit else k.limit) for k in self.kinds
+            k.largest <= (tol if tol is not None and k.limit else k.limit) for k in self.values()
         )
 
     def __str__(self) -> str:
-        units = (f"     {k.name:<9} in units of {DEFINITIONS[k.name].unit}" for k in self.kinds)
-        return "\n".join([table(self.kinds), *units])
+        units = (f"     {name:<9} in units of {DEFINITIONS[name].unit}" for name in self)
+        return "\n".join([table(self.values()), *units])
 
     __repr__ = __str__
 
@@ -205,7 +184,7 @@ def constraints(
             facing = -np.einsum("nc,nvc->nv", n, rays)
             off["visible"] = np.maximum(0.0, (min_facing - facing).max(axis=1))
     off = {k: v if k == "simplex" else np.where(broken, np.inf, v) for k, v in off.items()}
-    return Constraints(tuple(kind(k, v) for k, v in off.items()))
+    return Constraints({k: kind(k, v) for k, v in off.items()})
 
 
 def _array(value: object, name: str, shape: tuple[int, ...]) -> Float:

@@ -27,7 +27,6 @@ class Segmentation:
         labels: (H, W) int32 superpixel of every pixel.
         anchors: (N, 2) centroid (u, v) of every superpixel, pixels.
         sizes: (N,) pixels of every superpixel.
-        radius: (N,) root mean square distance of its pixels from the anchor, pixels.
         knn: (N, K) the K nearest anchors of every anchor, nearest first (directed).
         edges: (E, 2) undirected edges i < k of the K-NN graph.
         edge_multiplicity: (E,) 1 or 2: directions in which the edge occurs.
@@ -42,7 +41,6 @@ class Segmentation:
     labels: NDArray[np.int32]
     anchors: Float
     sizes: Int
-    radius: Float
     knn: Int
     edges: Int
     edge_multiplicity: Int
@@ -99,7 +97,6 @@ def build_segmentation(
     sizes = np.bincount(flat, minlength=n)
     v, u = (x.ravel().astype(float) for x in np.mgrid[0:height, 0:width])
     anchors = np.stack([np.bincount(flat, w, n) / sizes for w in (u, v)], axis=1)
-    moment = np.bincount(flat, (u - anchors[flat, 0]) ** 2 + (v - anchors[flat, 1]) ** 2, n)
     knn = _nearest(anchors, neighbours)
     directed = np.stack([np.repeat(np.arange(n), knn.shape[1]), knn.ravel()], axis=1)
     edges, multiplicity = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
@@ -109,7 +106,6 @@ def build_segmentation(
         labels=labels,
         anchors=anchors,
         sizes=sizes,
-        radius=np.sqrt(moment / sizes).clip(0.5),
         knn=knn,
         edges=edges,
         edge_multiplicity=multiplicity,

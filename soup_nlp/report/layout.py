@@ -29,7 +29,6 @@ input/confidence          1     H,W     of the flow, 0 is unused
 segmentation/labels       1     H,W     superpixel of every pixel
 segmentation/anchors      px    N,2     centroids (u, v)
 segmentation/sizes        px    N       pixels of every superpixel
-segmentation/radius       px    N       root mean square distance from the anchor
 segmentation/knn          1     N,K     nearest anchors, nearest first
 segmentation/edge_multiplicity  1  L    directions of the K-NN edges, the first L of energy/edges
 segmentation/boundary     px    P,B,2   sampled shared boundary points (u, v)
@@ -126,7 +125,6 @@ components/interpolated   1     C       share of the pixels whose depth is that 
 truth/depth_ref           truth  H,W    true z of the reference frame, NaN where unknown
 truth/depth_next          truth  H,W    true z of the next frame, NaN where unknown
 truth/flow                px    H,W,2   true flow, NaN where unknown
-truth/occluded            1     H,W     reference pixel is not visible in the next frame
 truth/components          1     H,W     component of a reference pixel, -1 for none
 truth/motions             truth  B,4,4  next_from_ref of each component
 truth/scene_flow          truth  H,W,3  true X' - X, each in its own frame's camera

@@ -58,7 +58,6 @@ def test_folder_with_everything(folder: Path) -> None:
     png16(folder / "depth.png", np.full((H, W), 1500))
     write_dpt(folder / "depth_next.dpt", np.full((H, W), 2.5))
     write_flo(folder / "flow.flo", np.full((H, W, 2), np.nan))
-    picture(folder / "occluded.png", np.full((H, W), 255, np.uint8))
     moving = np.zeros((H, W), np.uint8)
     moving[:2, :2] = moving[4:, 4:] = 255
     picture(folder / "moving.png", moving)
@@ -70,7 +69,6 @@ def test_folder_with_everything(folder: Path) -> None:
     assert truth.depth_ref[0, 0] == 1.5
     assert truth.depth_next[0, 0] == 2.5
     assert np.isnan(truth.flow).all()
-    assert truth.occluded.all()
     # the static scene and two connected regions
     assert sorted(np.bincount(truth.components.ravel())) == [4, 10, H * W - 14]
     np.testing.assert_allclose(truth.points, [[3.5, 2.5, 0.55]])

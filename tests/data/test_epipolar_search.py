@@ -47,7 +47,7 @@ def grey(image: np.ndarray) -> np.ndarray:
 def error(pair: Pair, uv: np.ndarray) -> np.ndarray:
     """Distance from the true flow, NaN where that is unknown or leads out of the image."""
     at = pixel_grid(*pair.size) + np.nan_to_num(pair.truth.flow, nan=1e6)
-    inside = ((at > 4) & (at < np.array(pair.size[::-1]) - 5)).all(axis=2) & ~pair.truth.occluded
+    inside = ((at > 4) & (at < np.array(pair.size[::-1]) - 5)).all(axis=2)
     return np.where(inside, np.linalg.norm(uv - pair.truth.flow, axis=2), np.nan)
 
 

@@ -161,7 +161,8 @@ def test_a_larger_next_image_is_searched_as_a_whole() -> None:
 PLUGINS = SimpleNamespace(
     mine=lambda first, _: Flow(np.full((*first.shape[:2], 2), 3.0, np.float32), source="mine"),
     cropped=lambda first, _: Flow(np.zeros((*first[1:].shape[:2], 2), np.float32)),
-    array_only=lambda first, _: np.zeros((*first.shape[:2], 2)),
+    array=lambda first, _: np.full((*first.shape[:2], 2), 3.0),
+    nothing=lambda first, _: None,
     broken=lambda first, _: first.weights,
 )
 
@@ -176,15 +177,16 @@ def test_a_flow_source_is_an_entry_point(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.syspath_prepend(tmp_path)
     assert flow_sources().keys() >= {*vars(PLUGINS), "absent"}
     pair = pair_of()
-    flow = resolve_flow(pair, "mine")
-    assert flow.source == "mine"
-    assert (flow.uv == 3.0).all()
+    for name in ("mine", "array"):
+        flow = resolve_flow(pair, name)
+        assert flow.source == name
+        assert (flow.uv == 3.0).all()
     for name, match in [
         ("cropped", "differ in size"),
-        ("array_only", r"returned no Flow[\s\S]*ndarray"),
+        ("nothing", r"flow is no array[\s\S]*where: nothing"),
         ("broken", r"plug-in failed[\s\S]*AttributeError: .*weights"),
         ("absent", r"plug-in failed[\s\S]*AttributeError"),
-        ("unheard", r"dis, truth, .*SIGMA, absent, array_only, broken, cropped, mine, or the path"),
+        ("unheard", r"dis, truth, .*SIGMA, absent, array, broken, cropped, mine, nothing, or the"),
     ]:
         with raises(match):
             resolve_flow(pair, name)
@@ -273,12 +275,6 @@ def test_dis_images_of_different_size() -> None:
     assert flow.uv.shape == (64, 90, 2)
     assert not flow.confidence[:, 72:].any()
     assert (flow.confidence[10:-10, 10:60] > 0.5).mean() > 0.9
-
-
-def test_an_image_that_is_too_small_for_dis() -> None:
-    good = np.zeros((20, 20, 3), np.uint8)
-    with raises(r"too small[\s\S]*20x15"):
-        dis_flow(good[:15], good)
 
 
 @pytest.mark.slow

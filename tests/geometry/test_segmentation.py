@@ -77,13 +77,12 @@ def test_filled_pieces_that_end_up_cut_off_become_their_own(seed):
 # --- graphs ------------------------------------------------------------------------------------
 
 
-def test_anchors_sizes_and_radius_by_hand():
+def test_anchors_and_sizes_by_hand():
     labels = np.zeros((2, 6), np.int32)
     labels[:, 4:] = 1
     seg = build_segmentation(labels, noise(2, 6), neighbours=1)
     np.testing.assert_allclose(seg.anchors, [[1.5, 0.5], [4.5, 0.5]])
     np.testing.assert_array_equal(seg.sizes, [8, 4])
-    np.testing.assert_allclose(seg.radius, [np.sqrt(1.25 + 0.25), np.sqrt(0.25 + 0.25)])
     assert len(seg) == 2
 
 

@@ -53,7 +53,7 @@ DATASETS = {
     "vkitti2": "root: {}, scene: Scene01, frame: 0",
 }
 PARTS = {
-    **dict.fromkeys(("frame_0", "frame_1", "occluded", "moving"), "png"),
+    **dict.fromkeys(("frame_0", "frame_1", "moving"), "png"),
     **{"K": "txt", "K_next": "txt", "depth": "npy png dpt pfm", "depth_next": "npy"},
     **{"flow": "flo npy png", "points": "npz"},
 }

@@ -128,7 +128,7 @@ def make_pair(
 
 LAYOUT = (
     "frame_0.png, frame_1.png, K.txt; optional K_next.txt, depth.npy|dpt|pfm|png, depth_next.*, "
-    "flow.flo|png|npy, occluded.png, moving.png, points.npz"
+    "flow.flo|png|npy, moving.png, points.npz"
 )
 _IMAGES = ".png .jpg .jpeg .tif .tiff .ppm .pgm .bmp"
 _DEPTHS = ".npy .dpt .pfm .png"
@@ -146,8 +146,8 @@ class FolderInput(FramesInput):
     - `frame_0.png`, `frame_1.png`
     - `K.txt`: 3x3 intrinsics, or fx fy cx cy; `K_next.txt` if the next frame's differ
     - optional truth: `depth`, `depth_0` or `depth_ref` (.npy, .dpt, .pfm, 16-bit .png),
-      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `occluded.png` (white = occluded),
-      `moving.png` (white = moves by itself; every connected region is one component)
+      `depth_next` or `depth_1`, `flow` (.flo, .npy, KITTI .png), `moving.png` (white = moves by
+      itself; every connected region is one component)
     - optional sparse truth `points.npz`: `uv_0` (M, 2) pixels and `xyz_mm_0` (M, 3) millimetres in
       the reference camera; z is converted to `unit` when that is "m" and kept when it is "mm".
     """
@@ -172,7 +172,6 @@ class FolderInput(FramesInput):
             depth_ref=depth,
             depth_next=depth_next,
             flow=folder.read(read_flow, *_names("flow", ".flo .npy .png")),
-            occluded=folder.read(read_mask, *_names("occluded", _IMAGES)),
             components=folder.read(_read_regions, *_names("moving", _IMAGES)),
             points=folder.read(_read_points, "points.npz", unit=self.unit),
             unit=self.unit,

@@ -14,7 +14,6 @@ import numpy as np
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.flow.consistency import LIMIT, SURE, confidence_of, round_trip_error, sampled
 from soup_nlp.data.pair import Flow
-from soup_nlp.errors import DataError
 
 Match = Callable[[Image, Image], tuple[FloatMap, FloatMap]]
 """Forward and backward flow of two grey images of one size."""
@@ -104,9 +103,6 @@ def flow_score(ref: Image, nxt: Image, flow: FloatMap, gap: FloatMap) -> FloatMa
     return np.asarray(score, dtype=np.float32)
 
 
-MIN_SIDE = 16
-"""Smallest image side for DIS, pixels."""
-
 FINEST_SCALE, PATCH_SIZE, PATCH_STRIDE = 0, 8, 2
 """Full resolution, and denser patches than in OpenCV's medium preset (stride 3)."""
 ITERATIONS, ALPHA, DELTA, GAMMA = 20, 30.0, 1.0, 10.0
@@ -133,14 +129,6 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
     keeps its confidence. An image without contrast (standard deviation below one grey level) gives
     a zero flow with confidence 0.
     """
-    for where, image in (("image_ref", image_ref), ("image_next", image_next)):
-        if min(image.shape[:2]) < MIN_SIDE:
-            raise DataError(
-                "image is too small for DIS flow",
-                where=where,
-                found=f"{image.shape[1]}x{image.shape[0]}",
-                expected=f"at least {MIN_SIDE} pixels on each side",
-            )
     ref, nxt = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (image_ref, image_next))
     height, width = ref.shape
     if min(float(ref.std()), float(nxt.std())) < _FLAT:

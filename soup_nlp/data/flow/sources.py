@@ -1,7 +1,7 @@
 """Sources of the flow of a pair: DIS and other methods, a file, the truth, or a plug-in.
 
-A plug-in is a function `(image_ref, image_next) -> Flow` that an installed package registers as an
-entry point of the group `soup_nlp.flow`; the name of the entry point is the name of the source.
+A plug-in is a function of two images that returns a `Flow`, or what makes one. An installed package
+registers it as an entry point of the group `soup_nlp.flow`, whose name is that of the source.
 """
 
 from collections.abc import Callable
@@ -198,21 +198,16 @@ def _without_bars(flow: Flow, pair: Pair) -> Flow:
 
 
 def _run_plugin(point: EntryPoint, pair: Pair) -> Flow:
-    where = f"flow plug-in {point.name!r} ({point.value})"
     try:
-        flow = point.load()(pair.image_ref, pair.image_next)
+        found = point.load()(pair.image_ref, pair.image_next)
     except DataError:
         raise
     except Exception as error:
         raise DataError(
-            "flow plug-in failed", where=where, found=f"{type(error).__name__}: {error}"
+            "flow plug-in failed",
+            where=f"flow plug-in {point.name!r} ({point.value})",
+            found=f"{type(error).__name__}: {error}",
         ) from error
-    if not isinstance(flow, Flow):
-        raise DataError(
-            "flow plug-in returned no Flow",
-            where=where,
-            found=type(flow).__name__,
-            expected="soup_nlp.data.pair.Flow",
-        )
-    check_size("flow and reference image", flow.uv.shape, pair.size, where)
+    flow = found if isinstance(found, Flow) else Flow(found, source=point.name)
+    pair.with_flow(flow)  # checks its size
     return flow

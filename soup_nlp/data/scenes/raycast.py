@@ -1,9 +1,8 @@
-"""A small ray caster for dynamic scenes: exact depth, flow and visibility, textured images.
+"""A small ray caster for dynamic scenes: exact depth and flow, textured images.
 
 A `Scene` consists of bodies, a body of parts that move together, and a part is a shape with a pose
-and a texture. Rays are `K^-1 (u, v, 1)`, so the ray parameter of a hit is its depth z. Depth, flow,
-labels and visibility are computed at pixel centres in closed form; only colour is averaged over the
-pixel.
+and a texture. Rays are `K^-1 (u, v, 1)`, so the ray parameter of a hit is its depth z. Depth, flow
+and labels are computed at pixel centres in closed form; only colour is averaged over the pixel.
 """
 
 from collections.abc import Sequence
@@ -18,8 +17,6 @@ from soup_nlp.data.scenes.surfaces import NEAR, Shape, Texture
 from soup_nlp.errors import DataError
 from soup_nlp.geometry import camera
 
-SAME_DEPTH = 1e-6
-"""Largest relative difference of depth of two hits of the same point."""
 TAPS = 3
 """Colour samples of a pixel along the direction of foreshortening."""
 TILTED = 0.75
@@ -222,9 +219,8 @@ class Frame:
 def render(scene: Scene, K: Float, height: int, width: int) -> Pair:
     """Both images of a scene, with intrinsics K (3, 3), and its exact truth; no flow.
 
-    A reference pixel is occluded if its point is hidden in the next frame, projects outside the
-    rectangle of the pixel centres, or is behind the camera (with a flow of NaN). Every ray must hit
-    a surface, such as an infinite plane behind the bodies.
+    The flow is NaN where a point comes to lie behind the camera. Every ray must hit a surface, such
+    as an infinite plane behind the bodies.
     """
     size, uv = (height, width), camera.pixel_grid(height, width).reshape(-1, 2)
     ref, following = Frame(scene, K, 0), Frame(scene, K, 1)
@@ -242,16 +238,10 @@ def render(scene: Scene, K: Float, height: int, width: int) -> Pair:
     in_front = X_next[:, 2] > NEAR
     target = np.full_like(uv, np.nan)
     target[in_front] = camera.project(K, X_next[in_front])
-    # tolerates rounding at the border
-    edge = np.array([width, height]) - 1 + 1e-6
-    visible = in_front & ((target >= -1e-6) & (target <= edge)).all(axis=1)
-    first, _ = following.trace(target[visible])
-    visible[visible] = X_next[visible, 2] <= first * (1 + SAME_DEPTH)
     truth = Truth(
         depth_ref=depth.reshape(size),
         depth_next=depth_next.reshape(size),
         flow=(target - uv).reshape(*size, 2),
-        occluded=~visible.reshape(size),
         components=ref.body[part].reshape(size),
         motions=motions,
         scene_flow=(X_next - X).reshape(*size, 3),
