@@ -345,12 +345,3 @@ def test_the_worst_superpixel_is_named(exported):
     assert not so3.ok
     assert "7 (" in table(rows)
     assert kind("normal", np.array([0.0, np.nan]), 1e-6).largest == np.inf
-
-
-@pytest.mark.slow
-def test_no_multipliers_where_the_start_is_not_stationary(exported):
-    manifest = json.loads((exported / "manifest.json").read_text())
-    assert manifest["start"] == "proposal"
-    assert not manifest["initial_duals"]
-    lines = (exported / "soup.nl").read_text().splitlines()
-    assert not any(line[0] in "dS" for line in lines)

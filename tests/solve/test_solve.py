@@ -1,6 +1,5 @@
 """Soups solved: constraints, gauges, limits, interruption, a world whose truth is the optimum."""
 
-import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -35,7 +34,6 @@ from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import Solution, _near, solve_soup
 from soup_nlp.start.propose import propose
 from soup_nlp.start.views import FlowFit
-from soup_nlp.storage.progress import Watch
 
 pytestmark = pytest.mark.slow
 
@@ -303,13 +301,3 @@ def test_a_better_start_is_delivered_beside_the_presolves_kkt_point(room, solved
     assert again.delivered == "start"
     assert again.energy["total"] == pytest.approx(again.energy_start["total"], rel=1e-9)
     assert_constraints(again, room.data)
-
-
-def test_a_stop_before_the_start_gives_the_start(room):
-    stop = threading.Event()
-    stop.set()
-    solution = room.solve(watch=Watch(stop=stop))
-    assert solution.status == "Interrupted"
-    assert not solution.converged
-    assert_whole(solution, room)
-    assert solution.energy["total"] == pytest.approx(solution.energy_start["total"], rel=1e-3)

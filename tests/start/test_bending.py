@@ -76,6 +76,7 @@ def test_sheet_bends_and_can_be_told_not_to():
         assert c.start.bending
         assert c.start.bends.all()
         assert c.data.arap_at_anchors
+    assert c.start.order is None
     assert (c.start.component == 0).all()
     np.testing.assert_allclose(c.soup.depth_at(c.data.anchor_ray), 1.0, rtol=1e-9)
     # occlusion shows the sheet before strips of the wall, which become components behind it
