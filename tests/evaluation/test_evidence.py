@@ -123,12 +123,12 @@ FOCAL = 400.0
 def matches(seed: int = 0) -> Matches:
     """Correspondences of points with relief, seen by a camera that turns and shifts."""
     rng = np.random.default_rng(seed)
-    place = np.column_stack([rng.uniform(-0.6, 0.6, 1500), rng.uniform(-0.4, 0.4, 1500)])
+    place = np.column_stack([rng.uniform(-0.6, 0.6, 600), rng.uniform(-0.4, 0.4, 600)])
     ray = np.pad(place, [(0, 0), (0, 1)], constant_values=1.0)
-    X = ray * rng.uniform(2.0, 8.0, (1500, 1))
+    X = ray * rng.uniform(2.0, 8.0, (600, 1))
     moved = X @ rotation.exp(np.array([0.02, 0.04, 0.01])).T + [0.3, 0.05, 0.1]
     target = moved / moved[:, 2:]
-    target[:, :2] += rng.normal(0.0, 0.03 / FOCAL, (1500, 2))
+    target[:, :2] += rng.normal(0.0, 0.03 / FOCAL, (600, 2))
     return Matches(ray, target, np.ones(len(ray)), FOCAL)
 
 
@@ -171,7 +171,7 @@ def test_the_error_of_a_camera_is_found(kind, x):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_right_camera_is_believed(seed):
     found = camera_errors(matches(seed))
     assert likeliest(found) is None
