@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soup_nlp.evaluation.confidence import FACTORS, KINDS, confidence, kinds
+from soup_nlp.evaluation.confidence import FACTORS, KINDS, MOST_SIGMA, confidence, kinds
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.report.findings import ORIGIN_WORDS
 from soup_nlp.report.verdict import certainty
@@ -23,6 +23,7 @@ def test_every_pixel_is_of_one_kind(small_run):
     found, sure = certainty(small_run), small_run.confidence
     assert sum(found[kind] for kind in KINDS) == pytest.approx(1.0)
     assert found["measured"] > 0.5
+    assert np.mean(sure.sigma > MOST_SIGMA) < 0.2
     measured = sure.kind == KINDS.index("measured")
     assert found["median_sigma"] == pytest.approx(np.median(sure.sigma[measured]))
     seen = (small_run.pair.flow.confidence > 0) & ~hidden(small_run.reconstruction)

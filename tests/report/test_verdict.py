@@ -55,6 +55,9 @@ def test_hints_name_what_would_help(small_run):
     assert told(unsure(flat, 0.05)) == ""
     tenth = np.where(np.arange(labels.size).reshape(labels.shape) < labels.size // 10, 1.2, 0.05)
     assert "frames farther apart in time" in told(unsure(flat, tenth))
+    same = replace(small_run.pair, flow=replace(small_run.pair.flow, uv=0 * small_run.pair.flow.uv))
+    for run, says in ((unsure(small_run), True), (sure, False)):
+        assert ("these two are nearly the same" in told(replace(run, pair=same))) == says
     assert "moves aside" in told(unsure(small_run, 0.05, at_rest=True))
     moving = (start.component != SCENE)[labels]
     assert "--depth-prior" in told(unsure(small_run, np.where(moving, 1.2, 0.05)))
