@@ -25,7 +25,6 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.kernel import HESSIANS
 from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.solve.ipopt import Ipopt
@@ -229,20 +228,14 @@ def slanted() -> tuple[Soup, EnergyData]:
     return truth, in_pixels(data, truth, seg)
 
 
-@pytest.mark.parametrize(
-    ("gauge", "kind"),
-    [
-        *[(g, "gauss-newton+constraints") for g in GAUGES],
-        *[("unit-offset", h) for h in HESSIANS if h != "gauss-newton+constraints"],
-    ],
-)
-def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge, kind):
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge):
     """E >= 0 and E = 0 at the truth: the optimum is known."""
     truth, data = slanted
     start = disturbed(truth, 0.05)
     weights = PAPER.replace(cont=0.05, prior=0.0, sigma_cont=np.inf, sigma_orient=0.5, proj=1.0)
     options = OPTIONS.replace(presolve_tol=1e-5, max_iter=200)
-    solution = solve_soup(start, data, weights, form(gauge=gauge, hessian=kind), options)
+    solution = solve_soup(start, data, weights, form(gauge=gauge), options)
     before, after = solution.energy_start["total"], solution.energy["total"]
     assert before > 10
     assert after < 1e-3 * before
