@@ -223,11 +223,3 @@ def test_numbers_do_not_reach_symbols(module):
 def test_modules_do_not_import_in_circles():
     # raises an error that names the modules of a circle
     TopologicalSorter({module: INSIDE[module] - {""} for module in MODULES}).prepare()
-
-
-PURPOSE: dict[str, str] = {}
-
-
-def test_every_module_has_a_purpose_line():
-    for module, text in PURPOSE.items():
-        assert len(text.partition("\n")[0]) > 10, module

@@ -25,7 +25,8 @@ from soup_nlp.storage.each import each, read_rows
 
 TINY = [
     *("segmentation.superpixels=12", "segmentation.neighbours=4", "energy.pixel_samples=4"),
-    *("refine.enabled=false", "output.page=false"),
+    # refining the start takes less time than Ipopt
+    *("refine.from_start=true", "refine.rounds=1", "refine.particles=4", "output.page=false"),
 ]
 TINY_SET = [word for key in TINY for word in ("--set", key)]
 
@@ -182,7 +183,7 @@ def four(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on(four, tmp_path):
+def test_a_killed_run_goes_on_and_two_runs_solve_no_pair_twice(four, tmp_path):
     out = tmp_path / "out"
     run = subprocess.Popen(command(four, out))
     while len(read_rows(out / "pairs.jsonl")) < 1:
@@ -190,12 +191,18 @@ def test_a_killed_run_goes_on(four, tmp_path):
     run.kill()
     run.wait()
     kept = read_rows(out / "pairs.jsonl")
-    done = batch(four, out, overrides=TINY)
-    assert done.good
-    assert len(done.rows) == 4
+    runs = [subprocess.Popen(command(four, out)) for _ in range(2)]
+    assert [run.wait() for run in runs] == [0, 0]
     rows = read_rows(out / "pairs.jsonl")
     assert rows[: len(kept)] == kept
     assert sorted(row["key"] for row in rows) == [f"orbit_{k}" for k in range(4)]
+    assert not list((out / "pairs").glob("*.claim"))
+    assert len(rows_of(out)) == 4
+    # and in Python
+    done = batch(four, out, overrides=TINY)
+    assert done.good
+    assert len(done.rows) == 4
+    assert read_rows(out / "pairs.jsonl") == rows
 
 
 def test_a_pair_of_a_run_that_lives_is_not_taken(tmp_path):
@@ -255,7 +262,8 @@ def cluster(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_cluster_survives_the_loss_of_a_worker(four, tmp_path, cluster):
+@pytest.mark.filterwarnings("ignore")
+def test_a_cluster_survives_the_loss_of_a_worker_but_not_of_its_scheduler(four, tmp_path, cluster):
     address, started = cluster
     killed = []
 
@@ -268,22 +276,6 @@ def test_a_cluster_survives_the_loss_of_a_worker(four, tmp_path, cluster):
     assert done.good
     assert len(killed) == 1
     assert len(rows_of(tmp_path / "out")) == 4
-
-
-@pytest.mark.slow
-def test_two_runs_in_one_folder_solve_no_pair_twice(four, tmp_path):
-    runs = [subprocess.Popen(command(four, tmp_path / "out")) for _ in range(2)]
-    assert [run.wait() for run in runs] == [0, 0]
-    rows = read_rows(tmp_path / "out" / "pairs.jsonl")
-    assert sorted(row["key"] for row in rows) == [f"orbit_{k}" for k in range(4)]
-    assert not list((tmp_path / "out" / "pairs").glob("*.claim"))
-    assert len(rows_of(tmp_path / "out")) == 4
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_the_loss_of_the_scheduler_ends_the_command(cluster):
-    address, started = cluster
 
     # pickled by value: the workers do not know this module
     def later() -> dict[str, int]:

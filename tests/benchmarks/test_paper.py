@@ -1,9 +1,7 @@
 """The tables of the paper, from artificial rows."""
 
 import json
-import re
 from operator import attrgetter
-from pathlib import Path
 
 import pytest
 
@@ -42,20 +40,6 @@ def test_undone_departures_have_the_values_of_the_preset():
     rest = printed().keys() - undone
     both = [key for key in rest if attrgetter(key)(paper) != attrgetter(key)(base)]
     assert set(both) <= NO_EFFECT
-
-
-def test_the_documented_departures_that_the_preset_keeps():
-    """The table of departures names their keys: the preset sets all but the listed ones."""
-    text = (Path(__file__).parents[2] / "docs" / "formulation.md").read_text()
-    table = text.split("| in the paper |")[1].split("\n\n")[0]
-    keys = set(re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)", table.replace("../soup_nlp", "")))
-    assert keys - printed().keys() == {
-        "flow.source",
-        "energy.pixel_samples",
-        "segmentation.boundary_samples",
-        "solver.eps",
-        "solver.presolve_iterations",
-    }
 
 
 def test_a_plan_measures_nothing_twice():

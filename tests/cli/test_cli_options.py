@@ -180,13 +180,3 @@ def test_rows_of_a_batch_say_how_much_time_is_left(monkeypatch, capsys):
         "3/4  pair_3  fine  60 s, 1 min left",
         "4/4  pair_4  fine  60 s",
     ]
-
-
-@pytest.mark.parametrize(
-    "option", [("--depth", "truth.npy"), ("--intrinsics", "1,1,0,0"), ("--fov", "50")]
-)
-def test_options_of_a_pair_exclude_a_problem_file(option, tmp_path, capsys):
-    assert main(["solve", "orbit", "--out", str(tmp_path / "out"), *option]) == 2
-    error = capsys.readouterr().err
-    assert option[0] in error
-    assert not (tmp_path / "out").exists()

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from soup_nlp.evaluation.confidence import FACTORS, KINDS, confidence, kinds
+from soup_nlp.evaluation.confidence import FACTORS, KINDS, MOST_SIGMA, confidence, kinds
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.report.findings import ORIGIN_WORDS
 from soup_nlp.report.verdict import certainty
@@ -23,6 +23,7 @@ def test_every_pixel_is_of_one_kind(small_run):
     found, sure = certainty(small_run), small_run.confidence
     assert sum(found[kind] for kind in KINDS) == pytest.approx(1.0)
     assert found["measured"] > 0.5
+    assert np.mean(sure.sigma > MOST_SIGMA) < 0.2
     measured = sure.kind == KINDS.index("measured")
     assert found["median_sigma"] == pytest.approx(np.median(sure.sigma[measured]))
     seen = (small_run.pair.flow.confidence > 0) & ~hidden(small_run.reconstruction)
@@ -50,7 +51,9 @@ def test_what_parallax_does_not_tell_is_inferred(name, small_run):
 @pytest.mark.slow
 def test_before_a_camera_at_rest_all_is_drawn_but_what_is_given(small_run):
     at_rest = replace(small_run.start, at_rest=True)
-    assert sure_of(small_run, at_rest).share("drawn") == 1.0
+    drawn = sure_of(small_run, at_rest)
+    assert drawn.share("drawn") == 1.0
+    assert (drawn.sigma == FACTORS["drawn"]).all()
     one = np.arange(len(at_rest.soup)) == 3
     sigma = np.where(one, 0.3, np.inf)
     given = SimpleNamespace(sigma=sigma, from_prior=one)
@@ -60,13 +63,14 @@ def test_before_a_camera_at_rest_all_is_drawn_but_what_is_given(small_run):
     assert (kind[~inside] == KINDS.index("drawn")).all()
 
 
-@pytest.mark.slow
 def test_what_is_as_uncertain_as_a_drawing_is_one(small_run):
+    """An energy that sees no plane leaves everything to the prior."""
     sure = small_run.confidence
     assert (sure.kind[sure.sigma >= FACTORS["drawn"]] == KINDS.index("drawn")).all()
     alone = dict.fromkeys(("proj", "cont", "orient", "prior"), 0.0)
     blind = replace(small_run, weights=small_run.weights.replace(**alone))
     nothing = sure_of(blind, blind.start)
+    assert np.isfinite(nothing.sigma).all()
     assert np.median(nothing.sigma) == pytest.approx(FACTORS["prior"], rel=0.05)
     assert nothing.share("drawn") > 0.95
 

@@ -123,12 +123,12 @@ FOCAL = 400.0
 def matches(seed: int = 0) -> Matches:
     """Correspondences of points with relief, seen by a camera that turns and shifts."""
     rng = np.random.default_rng(seed)
-    place = np.column_stack([rng.uniform(-0.6, 0.6, 1500), rng.uniform(-0.4, 0.4, 1500)])
+    place = np.column_stack([rng.uniform(-0.6, 0.6, 600), rng.uniform(-0.4, 0.4, 600)])
     ray = np.pad(place, [(0, 0), (0, 1)], constant_values=1.0)
-    X = ray * rng.uniform(2.0, 8.0, (1500, 1))
+    X = ray * rng.uniform(2.0, 8.0, (600, 1))
     moved = X @ rotation.exp(np.array([0.02, 0.04, 0.01])).T + [0.3, 0.05, 0.1]
     target = moved / moved[:, 2:]
-    target[:, :2] += rng.normal(0.0, 0.03 / FOCAL, (1500, 2))
+    target[:, :2] += rng.normal(0.0, 0.03 / FOCAL, (600, 2))
     return Matches(ray, target, np.ones(len(ray)), FOCAL)
 
 
@@ -171,7 +171,7 @@ def test_the_error_of_a_camera_is_found(kind, x):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_right_camera_is_believed(seed):
     found = camera_errors(matches(seed))
     assert likeliest(found) is None
@@ -210,11 +210,6 @@ def test_too_few_matches_show_no_error():
 ORBIT = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
 
 
-@pytest.fixture(scope="module")
-def orbit():
-    return make_problem({"input": ORBIT, "flow": {"source": "truth"}}).load_pair()
-
-
 def started(pair: Pair):
     """The start of a pair as a run, and what is said of it."""
     raw = {"input": ORBIT, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
@@ -234,7 +229,8 @@ def test_a_turn_is_no_evidence_with_a_wrong_focal_length(small_room):
 
 
 @pytest.mark.slow
-def test_a_wrong_principal_point_makes_depth_unsure(orbit):
+def test_a_wrong_principal_point_makes_depth_unsure():
+    orbit = make_problem({"input": ORBIT, "flow": {"source": "truth"}}).load_pair()
     K = orbit.K_ref.copy()
     K[0, 2] += 32
     exact, told = started(replace(orbit, flow=None))
@@ -258,11 +254,3 @@ def test_two_scenes_are_drawn():
     done, told = started(replace(one, flow=None, image_next=other.image_next))
     assert not done.good
     assert "same scene" in told
-
-
-@pytest.mark.slow
-def test_a_repeated_frame_is_drawn(orbit):
-    done, told = started(replace(orbit, flow=None, image_next=orbit.image_ref))
-    assert not done.good
-    assert done.confidence.share("drawn") == 1
-    assert "nearly the same" in told

@@ -4,34 +4,27 @@ import re
 
 import numpy as np
 import pytest
-from helpers_start import squares
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
-from soup_nlp.geometry import camera
-from soup_nlp.model import oracle
-from soup_nlp.model.energy_data import build_energy_data
-from soup_nlp.model.energy_options import Weights
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, run, skipped
 from soup_nlp.report.verdict import verdict
-from soup_nlp.start.propose import propose
-from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    ("scene", "seed", "width", "said"),
+    ("scene", "seed", "width", "least", "most"),
     [
-        ("still", 0, 256, True),
-        ("orbit", 0, 256, False),
+        ("still", 0, 256, 80, 100),
+        ("orbit", 0, 256, 0, 20),
         # vehicles that are taken to bend, although the flow jumps between them
-        ("jam", 25, 320, True),
-        ("sheet", 0, 768, False),
+        ("jam", 25, 320, 51, 100),
+        ("sheet", 0, 768, 0, 50),
     ],
 )
-def test_the_verdict_warns_where_depth_is_drawn(scene, seed, width, said, tmp_path):
+def test_the_verdict_warns_where_depth_is_drawn(scene, seed, width, least, most, tmp_path):
     height = width * 109 // 256
     raw = {
         "input": {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height},
@@ -41,9 +34,9 @@ def test_the_verdict_warns_where_depth_is_drawn(scene, seed, width, said, tmp_pa
     # the start decides it
     case = prepare(make_problem(raw))
     done = make_run(case, skipped(case))
-    assert done.good != said
+    assert done.good == (most <= 50)
     share = re.search(r"(\d+)% of the image is drawn", verdict(done, tmp_path, []))
-    assert (share is not None and int(share[1]) > 50) == said
+    assert least <= (0 if share is None else int(share[1])) <= most
 
 
 # --- flow that is missing ------------------------------------------------------------------------
@@ -87,30 +80,3 @@ def test_a_masked_part_is_sane_and_the_rest_stays(problem, whole, kind):
     assert np.median(sigma[mask]) > 3 * np.median(sigma[~mask])
     wrong = mask & (error > 0.2)
     assert np.sum(sigma[wrong] < 0.1) <= 0.15 * wrong.sum()
-
-
-@pytest.fixture(scope="module")
-def tiles():
-    return squares(6, 8, side=20, neighbours=6)
-
-
-K = camera.intrinsics(150.0, 150.0, 80.0, 60.0)
-
-
-def turned(angle: float) -> np.ndarray:
-    """Flow of a camera that turns about its vertical axis, pixels."""
-    c, s = np.cos(angle), np.sin(angle)
-    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    uv = camera.pixel_grid(120, 160)
-    return camera.project(K, camera.rays(K, uv) @ R.T) - uv
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.02])
-def test_a_start_without_parallax_interpolates_depth_but_fits_flow(tiles, angle):
-    flow = Flow(turned(angle).astype(np.float32), np.ones((120, 160), np.float32), "turn")
-    start = propose(FlowFit.of(tiles, flow, K, K))
-    assert start.interpolated.all()
-    data = build_energy_data(tiles, flow, K, K)
-    error = oracle.values("proj", start.soup, data, Weights())
-    assert error.max() < 1e-3
-    np.testing.assert_allclose(error, start.error, atol=1e-3)

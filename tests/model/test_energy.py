@@ -247,6 +247,12 @@ def test_what_a_prior_decides_keeps_its_slopes_and_has_its_depths():
     cost = oracle.values("orient", soup, found, Weights())
     np.testing.assert_allclose(cost[held], 0.0, atol=1e-12)
     assert not found.orient_turn[~held].any()
+    # orientation is held where the prior decides; where the flow does nothing changes
+    steep = np.where(held, BENDING["orient"] * len(soup) / 1000, 1.0)
+    np.testing.assert_allclose(found.orient_weight, steep * data.orient_weight)
+    for some in (ambiguity, 0 * ambiguity):
+        known = of_scene(len(soup), prior=(log_depth, some, np.full(len(soup), 0.12)))
+        assert weighted(data, soup, known, EnergyOptions()).depth_weight.any() == some.any()
 
 
 def test_what_is_not_seen_keeps_the_relief_of_the_start():

@@ -46,7 +46,7 @@ def _wide(file: h5py.File) -> None:
 
 
 def _deep(group: h5py.Group) -> None:
-    for _ in range(3000):
+    for _ in range(1100):
         group = group.create_group("g")
 
 

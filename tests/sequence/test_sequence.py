@@ -367,23 +367,3 @@ def test_the_page_of_a_chain_opens(tmp_path):
         assert [r for r in browser.requests if not r.startswith("file:")] == []
     finally:
         browser.close()
-
-
-@pytest.mark.parametrize("kind", ["rows", "link of rows", "link of pairs"])
-def test_a_chain_does_not_write_into_what_is_the_users(kind, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(solving, "each", None)
-    out, mine = tmp_path / "out", tmp_path / "mine"
-    out.mkdir()
-    if kind == "rows":
-        (out / "pairs.jsonl").write_text("mine")
-    elif kind == "link of rows":
-        mine.write_text("mine")
-        (out / "pairs.jsonl").symlink_to(mine)
-    else:
-        mine.mkdir()
-        (out / "pairs").symlink_to(mine)
-    before = sorted(tmp_path.rglob("*"))
-    for more in ([], ["--overwrite"]):
-        assert main(["chain", "scene:street", "--frames", "3", "-o", str(out), "-q", *more]) == 2
-        assert str(out) in capsys.readouterr().err
-    assert sorted(tmp_path.rglob("*")) == before

@@ -71,6 +71,7 @@ def solve(nlp: NLP, **options) -> Stage:
 
 
 def test_hs071_is_solved_to_its_known_optimum():
+    """And KKT residuals are small there only."""
     nlp = hs071()
     stage = solve(nlp)
     assert stage.converged
@@ -80,12 +81,19 @@ def test_hs071_is_solved_to_its_known_optimum():
     # multipliers of the book, in CasADi's sign: negative at a lower bound
     np.testing.assert_allclose(stage.lam_g, [-0.55229366, 0.16146857], atol=1e-4)
     np.testing.assert_allclose(stage.lam_x, [-1.08787121, 0, 0, 0], atol=1e-4)
+    best = optimality(nlp, stage.x, stage.lam_x, stage.lam_g)
+    assert best["dual_infeasibility"] <= 1e-6
+    assert best["complementarity"] <= 1e-4  # mu_init is small but not zero
 
-    def residual(sign: int) -> float:
-        return max(optimality(nlp, stage.x, stage.lam_x, sign * stage.lam_g).values())
+    def residual(x=stage.x, lam_x=stage.lam_x, lam_g=stage.lam_g) -> float:
+        return max(optimality(nlp, x, lam_x, lam_g).values())
 
-    # mu_init is small but not zero
-    assert residual(1) <= 1e-4 < 0.1 < residual(-1)
+    assert residual(x=nlp.x0) > 1
+    assert residual(lam_g=0 * stage.lam_g) > 0.1
+    assert residual(lam_g=-stage.lam_g) > 0.1
+    assert residual(lam_x=0 * stage.lam_x) > 0.1
+    # a multiplier on an open bound is not complementary
+    assert residual(lam_x=stage.lam_x - [0, 0.5, 0, 0]) > 0.1
 
 
 def of_one_variable(f, g=None, x0: float = 1.0, **bounds: float) -> NLP:
@@ -248,43 +256,6 @@ def test_an_event_stops_and_keeps_the_best_iterate():
     assert len(seen) == 4
     assert stage.objective == min(seen)
     assert nlp.value(stage.x) == pytest.approx(stage.objective)
-
-
-def test_the_time_limit_stops_and_keeps_the_best_iterate():
-    nlp = rosenbrock(10)
-    stage = solve(nlp, seconds=0.0)
-    assert stage.status == "Time_Limit"
-    assert not stage.converged
-    assert np.isfinite(stage.x).all()
-    assert stage.iterations <= 1
-
-
-def test_a_listener_that_fails_ends_the_solve_with_its_message():
-    def listen(p: Progress) -> None:
-        raise ValueError("no more paper")
-
-    stage = solve(rosenbrock(10), watch=Watch(listen))
-    assert "no more paper" in stage.status
-    assert not stage.converged
-    assert np.isfinite(stage.x).all()
-
-
-def test_kkt_residuals_are_small_at_the_optimum_only():
-    nlp = hs071()
-    stage = solve(nlp)
-    best = optimality(nlp, stage.x, stage.lam_x, stage.lam_g)
-    assert best["dual_infeasibility"] <= 1e-6
-    assert best["complementarity"] <= 1e-4  # mu_init is small but not zero
-
-    def residual(x=stage.x, lam_x=stage.lam_x, lam_g=stage.lam_g) -> float:
-        return max(optimality(nlp, x, lam_x, lam_g).values())
-
-    assert residual(x=nlp.x0) > 1
-    assert residual(lam_g=0 * stage.lam_g) > 0.1
-    assert residual(lam_g=-stage.lam_g) > 0.1
-    assert residual(lam_x=0 * stage.lam_x) > 0.1
-    # a multiplier on an open bound is not complementary
-    assert residual(lam_x=stage.lam_x - [0, 0.5, 0, 0]) > 0.1
 
 
 def test_a_bound_beyond_the_optimum_is_active():

@@ -1,6 +1,5 @@
 """Soups solved: constraints, gauges, limits, interruption, a world whose truth is the optimum."""
 
-import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -25,7 +24,6 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
-from soup_nlp.model.kernel import HESSIANS
 from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.solve.ipopt import run_ipopt
@@ -34,7 +32,6 @@ from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import Solution, _near, solve_soup
 from soup_nlp.start.propose import propose
 from soup_nlp.start.views import FlowFit
-from soup_nlp.storage.progress import Watch
 
 pytestmark = pytest.mark.slow
 
@@ -230,20 +227,14 @@ def slanted() -> tuple[Soup, EnergyData]:
     return truth, in_pixels(data, truth, seg)
 
 
-@pytest.mark.parametrize(
-    ("gauge", "kind"),
-    [
-        *[(g, "gauss-newton+constraints") for g in GAUGES],
-        *[("unit-offset", h) for h in HESSIANS if h != "gauss-newton+constraints"],
-    ],
-)
-def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge, kind):
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_a_rigid_plane_is_recovered_from_a_disturbed_start(slanted, gauge):
     """E >= 0 and E = 0 at the truth: the optimum is known."""
     truth, data = slanted
     start = disturbed(truth, 0.05)
     weights = PAPER.replace(cont=0.05, prior=0.0, sigma_cont=np.inf, sigma_orient=0.5, proj=1.0)
     options = OPTIONS.replace(presolve_tol=1e-5, max_iter=200)
-    solution = solve_soup(start, data, weights, form(gauge=gauge, hessian=kind), options)
+    solution = solve_soup(start, data, weights, form(gauge=gauge), options)
     before, after = solution.energy_start["total"], solution.energy["total"]
     assert before > 10
     assert after < 1e-3 * before
@@ -302,13 +293,3 @@ def test_a_better_start_is_delivered_beside_the_presolves_kkt_point(room, solved
     assert again.delivered == "start"
     assert again.energy["total"] == pytest.approx(again.energy_start["total"], rel=1e-9)
     assert_constraints(again, room.data)
-
-
-def test_a_stop_before_the_start_gives_the_start(room):
-    stop = threading.Event()
-    stop.set()
-    solution = room.solve(watch=Watch(stop=stop))
-    assert solution.status == "Interrupted"
-    assert not solution.converged
-    assert_whole(solution, room)
-    assert solution.energy["total"] == pytest.approx(solution.energy_start["total"], rel=1e-3)

@@ -17,9 +17,9 @@ from soup_nlp.config.problem import Problem, load_problem, make_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluation.metrics import UNSCALED, depth_metrics
 from soup_nlp.geometry import rotation
-from soup_nlp.geometry.soup import reconstruct
+from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model.energy_options import BENDING_ARAP
-from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.case import prepare, solver_options
 from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import (
@@ -38,7 +38,6 @@ from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow
 
-SMALL = "segmentation.superpixels=150 flow.source=truth expected.mre_at_most=null"
 UNORDERED = "energy.weights.order=0"  # leaves out the order that occlusion shows
 
 
@@ -76,6 +75,7 @@ def test_sheet_bends_and_can_be_told_not_to():
         assert c.start.bending
         assert c.start.bends.all()
         assert c.data.arap_at_anchors
+    assert c.start.order is None
     assert (c.start.component == 0).all()
     np.testing.assert_allclose(c.soup.depth_at(c.data.anchor_ray), 1.0, rtol=1e-9)
     # occlusion shows the sheet before strips of the wall, which become components behind it
@@ -87,7 +87,7 @@ def test_sheet_bends_and_can_be_told_not_to():
     assert not case("sheet", "start.bending=false").start.bending
 
 
-@pytest.mark.parametrize("count", [60, 600])
+@pytest.mark.parametrize("count", [60, 300])
 @pytest.mark.parametrize(
     ("scene", "least", "most"), [("sheet", 0.9, 1), ("banner", 0.2, 0.4), ("street", 0, 0)]
 )
@@ -220,21 +220,22 @@ def test_depth_that_explains_the_flow_is_no_turn():
 )
 def test_bending_surfaces_have_a_narrower_presolve_of_two_strategies(scene, widths, overrides):
     """One strategy truncates E_arap from the start, the other at its end only."""
-    options = case(scene, *overrides).options
+    options = solver_options(problem(scene, *overrides), case(scene).start)
     assert options.presolve_eps == widths
     assert options.untruncated == (scene == "sheet")
 
 
 @pytest.mark.parametrize(
-    ("scene", "words", "most"),
-    [("sheet", "100% bending", {}), ("banner", "bending", {0: 0.04, 1: 0.12})],
+    ("scene", "count", "words", "most"),
+    [("sheet", 80, "100% bending", {}), ("banner", 150, "bending", {0: 0.04, 1: 0.12})],
 )
 def test_bending_regions_are_reconstructed_and_every_claim_holds(
-    tmp_path, capsys, scene, words, most
+    tmp_path, capsys, scene, count, words, most
 ):
     """Both kinds of regions are in one image; `most` limits the MRE of each component."""
     sized = " ".join(f"input.{key}={value}" for key, value in size(scene).items())
-    main(["solve", scene, "--out", str(tmp_path), "--no-refine", *sets(f"{SMALL} {sized}")])
+    sized += f" segmentation.superpixels={count} flow.source=truth expected.mre_at_most=null"
+    main(["solve", scene, "--out", str(tmp_path), "--no-refine", *sets(sized)])
     assert words in (tmp_path / "log.txt").read_text()
     assert main(["check", str(tmp_path)]) == 0, capsys.readouterr().out
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -253,10 +254,9 @@ def test_bending_regions_are_reconstructed_and_every_claim_holds(
         assert 1e-4 < depth_metrics(z, true_depth, UNSCALED).mre < limit
 
 
-def own_relief(c: Case) -> float:
+def own_relief(c: Case, soup: Soup) -> float:
     """Mean relative error of the sheet's depth in its own median scale."""
-    answer = solve_soup(c.soup, c.data, c.weights, c.formulation(), c.options)
-    z = reconstruct(answer.soup, c.segmentation.labels, c.pair.K_ref, c.pair.K_next).depth_ref
+    z = reconstruct(soup, c.segmentation.labels, c.pair.K_ref, c.pair.K_next).depth_ref
     gt = c.pair.truth.depth_ref
     return depth_metrics(z, np.where(c.pair.truth.components == 1, gt, np.nan)).mre
 
@@ -338,7 +338,8 @@ def test_noise_where_surfaces_bend_is_that_of_affine_flows():
 
 
 def test_the_order_by_occlusion_leaves_a_sheet_its_relief():
-    # without E_prior, which flattens relief
-    flat = "segmentation.superpixels=80", "energy.weights.prior=0.0"
-    c, ordered = case("sheet", *flat, UNORDERED), case("sheet", *flat)
-    assert own_relief(ordered) < 1.1 * own_relief(c)
+    # without E_prior, which flattens relief; with fewer superpixels nothing is ordered
+    c = case("sheet", "segmentation.superpixels=120", "energy.weights.prior=0.0")
+    assert c.data.order_weight.any()
+    answer = solve_soup(c.soup, c.data, c.weights, c.formulation(), c.options)
+    assert own_relief(c, answer.soup) < 0.1 * own_relief(c, c.soup)

@@ -63,7 +63,7 @@ def test_the_spread_of_relief_is_that_of_depths_under_random_motions():
     matches, _ = flow(0.3)
     motion, covariance = most_probable([TRUE], matches, 0.05)
     spread = relief_spread(motion, covariance, matches.ray, matches.target)
-    changes = np.random.default_rng(0).multivariate_normal(np.zeros(5), covariance, 1000)
+    changes = np.random.default_rng(0).multivariate_normal(np.zeros(5), covariance, 300)
     drawn = np.array([relief(around(motion)(x), matches.ray, matches.target) for x in changes])
     # the median of a draw is that of one of its points
     drawn = (drawn - drawn.mean(axis=1, keepdims=True)).std(axis=0)

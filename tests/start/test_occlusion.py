@@ -12,8 +12,6 @@ from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.model import oracle
-from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import run
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.regions import LEAST_ORDER, ORIGINS, covering, vote
@@ -147,10 +145,10 @@ def test_a_swinging_object_comes_before_the_wall(swing):
 OPTIONS = ("segmentation.superpixels=48", "segmentation.neighbours=6", "refine.enabled=false")
 
 
-def made(covers: bool, *options: str):
+def made(covers: bool):
     pair, _ = sliding(covers)
     raw = {"name": "sliding", "input": {"kind": "scene", "scene": "swing"}}
-    problem = make_problem(raw, [*OPTIONS, "segmentation.method=grid", *options], where="test")
+    problem = make_problem(raw, [*OPTIONS, "segmentation.method=grid"], where="test")
     return problem, pair
 
 
@@ -186,12 +184,3 @@ def test_an_image_without_discontinuities_keeps_its_start(swing):
     start, same = propose(fitted(still, seg)), ordered(seg, still)
     np.testing.assert_array_equal(same.soup.distance, start.soup.distance)
     assert same.order is None
-
-
-@pytest.mark.slow
-def test_without_its_weight_nothing_is_placed_in_order():
-    problem, pair = made(True, "energy.weights.order=0")
-    case = prepare(problem, pair=pair)
-    assert case.start.order is None
-    assert not case.data.order_weight.any()
-    assert "order" not in oracle.energy(case.soup, case.data, case.weights)
