@@ -68,7 +68,7 @@ class Confidence:
         spread: (H, W) standard deviation of log depth by the marginals, not calibrated.
         marginals: Marginal variances of the planes and of the components' scales.
         component_sigma: (C,) standard deviation of the components' log scale.
-        evidence: Evidence of the flow for the depth of every component.
+        evidence: Evidence of the flow for the camera.
         terms: (H, W) terms of sigma by name, without their factors, see `terms`.
         kind: (H, W) by what the depth is known, an index of `KINDS`.
     """
@@ -161,7 +161,7 @@ def terms(
         anchor_ray: (N, 3) rays through the anchors.
         spread: (H, W) standard deviation of log depth by the marginals.
         component: (C,) standard deviation of the components' mean log depth by the marginals.
-        sure: Evidence of the flow for the depth of the components.
+        sure: Evidence of the flow for the camera.
     """
     labels, noise, part = rec.labels, start.noise, start.component
     at = labels.ravel()
@@ -244,7 +244,7 @@ def confidence(
         )
         spread = np.full(labels.shape, np.inf)
     rigid = ~start.bends & (start.origin != FIXED) & (not start.at_rest)
-    sure = evidence(rec.soup, data, start.component, start.noise, pair.focal_sigma, rigid)
+    sure = evidence(rec.soup, data, start.component, pair.focal_sigma, rigid)
     component = np.sqrt(variances.component)
     known = terms(rec, pair.flow, start, data.anchor_ray, spread, component, sure)
     sigma = sigma_of(known)

@@ -11,6 +11,7 @@ from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.pipeline.record import Run
 from soup_nlp.start.camera_error import better_camera
 from soup_nlp.start.regions import FIXED, SCENE
+from soup_nlp.start.views import LEAST_PARALLAX_PX
 
 SAID = {
     "measured": "measured by parallax",
@@ -128,16 +129,10 @@ def _shift(run: Run, label: int, shift: Float) -> str:
     return f"by {size} {WAYS[axis][int(shift[axis] < 0)]}{sure}"
 
 
-def flow_words(run: Run) -> list[str]:
-    """Usable flow, and how well simpler explanations than depth fit it."""
-    sure, main = run.confidence.evidence, np.argmax(np.bincount(run.start.component))
+def flow_words(run: Run) -> str:
+    """Usable flow and its noise."""
     assert run.pair.flow is not None
-    usable = f"usable at {run.pair.flow.usable:.0%} of the pixels, noise {sure.noise:.2f} px"
-    errors = (
-        f"error of the largest component: {sure.turn[main]:.2f} px by a turn alone,"
-        f" {sure.constant[main]:.2f} px at a constant depth, {sure.solution[main]:.2f} px here"
-    )
-    return [usable, errors] if np.isfinite(sure.turn[main]) else [usable]
+    return f"usable at {run.pair.flow.usable:.0%} of the pixels, noise {run.start.noise:.2f} px"
 
 
 def hints(run: Run) -> list[str]:
@@ -166,7 +161,7 @@ def hints(run: Run) -> list[str]:
         out.append("frames closer in time" if fast else "a better flow (--flow)")
     elif length < SAME_PX and drawn > 0.5:
         out.append("frames farther apart in time: these two are nearly the same")
-    flat = share(sure.evidence.guess[start.component])
+    flat = share(start.parallax < LEAST_PARALLAX_PX)
     if flat > 0.5 or start.at_rest:
         out.append("frames between which the camera moves aside, not only turns or zooms")
     elif flat >= SHARE:

@@ -133,7 +133,7 @@ def _details(run: Run) -> dict[str, list[str]]:
         )
     energies = {"start": s.energy_start, "NLP": s.energy, "solution": run.energy}
     return {
-        "flow": flow_words(run),
+        "flow": [flow_words(run)],
         "solver": solver,
         "energy": [f"{name:<9} {_numbers(e, '.5g')}" for name, e in energies.items()],
         "residuals": [_numbers(run.residuals, ".1e")],

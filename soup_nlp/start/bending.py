@@ -93,13 +93,6 @@ def displaced(x: Float) -> Float:
     return np.concatenate([R, T], axis=-1)
 
 
-def at_one_depth(x: Float) -> Float:
-    """Matrices (..., 3, 3) that move rays as points at depth 1, by parameters of `displaced`."""
-    move = displaced(x)
-    # the third component of a ray is 1
-    return move[..., :3] + move[..., 3:] * np.array([0.0, 0.0, 1.0])
-
-
 CLIP_PX = 3.0
 """Limit of a superpixel's error where explanations are compared, pixels."""
 
@@ -144,17 +137,15 @@ def fit_robustly(
     return x @ free, miss(x).reshape(2, -1).T
 
 
-def fit_turn(
-    views: Views, size: int = PLAIN_TURN, matrix: Callable[[Float], Float] = turned
-) -> tuple[Float, Float]:
+def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
     """Rotation of the turn that explains a flow best, and (N,) mean error of that turn, pixels.
 
-    The first `size` parameters of the matrices (..., 3, 3), `turned` or `at_one_depth`, are free.
+    The first `size` parameters of `turned` are free.
     """
     ray, target, weight, _ = views.matches(2 * MOTION_PIXELS)
     scale = np.sqrt(weight)[:, None] * views.focal
-    x, _ = fit_robustly(matrix, size, ray, target[:, :2], scale)
-    return rotation.exp(x[:3]), views.distance(views.ray @ matrix(x).T)
+    x, _ = fit_robustly(turned, size, ray, target[:, :2], scale)
+    return rotation.exp(x[:3]), views.distance(views.ray @ turned(x).T)
 
 
 LEAST_SURFACE = 0.06

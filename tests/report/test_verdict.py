@@ -34,11 +34,9 @@ def unsure(run, sigma=1.2, **start):
     return replace(run, confidence=sure, start=replace(run.start, **start))
 
 
-def without_gap(run):
+def without_parallax(run):
     """A run whose flow a turn alone explains as well."""
-    none = np.zeros_like(run.confidence.evidence.turn)
-    evidence = replace(run.confidence.evidence, turn=none, constant=none, solution=none)
-    return replace(run, confidence=replace(run.confidence, evidence=evidence))
+    return replace(run, start=replace(run.start, parallax=np.zeros(len(run))))
 
 
 def told(run):
@@ -50,7 +48,7 @@ def test_hints_name_what_would_help(small_run):
     start, labels = small_run.start, small_run.segmentation.labels
     sure = unsure(small_run, 0.05)
     assert told(sure) == ""
-    flat = without_gap(small_run)
+    flat = without_parallax(small_run)
     assert "moves aside" in told(unsure(flat))
     assert told(unsure(flat, 0.05)) == ""
     tenth = np.where(np.arange(labels.size).reshape(labels.shape) < labels.size // 10, 1.2, 0.05)
@@ -88,7 +86,7 @@ def test_frames_without_a_common_scene_are_told_nothing_else(small_run):
     """Where hardly any flow is usable, its parallax, camera and motion are no evidence."""
     few = np.zeros_like(small_run.pair.flow.confidence)
     few[:5] = 1.0
-    nothing = without_gap(unsure(small_run))
+    nothing = without_parallax(unsure(small_run))
     for camera in (None, "zoom between the frames"):
         found = told(seen(nothing, few, 0.4, camera))
         assert found.endswith("closer in time: hardly anything is in both")
