@@ -32,8 +32,13 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
     "columns": (COLUMNS, []),
     "exponents": ("2.56e2 +257 1.595E+02 119.5", []),
     "4x4": ("256 0 159.5 0\n0 257 119.5 0\n0 0 1 0\n0 0 0 1", []),
+    "MATLAB": ("K = [256 0 159.5; 0 257 119.5; 0 0 1];  % pixels", []),
     "with distortion": ("256 257 159.5 119.5 0.1 -0.2 0 0.001 0.3", [0.1, -0.2, 0, 0.001, 0.3]),
     "names": (FOUR, []),
+    "equal signs": ("fx=256, fy=257, cx=159.5, cy=119.5", []),
+    "one row of names": ("fx 256 fy 257 cx 159.5 cy 119.5", []),
+    "head row": ("fx,fy,cx,cy\n256,257,159.5,119.5\n", []),
+    "INI": ("[camera]\nfx = 256\nfy = 257\ncx = 159.5\ncy = 119.5\nk1 = -0.3\n", [-0.3]),
     "twice the same": (FOUR + "fx: 256.0", []),
     "ROS 1": (
         f"image_width: 320\ncamera_name: a\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [{ROWS}]"
@@ -48,6 +53,12 @@ READ: dict[str, tuple[str | bytes, list[float]]] = {
         2 * "header:\n  stamp:\n    sec: 1\nk:\n- 256.0\n- 0.0\n- 159.5\n- 0.0\n- 257.0\n- 119.5\n"
         "- 0.0\n- 0.0\n- 1.0\nd: []\n---\n",
         [],
+    ),
+    "oST": (
+        "# oST version 5.0\n[image]\nwidth\n320\nheight\n240\n[narrow_stereo]\ncamera matrix\n"
+        "256 0 159.5\n0 257 119.5\n0 0 1\n\ndistortion\n-0.3 0.1 0 0 0\n\nrectification\n1 0 0\n"
+        "0 1 0\n0 0 1\n\nprojection\n250 0 160 0\n0 250 120 0\n0 0 1 0\n",
+        [-0.3, 0.1],
     ),
     "OpenCV": (
         "%YAML:1.0\n---\n" + opencv("camera_matrix", ROWS, 3)
@@ -124,12 +135,14 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
         ),
         r"2 cameras[\s\S]*Camera1: 256,256,159.5,119.5; Camera2: 300,[\s\S]*--intrinsics 256,256,",
     ),
-    "INI": ("[camera]\nfx = 256\nfy = 257\n", "not text of a known kind"),
-    "INI after a comment": ("# oST version 5.0\n[image]\nwidth\n320\n", "'image'"),
-    "MATLAB": ("K = [256 0 159.5; 0 257 119.5; 0 0 1];  % pixels", "'K'"),
-    "equal signs": ("fx=256, fy=257, cx=159.5, cy=119.5", "'fx=256'"),
-    "one row of names": ("fx 256 fy 257 cx 159.5 cy 119.5", "'fx'"),
-    "head row": ("fx,fy,cx,cy\n256,257,159.5,119.5\n", "'fx'"),
+    "two in INI": (
+        "[LEFT_CAM]\n" + FOUR.replace(":", "=") + "[RIGHT_CAM]\n" + FOUR.replace("256", "300"),
+        "2 cameras[\\s\\S]*LEFT_CAM: [\\s\\S]*RIGHT_CAM: ",
+    ),
+    "Middlebury": (
+        "cam0=[256 0 159.5; 0 257 119.5; 0 0 1]\ncam1=[256 0 190; 0 257 119.5; 0 0 1]\ndoffs=30",
+        r"2 cameras[\s\S]*cam0: [\s\S]*cam1: ",
+    ),
     "two of COLMAP": (
         "1 PINHOLE 320 240 256 257 160 120\n2 SIMPLE_PINHOLE 320 240 256 160 120",
         "2 cameras[\\s\\S]*camera 1: [\\s\\S]*camera 2: ",
@@ -165,12 +178,14 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "decimal commas without names": ("256,5 256,5 59,5 19,5", r"'256,5'[\s\S]*decimal comma"),
     "empty": ("fx:\nfy: 1\ncx: 1\ncy: 1", "fx is not one number"),
     "two points": (FOUR.replace("256", "1.2.3"), r"'1\.2\.3'"),
+    "a unit in lines": ("fx = 4.2 mm\nfy = 4.2 mm\ncx = 1\ncy = 1", "not one|not a number"),
     "two numbers": (FOUR.replace("256", "[256, 257]"), "fx is not one number"),
     "NaN distortion": (FOUR + "k1: .nan", "distortion k1 is unclear"),
     "NaN distortion without names": ("256 257 159.5 119.5 0.1 nan", "wrong number of values"),
     "infinite": (json.dumps({**GROUP, "fx": float("inf")}), "no camera matrix"),
     "negative": (json.dumps({**GROUP, "fx": -1}), "no camera matrix"),
     "half a camera": ("fx: 256\ncx: 1", "lacks fy and cy"),
+    "a field of view": ('{"camera_angle_x": 0.6911112070083618, "frames": []}', "--fov 39.60"),
     "no camera": ("width: 320\nheight: 240", r"no camera[\s\S]*width, height"),
     "damaged JSON": ('{"fx": 256, "fy": 257, "cx": 159.5, "cy"', "damaged JSON"),
     "nested deeply": ("[" * 100_000, "kind"),
@@ -178,7 +193,7 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "empty file": ("", "is empty"),
     "binary": (b"\x80\x04\x95\x00\x00", "not text"),
     "other .npy": (npy(np.ones(3)), "wrong number of values"),
-    "prose": ("the camera of my phone", r"'the'[\s\S]*the four numbers: --intrinsics FX"),
+    "prose": ("the camera of my phone", "no camera"),
 }
 
 

@@ -30,8 +30,8 @@ DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of distortion in OpenCV's order; up to six more have no common names."""
 
 _EXPECTED = (
-    "one pinhole camera in pixels: fx fy cx cy or a 3x3 matrix, as numbers (text, .npy) or with"
-    " names (YAML, JSON, .npz, COLMAP's cameras.txt), with distortion k1 k2 p1 p2 k3 ... or without"
+    "one pinhole camera in pixels: fx fy cx cy or a 3x3 matrix, as numbers or with names (text,"
+    " YAML, JSON, INI, .npy, COLMAP's cameras.txt), with distortion k1 k2 p1 p2 k3 ... or without"
 )
 _FOUR = "give the four numbers: --intrinsics FX,FY,CX,CY, in Python K_ref=(fx, fy, cx, cy)"
 _UNDISTORT = "undistort the images first, and give the camera of the new images"
@@ -172,7 +172,13 @@ def read_camera(path: PathLike) -> tuple[Float, Float]:
         )
     if not cameras:
         shown = ", ".join(name for name, _ in named[:12]) or "nothing"
-        raise refused("camera file holds no camera", path, shown)
+        angles = [words[0] for name, words in named if words and name.endswith("camera_angle_x")]
+        hint = _FOUR
+        if angles and re.fullmatch(r"\d*\.\d+", angles[0]):
+            # NeRF's, in radians
+            degrees = math.degrees(float(angles[0]))
+            hint = f"camera_angle_x is a field of view: --fov {degrees:.2f}"
+        raise refused("camera file holds no camera", path, shown, hint)
     return check_intrinsics(cameras[0][1], path), distortion
 
 

@@ -1,4 +1,4 @@
-"""Names and words of a camera file: JSON, YAML, COLMAP's rows, plain numbers, NumPy arrays.
+"""Names and words of a camera file: JSON, YAML, INI, lines of names and numbers, NumPy arrays.
 
 Nothing is interpreted here: a word is a number only for `camera_files`, and a name that occurs
 twice stays twice. In trees a mapping is a tuple of its pairs.
@@ -17,6 +17,8 @@ from soup_nlp.storage.files import MOST_TEXT, PathLike, compose_yaml, read_bytes
 Named: TypeAlias = list[tuple[str, list[str]]]
 """Names such as "cam0.intrinsics", empty for none, and the words of their values."""
 
+_SECTION = re.compile(r"\s*\[([^\[\],]*[A-Za-z][^\[\],]*)\]\s*")
+_LIKE_NUMBER = re.compile(r"[-+.\d]|(?:nan|inf)\b", re.IGNORECASE)
 _COLMAP_ROW = re.compile(r"(\d+)\s+([A-Z][A-Z_]+)\s+\d+\s+\d+\s+(.*)")
 _COLMAP = {
     "SIMPLE_PINHOLE": "f cx cy",
@@ -39,8 +41,9 @@ def named_words(path: PathLike) -> Named:
     text = content.decode("utf-16" if utf16 else "utf-8-sig")
     if "\0" in text or text.lstrip().startswith("<"):
         raise ValueError("XML" if text.lstrip().startswith("<") else "binary content")
+    brackets = text.lstrip().startswith(("{", "[")) and not _SECTION.match(text)
     try:
-        tree = _json(text) if text.lstrip().startswith(("{", "[")) else _yaml(text)
+        tree = _json(text) if brackets else _yaml(text)
         return list(_lines(text) if tree is None else _leaves(tree))
     except RecursionError:
         raise ValueError("brackets are nested too deeply") from None
@@ -103,16 +106,33 @@ def words_of(text: str) -> list[str]:
 
 
 def _lines(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Rows of COLMAP's cameras.txt, or plain numbers, which have no name."""
-    numbers: list[str] = []
+    """Values of lines such as `fx: 500`, `fx 500 fy 500`, names above their numbers, numbers."""
+    found: list[tuple[str, list[str], list[str]]] = [("", [], [])]
+    section = ""
     for line in text.splitlines():
         line = re.sub(r"(?:#|//|%).*", "", line).strip()
-        if row := _COLMAP_ROW.fullmatch(line):
+        if head := _SECTION.fullmatch(line):
+            section = f"{head.group(1)}."
+            found.append((section, [], []))
+        elif row := _COLMAP_ROW.fullmatch(line):
             yield from _colmap(row[1], row[2], words_of(row[3]))
         else:
-            numbers += words_of(line)
-    if numbers:
-        yield "", numbers
+            words = words_of(re.sub(r"[:=]", " ", line))
+            last = max((k for k, word in enumerate(words) if _LIKE_NUMBER.match(word)), default=-1)
+            for k, word in enumerate(words):
+                _, names, values = found[-1]
+                # a unit behind the last number belongs to the value
+                if (k <= last and _LIKE_NUMBER.match(word)) or 0 <= last < k:
+                    values.append(word)
+                elif values or (names and k == 0):
+                    found.append((section, [word], []))
+                else:
+                    names.append(word)
+    for section, names, values in found:
+        if len(names) > 1 and len(names) == len(values):
+            yield from ((section + name, [value]) for name, value in zip(names, values))
+        elif names or values:
+            yield (section + "_".join(names)).rstrip("."), values
 
 
 def _colmap(camera: str, model: str, words: list[str]) -> Iterator[tuple[str, list[str]]]:
