@@ -196,7 +196,7 @@ CHAINS: dict[str, Any] = {
     "scene with stride": "chain scene:orbit --stride=2 -o {out}",
     "scene with camera": "chain scene:orbit --fov=50 -o {out}",
     "images of two sizes": clip(sizes=(SIZE, (48, 80))),
-    "images too small": clip(sizes=((8, 8),)),
+    "images too small": clip(sizes=((2, 2),)),
     "superscripts": clip("1²3.png", "1²4.png", options="--fov=400"),
     "images that are folders": beside("frame_1.png", lambda p: (p.unlink(), p.mkdir())),
     "camera is a folder": beside("K.txt", Path.mkdir),
