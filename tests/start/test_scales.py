@@ -65,31 +65,6 @@ def test_a_row_is_a_weighted_quantile():
         np.testing.assert_allclose(x[1], expected, atol=1e-9)
 
 
-def test_what_stands_on_the_ground_has_its_depth():
-    z = np.array([[8.0] * 5, [8.0] * 5, [8.0] * 5, [2.0] * 5])
-    log_scale, origin = found(z, STANDS)
-    assert origin == "contact below"
-    np.testing.assert_allclose(log_scale, np.log(2), rtol=1e-6)
-
-
-def test_what_is_before_a_wall_is_not_behind_it():
-    z = np.array([[4.0] * 5, [4.0] * 5, [4.0] * 5])
-    log_scale, origin = found(z, HANGS[:3], upright=False)
-    assert origin == "outline"
-    np.testing.assert_allclose(log_scale, np.log(4), rtol=1e-6)
-
-
-def test_what_contact_would_make_too_fast_moves_little_farther_than_the_scene():
-    """It touches the wall, where it would move eight times as far as the scene."""
-    wall = np.full((4, 5), 8.0)
-    log_scale, origin = found(wall, CUT_OFF, far=1.0)
-    assert origin == "too fast"
-    np.testing.assert_allclose(log_scale, FREE_DISPLACEMENT, atol=1e-6)
-    log_scale, origin = found(wall, HANGS, far=1e-3)
-    assert origin == "contact below"
-    np.testing.assert_allclose(log_scale, np.log(8), rtol=1e-6)
-
-
 def test_what_is_too_fast_covers_all_that_it_touches():
     label = np.ravel(CUT_OFF)
     flow = flow_of(squares(4, 5), K=K)
@@ -107,20 +82,45 @@ def covers(label, seg):
     return 0.9 * (ends[:, 1] - ends[:, 0])
 
 
-def test_what_covers_is_in_front_of_all_but_what_it_stands_on():
-    wall = np.full((4, 5), 8.0)
-    log_scale, origin = found(wall, HANGS, far=1e-3, order=covers, upright=False)
-    assert origin == "occlusion"
-    np.testing.assert_allclose(log_scale, np.log(8) - LEAST_STEP_IN_FRONT, rtol=1e-6)
-    wall[-1] = 4.0
-    log_scale, origin = found(wall, STANDS, far=1e-3, order=covers)
-    assert origin == "contact below"
-    np.testing.assert_allclose(log_scale, np.log(4), rtol=1e-6)
+def wall(*floor, rows=4):
+    """Depth 8 everywhere but in the lowest rows, of these depths."""
+    return np.repeat([8.0] * (rows - len(floor)) + [*floor], 5).reshape(rows, 5)
 
 
-@pytest.mark.parametrize(("floor", "expected"), [(0.0, np.log(8)), (0.25, np.log(4))])
-def test_nothing_is_below_the_ground(floor, expected):
-    """The ground is at depth 4 everywhere, or unknown."""
-    log_scale, origin = found(np.full((4, 5), 8.0), HANGS, far=1e-3, floor=floor)
-    assert origin == ("ground" if floor else "contact below")
-    np.testing.assert_allclose(log_scale, expected, rtol=1e-6)
+SLOW = {"far": 1e-3}
+"""Moves hardly at all beside the scene."""
+
+
+@pytest.mark.parametrize(
+    ("z", "component", "options", "origin", "expected"),
+    [
+        pytest.param(wall(2.0), STANDS, {}, "contact below", np.log(2), id="stands on the ground"),
+        pytest.param(
+            np.full((3, 5), 4.0), HANGS[:3], {"upright": False},
+            "outline", np.log(4), id="before a wall, not behind it",
+        ),
+        # by contact with the wall it would move eight times as far as the scene
+        pytest.param(
+            wall(), CUT_OFF, {"far": 1.0},
+            "too fast", FREE_DISPLACEMENT, id="moves little farther than the scene",
+        ),
+        pytest.param(wall(), HANGS, SLOW, "contact below", np.log(8), id="slow, ground unknown"),
+        pytest.param(
+            wall(), HANGS, {**SLOW, "order": covers, "upright": False},
+            "occlusion", np.log(8) - LEAST_STEP_IN_FRONT, id="before all that it covers",
+        ),
+        pytest.param(
+            wall(4.0), STANDS, {**SLOW, "order": covers},
+            "contact below", np.log(4), id="before all but what it stands on",
+        ),
+        # the ground is at depth 4 everywhere
+        pytest.param(
+            wall(), HANGS, {**SLOW, "floor": 0.25}, "ground", np.log(4), id="not below the ground",
+        ),
+    ],
+)  # fmt: skip
+def test_what_decides_a_scale(z, component, options, origin, expected):
+    log_scale, found_origin = found(z, component, **options)
+    assert found_origin == origin
+    # displacements are limited up to 1e-6
+    np.testing.assert_allclose(log_scale, expected, rtol=1e-6, atol=1e-6 * (origin == "too fast"))
