@@ -10,7 +10,7 @@ import yaml
 
 from benchmarks.paper import printed
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import Problem, dump_problem, load_problem, make_problem
+from soup_nlp.config.problem import Problem, load_problem, make_problem
 from soup_nlp.config.trees import PRESETS
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
@@ -81,15 +81,6 @@ def test_keys_of_the_file_and_overrides_lie_above_the_preset(tmp_path):
     assert (problem.refine.rounds, problem.refine.particles) == (7, 50)
     assert (problem.energy.units, problem.start.method) == ("pixel", "homography")
     assert load_problem(path, ["preset=null"]).refine == Problem(input=problem.input).refine
-
-
-def test_a_dumped_preset_is_the_same_problem(tmp_path):
-    problem = paper()
-    (tmp_path / "again.yaml").write_text(dump_problem(problem))
-    assert load_problem(tmp_path / "again.yaml") == problem
-    bare = dump_problem(problem).replace("preset: paper", "preset: null")
-    (tmp_path / "bare.yaml").write_text(bare)
-    assert load_problem(tmp_path / "bare.yaml").digest() == problem.digest()
 
 
 @pytest.fixture(scope="module")

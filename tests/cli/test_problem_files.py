@@ -22,14 +22,19 @@ def test_every_shipped_problem_is_one():
     assert all(load_problem(path) for path in PROBLEMS)
 
 
+@pytest.mark.parametrize("preset", ["null", "paper"])
 @pytest.mark.parametrize("path", PROBLEMS[::4], ids=lambda path: path.stem)
-def test_a_dumped_problem_is_the_same_problem(path, tmp_path, capsys):
-    problem = load_problem(path)
+def test_a_dumped_problem_is_the_same_problem(path, preset, tmp_path, capsys):
+    problem = load_problem(path, [f"preset={preset}"])
     text = dump_problem(problem)
-    assert main(["show", str(path)]) == 0
+    assert main(["show", str(path), "--set", f"preset={preset}"]) == 0
     for shown in (text, capsys.readouterr().out):
         (tmp_path / "again.yaml").write_text(shown)
         assert load_problem(tmp_path / "again.yaml") == problem
+    # all keys are there, so the name of the preset adds nothing
+    assert f"preset: {preset}" in text
+    (tmp_path / "bare.yaml").write_text(text.replace(f"preset: {preset}", "preset: null"))
+    assert load_problem(tmp_path / "bare.yaml").digest() == problem.digest()
     # other readers of YAML understand it too, and every key has its comment
     assert yaml.safe_load(text)["segmentation"]["superpixels"] == problem.segmentation.superpixels
     assert all("  # " in line for line in text.splitlines())

@@ -1,18 +1,21 @@
 """report.html in a real browser: it loads, draws, moves and recolours."""
 
 import base64
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
 from helpers_chromium import Chromium, find_chromium
+from helpers_result import toy_pairs
 
 from soup_nlp.report.chain import Chain
 from soup_nlp.report.page import MODES, page
 from soup_nlp.report.result import result_of
 from soup_nlp.report.verdict import summary
+from soup_nlp.sequence.folder import write_chain
+from soup_nlp.sequence.links import make_chain
 
 CHROMIUM = find_chromium()
 pytestmark = [
@@ -175,3 +178,28 @@ def test_a_console_error_would_be_seen(browser):
     assert "planted" in browser.log[0]
     assert "thrown" in browser.log[1]
     browser.log.clear()
+
+
+def test_the_page_of_a_chain_opens(opened, tmp_path):
+    chain = make_chain(toy_pairs())
+    write_chain(tmp_path, chain, "toy & co", ["a.png", "b.png", "<b>c.png"])
+    before = len(opened.requests)
+    opened.open((tmp_path / "report.html").as_uri())
+    assert opened.value("document.querySelector('h1').textContent") == "toy & co"
+    shots = []
+    for time in (0, 1.5, 2):
+        opened.value(f"soupView.setTime({time})")
+        shots.append(opened.screenshot())
+        assert opened.value("document.querySelector('#gallery img').naturalWidth") == 80
+    assert all((a != b).mean() > 0.01 for a, b in pairwise(shots))
+    now = "document.getElementById('now').textContent"
+    assert opened.value(now) == "<b>c.png, time 2 of 2; 0 % drawn"
+    # the other pair adds its static points to what is shown and saved
+    size, alone = "soupView.ply().size", opened.value("soupView.ply().size")
+    opened.value("document.getElementById('all').click()")
+    opened.wait(f"{size} > 1.5 * {alone}")
+    assert "b.png, pixel (40, 30)" in opened.value(
+        "soupView.tell(80 * 30 + 40), document.getElementById('picked').textContent"
+    )
+    assert opened.log == []
+    assert [r for r in opened.requests[before:] if not r.startswith("file:")] == []

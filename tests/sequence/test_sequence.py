@@ -2,12 +2,10 @@
 
 import json
 from dataclasses import replace
-from itertools import pairwise
 
 import cv2
 import numpy as np
 import pytest
-from helpers_chromium import Chromium, find_chromium
 from helpers_files import sets
 from helpers_result import CAMERA, CERTAINTY, toy_pairs
 
@@ -337,33 +335,3 @@ def test_a_chain_takes_the_keys_of_a_pair_and_files_of_every_pair(tmp_path):
             soup_nlp.chain(source, tmp_path / "more", intrinsics=camera, **{**keys, **more})
     with pytest.raises(ConfigError, match="superpixel"):
         soup_nlp.chain(source, tmp_path / "more", segmentation={"superpixel": 9})
-
-
-def test_the_page_of_a_chain_opens(tmp_path):
-    chromium = find_chromium()
-    if chromium is None:
-        pytest.skip("no Chromium is installed")
-    write_chain(tmp_path, make_chain(toy_pairs()), "toy & co", ["a.png", "b.png", "<b>c.png"])
-    browser = Chromium(chromium, 1000, 700)
-    try:
-        browser.open((tmp_path / "report.html").as_uri())
-        assert browser.value("document.querySelector('h1').textContent") == "toy & co"
-        shots = []
-        for time in (0, 1.5, 2):
-            browser.value(f"soupView.setTime({time})")
-            shots.append(browser.screenshot())
-            assert browser.value("document.querySelector('#gallery img').naturalWidth") == 80
-        assert all((a != b).mean() > 0.01 for a, b in pairwise(shots))
-        now = "document.getElementById('now').textContent"
-        assert browser.value(now) == "<b>c.png, time 2 of 2; 0 % drawn"
-        # the other pair adds its static points to what is shown and saved
-        size, alone = "soupView.ply().size", browser.value("soupView.ply().size")
-        browser.value("document.getElementById('all').click()")
-        browser.wait(f"{size} > 1.5 * {alone}")
-        assert "b.png, pixel (40, 30)" in browser.value(
-            "soupView.tell(80 * 30 + 40), document.getElementById('picked').textContent"
-        )
-        assert browser.log == []
-        assert [r for r in browser.requests if not r.startswith("file:")] == []
-    finally:
-        browser.close()

@@ -47,17 +47,6 @@ def lift(flow, Z, reliable, component):
     return soup
 
 
-def test_unknown_depth_comes_up_to_the_road(flow):
-    ray, Z = flow.views.anchor, street(flow)
-    lost = (ray[:, 1] > 0.2) & (ray[:, 0] > 0.5)
-    assert 0.02 < lost.mean() < 0.2
-    depth = np.where(lost, 40.0, Z)
-    soup = lift(flow, depth, ~lost, SCENE)
-    np.testing.assert_allclose(soup.depth_at(ray), Z, rtol=1e-9)
-    # the scene keeps its motion
-    np.testing.assert_allclose(soup.translation, moving(depth).translation, rtol=1e-12)
-
-
 @pytest.mark.parametrize("why", ["below", "steep", "nothing level"])
 def test_without_a_ground_nothing_moves(flow, why):
     ray, Z = flow.views.anchor, street(flow)
@@ -71,21 +60,27 @@ def test_without_a_ground_nothing_moves(flow, why):
     assert (ground(flow, 1 / Z, ALL) == 0).all()
 
 
-def test_reliable_depth_stays_below(flow):
-    """A ditch with reliable depth is kept."""
+@pytest.mark.parametrize(
+    ("where", "least", "most", "depth", "known", "lifted"),
+    [
+        # unknown depth comes up to the road
+        (lambda x, y: (y > 0.2) & (x > 0.5), 0.02, 0.2, lambda Z: 40.0, False, True),
+        # a ditch with reliable depth is kept
+        (lambda x, y: (y > 0.3) & (np.abs(x) < 0.1), 0, 0.05, lambda Z: 1.5 * Z, True, False),
+        # reliable depth that differs from one superpixel to the next is wrong
+        (
+            lambda x, y: (y > 0.25) & (np.abs(x) < 0.2), 0.05, 0.2,
+            lambda Z: np.random.default_rng(0).uniform(1.5, 20, len(Z)) * Z, True, True,
+        ),
+    ],
+    ids=["unknown", "ditch", "wrong flow"],
+)  # fmt: skip
+def test_what_is_below_the_road_is_lifted(flow, where, least, most, depth, known, lifted):
     ray, Z = flow.views.anchor, street(flow)
-    ditch = (ray[:, 1] > 0.3) & (np.abs(ray[:, 0]) < 0.1)
-    assert 0 < ditch.mean() < 0.05
-    depth = np.where(ditch, 1.5 * Z, Z)
-    soup = lift(flow, depth, ALL, SCENE)
-    np.testing.assert_allclose(soup.depth_at(ray), depth, rtol=1e-12)
-
-
-def test_wrong_flow_below_the_road_is_lifted(flow):
-    """Its depth is reliable, but differs from one superpixel to the next."""
-    ray, Z = flow.views.anchor, street(flow)
-    wrong = (ray[:, 1] > 0.25) & (np.abs(ray[:, 0]) < 0.2)
-    assert 0.05 < wrong.mean() < 0.2
-    far = np.random.default_rng(0).uniform(1.5, 20, len(Z))
-    soup = lift(flow, np.where(wrong, far * Z, Z), ALL, SCENE)
-    np.testing.assert_allclose(soup.depth_at(ray), Z, rtol=1e-9)
+    part = where(ray[:, 0], ray[:, 1])
+    assert least < part.mean() < most
+    below = np.where(part, depth(Z), Z)
+    soup = lift(flow, below, ALL if known else ~part, SCENE)
+    np.testing.assert_allclose(soup.depth_at(ray), *((Z, 1e-9) if lifted else (below, 1e-12)))
+    # the scene keeps its motion
+    np.testing.assert_allclose(soup.translation, moving(below).translation, rtol=1e-12)
