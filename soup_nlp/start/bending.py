@@ -21,12 +21,13 @@ from soup_nlp.start.labelling import (
     LEAST_GAP_PX,
     LEAST_SHARED,
     MOTION_PIXELS,
+    PIECE_SIZE,
     Labelling,
     candidates,
     dominant,
 )
-from soup_nlp.start.regions import connected_pieces
-from soup_nlp.start.views import FlowFit, Views
+from soup_nlp.start.regions import connected_labels, connected_pieces, numbered
+from soup_nlp.start.views import JUMP_PX, FlowFit, Views
 
 REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
@@ -146,6 +147,15 @@ def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:
     scale = np.sqrt(weight)[:, None] * views.focal
     x, _ = fit_robustly(turned, size, ray, target[:, :2], scale)
     return rotation.exp(x[:3]), views.distance(views.ray @ turned(x).T)
+
+
+def moving_pieces(flow: FlowFit) -> Int:
+    """(N,) connected piece of what moves before a camera that turns at most; 0 is what the turn
+    explains, and pieces with too few superpixels whose flow is usable."""
+    still = fit_turn(flow.views)[1] < JUMP_PX
+    piece = connected_labels(~flow.seg.across(still) & (flow.jump < JUMP_PX), flow.seg)
+    still |= np.bincount(piece, flow.views.usable)[piece] < PIECE_SIZE
+    return numbered(np.where(still, -1, piece))
 
 
 LEAST_SURFACE = 0.06

@@ -13,6 +13,7 @@ from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import (
     constant_depth,
     discontinuous,
+    moving_pieces,
     surface_motions,
     turn_alone,
 )
@@ -194,7 +195,8 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         start = replace(
             start, surface=surface, bends=every, unexplained=jumping, at_rest=turn is not None
         )
-        return _ordered(flow, start, _scene_first(surface), contrast)
+        part = _scene_first(surface) if turn is None else moving_pieces(flow)
+        return _ordered(flow, start, part, contrast)
     choice, covariance = with_least_relief(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
     soup, interpolated = _with_depth(rigid, choice, wrong)

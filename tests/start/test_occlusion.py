@@ -175,6 +175,13 @@ def test_what_moves_before_a_resting_camera_is_a_part_without_an_order_too():
     assert not start.component.any()
     np.testing.assert_array_equal(start.part > 0, moves)
     assert len(np.unique(start.part)) == 3
+    # a piece of flow that is hardly usable need not move
+    left = np.arange(WIDTH) < WIDTH / 2
+    doubtful = np.where((pair.flow.uv[..., 0] != 0) & left, 0.3, 1.0)
+    pair = pair.with_flow(Flow(pair.flow.uv, doubtful))
+    start = propose(fitted(pair, seg))
+    assert start.at_rest
+    np.testing.assert_array_equal(start.part > 0, moves & (seg.anchors[:, 0] > WIDTH / 2))
 
 
 @pytest.mark.slow
