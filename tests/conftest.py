@@ -64,6 +64,22 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return None
 
 
+SLOWEST = (
+    *("test_batches", "test_bending", "test_walkthrough", "test_sequence", "test_stop"),
+    *("test_given_depth", "test_odd_inputs", "test_family", "test_symbolic", "test_stored_json"),
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Several workers take files in their order here, not those of many tests first."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The slowest files come first, so that no worker has one left at the end."""
+    items.sort(key=lambda item: item.path.stem not in SLOWEST)
+
+
 def pytest_collection_finish() -> None:
     """Modules and test items live to the end: the collector need not visit them again.
 

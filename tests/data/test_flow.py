@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from helpers_files import raises, write_flo, write_kitti_flow
+from helpers_files import grey_texture, raises, write_flo, write_kitti_flow
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,15 +25,9 @@ from soup_nlp.data.pair import Flow, Pair, Truth
 K = np.array([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
 
 
-def texture(height: int, width: int, seed: int = 0) -> np.ndarray:
-    noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
-    smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
-    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-
-
 def shifted(height: int, width: int, du: int, dv: int) -> tuple[np.ndarray, np.ndarray]:
     """Two windows of one texture; a pixel of the first is at (u + du, v + dv) in the second."""
-    big = texture(height + 40, width + 40)
+    big = grey_texture(height + 40, width + 40)
     first = big[20 : 20 + height, 20 : 20 + width]
     second = big[20 - dv : 20 - dv + height, 20 - du : 20 - du + width]
     return np.dstack([first] * 3), np.dstack([second] * 3)
@@ -77,7 +71,7 @@ def test_dis_survives_a_change_of_exposure(gain: float, offset: float) -> None:
 @pytest.mark.parametrize("level", [0, 7, 255])
 def test_dis_without_contrast(level: int) -> None:
     flat = np.full((40, 50, 3), level, np.uint8)
-    for a, b in ((flat, flat), (flat, np.dstack([texture(40, 50)] * 3))):
+    for a, b in ((flat, flat), (flat, np.dstack([grey_texture(40, 50)] * 3))):
         flow = dis_flow(a, b)
         assert not flow.uv.any()
         assert not flow.confidence.any()
@@ -86,7 +80,7 @@ def test_dis_without_contrast(level: int) -> None:
 def test_dis_confidence_drops_where_nothing_matches() -> None:
     first, second = shifted(90, 120, 4, -2)
     second = second.copy()
-    second[30:60, 40:80] = np.dstack([texture(30, 40, seed=5)] * 3)
+    second[30:60, 40:80] = np.dstack([grey_texture(30, 40, seed=5)] * 3)
     flow, alike = dis_flow(first, second), dis_flow(first, second, consistency=False)
     assert flow.confidence[35:55, 45:70].mean() < 0.7 * flow.confidence[65:85, 20:100].mean()
     # without consistency, all vectors within the image have the same weight
@@ -207,7 +201,7 @@ def truth(H: np.ndarray) -> np.ndarray:
 
 
 def images(H: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    first = np.ascontiguousarray(np.dstack([texture(HEIGHT, WIDTH, seed=2)] * 3))
+    first = np.ascontiguousarray(np.dstack([grey_texture(HEIGHT, WIDTH, seed=2)] * 3))
     return first, cv2.warpPerspective(first, H, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
 
 

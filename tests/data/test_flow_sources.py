@@ -6,8 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers_files import write_flo
-from test_flow import texture
+from helpers_files import grey_texture, write_flo
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.dis import dis_flow
@@ -226,7 +225,7 @@ def given(pair: Pair, still: bool, source: str = "dis") -> Pair:
 def covered(image: np.ndarray) -> np.ndarray:
     """The image with a reflection of more contrast than the road."""
     out = image.astype(float)
-    layer = texture(HEIGHT, WIDTH, seed=5)[..., None]
+    layer = grey_texture(HEIGHT, WIDTH, seed=5)[..., None]
     out[BEHIND] = 0.5 * out[BEHIND] + 0.5 * layer[BEHIND]
     return np.rint(out).astype(np.uint8)
 
@@ -243,7 +242,7 @@ def reflecting(street: Pair) -> Pair:
 
 
 def test_a_static_layer_is_removed_from_the_images():
-    layer, other = (np.dstack([texture(60, 80, seed)] * 3) for seed in (0, 1))
+    layer, other = (np.dstack([grey_texture(60, 80, seed)] * 3) for seed in (0, 1))
     for image in without_still_layer(layer, layer):
         assert image.std() == 0
     for image, original in zip(without_still_layer(layer, other), (layer, other)):

@@ -92,6 +92,12 @@ def texture(width: int = 96, height: int = 64, seed: int = 0) -> np.ndarray:
     return np.asarray(cv2.GaussianBlur(noise, (0, 0), 1.5))
 
 
+def grey_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(size=(height, width)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
 def photo(path: Path, image: np.ndarray | None = None, turned: int = 1, **tags: float) -> Path:
     """A picture with EXIF; `tags` are those of the camera."""
     picture = Image.fromarray(texture() if image is None else image)

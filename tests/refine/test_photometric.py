@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from helpers_files import grey_texture
 
 from soup_nlp.data.census import census, census_at
 from soup_nlp.data.pair import Flow, Pair
@@ -33,12 +33,6 @@ NEAR, FAR, SHIFT = 1.0, 2.0, 0.1  # the near half moves by 8 px, the far one by 
 OPTIONS = RefineOptions(rounds=3, particles=20, photo=10.0)
 
 
-def texture(height: int, width: int, seed: int) -> np.ndarray:
-    noise = np.random.default_rng(seed).standard_normal((height, width))
-    grey = cv2.GaussianBlur(noise, (0, 0), 1.5)
-    return np.clip(128 + 50 * grey / grey.std(), 0, 255)
-
-
 class TwoPlanes:
     """A near plane on the right hides a strip of the far one; the camera moves to the left.
 
@@ -47,7 +41,7 @@ class TwoPlanes:
     """
 
     def __init__(self) -> None:
-        back, front = texture(HEIGHT, WIDTH, 1), texture(HEIGHT, WIDTH, 2)
+        back, front = grey_texture(HEIGHT, WIDTH, 1), grey_texture(HEIGHT, WIDTH, 2)
         ref, nxt = back.copy(), np.roll(back, 4, axis=1)
         ref[:, 48:] = front[:, 48:]
         nxt[:, 56:] = front[:, 48:-8]
@@ -87,7 +81,7 @@ def scene() -> TwoPlanes:
 
 
 def test_census_sees_structure_and_no_exposure():
-    image = texture(40, 50, 0).astype(np.uint8) // 2 + 40
+    image = grey_texture(40, 50) // 2 + 40
     assert np.abs(census(np.full((40, 50), 90, np.uint8))).max() == 0
     np.testing.assert_allclose(census(image + 60), census(image), atol=1e-5)
     assert np.abs(census(image)).mean() > 0.2
@@ -96,7 +90,7 @@ def test_census_sees_structure_and_no_exposure():
 
 
 def test_census_between_pixels_is_linear():
-    layers = census(texture(40, 50, 0).astype(np.uint8))
+    layers = census(grey_texture(40, 50))
     v, u = np.mgrid[0:40, 0:49].astype(np.float32)
     np.testing.assert_allclose(census_at(layers, u, v), layers[:, :, :49], atol=1e-6)
     middle = (layers[:, :, :49] + layers[:, :, 1:]) / 2
