@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 SMALL = sets(
     "input.width=96 input.height=72 flow.source=truth segmentation.superpixels=12"
-    " segmentation.neighbours=4 refine.enabled=false"
+    " segmentation.neighbours=4 refine.enabled=false solver.presolve_eps=[0.3]"
 )
 
 
