@@ -20,10 +20,11 @@ def value(name, channels):
     return h.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, channels, "H", "W"])
 
 
-def save(path, nodes, inputs, output, weights):
+def save(path, nodes, inputs, output, weights, **properties):
     """Check a network and write it."""
     graph = h.make_graph(nodes, "example", inputs, [output], weights)
     model = h.make_model(graph, opset_imports=[h.make_opsetid("", 13)], ir_version=8)
+    h.set_model_props(model, properties)
     onnx.checker.check_model(model)
     onnx.save(model, path)
 
@@ -32,8 +33,7 @@ def save(path, nodes, inputs, output, weights):
 
 side = np.array([[-0.5, 0.0, 0.5]])
 weights = [
-    # from 0 to 255 to 0 to 1
-    constant("grey", np.full((1, 3, 1, 1), 1 / (3 * 255))),
+    constant("grey", np.full((1, 3, 1, 1), 1 / 3)),
     constant("dx", side.reshape(1, 1, 1, 3)),
     constant("dy", side.reshape(1, 1, 3, 1)),
     constant("window", np.ones((1, 1, 15, 15))),
@@ -61,7 +61,7 @@ for out, pairs in {
     nodes.append(h.make_node("Div", [f"{out}_top", "det"], [out]))
 nodes.append(h.make_node("Concat", ["u", "v"], ["flow"], axis=1))
 images = [value("ref", 3), value("next", 3)]
-save("lk.onnx", nodes, images, value("flow", 2), weights)
+save("lk.onnx", nodes, images, value("flow", 2), weights, input_range="unit")
 
 # --- depth prior: the number of the row -----------------------------------------------------------
 

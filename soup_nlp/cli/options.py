@@ -5,7 +5,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 
+from soup_nlp.config.problem import shipped_problems
 from soup_nlp.config.trees import PRESETS
 from soup_nlp.data.formats.images import DataWarning
 from soup_nlp.errors import ConfigError, StoppedError, printable
@@ -25,6 +26,16 @@ from soup_nlp.storage.progress import Progress
 def option(text: str, *names: str, panel: str | None = None, **rules: Any) -> Any:
     """An option with its help, in a panel of the help page."""
     return typer.Option(*names, help=text, rich_help_panel=panel, **rules)
+
+
+def starting(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Completion of the last of comma-separated words; without any, shells complete files."""
+
+    def complete(incomplete: str) -> list[str]:
+        head, comma, last = incomplete.rpartition(",")
+        return [head + comma + word for word in words() if word.startswith(last)]
+
+    return complete
 
 
 in_input, in_size, in_method, in_output = (
@@ -52,14 +63,18 @@ MaxSize = Annotated[
 ]
 Set = Annotated[Words, in_method("Set any key, e.g. solver.max_iter=200.", "--set")]
 PresetName = Annotated[
-    str | None, in_method(f"Options below the problem's own: {', '.join(PRESETS)}.")
+    str | None,
+    in_method(
+        f"Options below the problem's own: {', '.join(PRESETS)}.",
+        autocompletion=starting(lambda: PRESETS),
+    ),
 ]
 Out = Annotated[Path, in_output("Output folder.", "--out", "-o")]
 Quiet = Annotated[bool, in_output("Print no progress, only warnings.", "--quiet", "-q")]
 OTHERS = "Also replace files of your own, and the result of another input."
 Overwrite = Annotated[bool, in_output(OTHERS, "--overwrite")]
 PROBLEM = "Problem file, or a name that `soup-nlp list` shows."
-Problem = Annotated[Path, typer.Argument(help=PROBLEM)]
+Problem = Annotated[Path, typer.Argument(help=PROBLEM, autocompletion=starting(shipped_problems))]
 Folder = Annotated[Path, typer.Argument(help="Folder of a result or a chain.")]
 COORDINATES = "tangent: nine per superpixel about the initialisation, without gauge."
 Coordinates = Annotated[Literal["matrix", "tangent"], option(COORDINATES)]

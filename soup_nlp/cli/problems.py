@@ -27,7 +27,10 @@ PAGE, ROWS = "README.md", "runs.jsonl"
 
 
 def show(
-    problem: Annotated[Path | None, typer.Argument(help=options.PROBLEM)] = None,
+    problem: Annotated[
+        Path | None,
+        typer.Argument(help=options.PROBLEM, autocompletion=options.starting(shipped_problems)),
+    ] = None,
     overrides: options.Set = None,
     preset: options.PresetName = None,
     all_options: Annotated[bool, option("Every key, also the unusual ones.", "--all")] = False,

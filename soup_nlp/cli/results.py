@@ -146,7 +146,14 @@ _NAMES = "; ".join(f"{name}: {one.text}" for name, one in FORMATS.items())
 
 def convert(
     folder: options.Folder,
-    to: Annotated[str, option(f"Comma separated. {_NAMES}.", "--to")],
+    to: Annotated[
+        str,
+        option(
+            f"Comma separated. {_NAMES}.",
+            "--to",
+            autocompletion=options.starting(lambda: FORMATS),
+        ),
+    ],
     out: Annotated[Path | None, out_option("the result's own")] = None,
     overwrite: options.Overwrite = False,
 ) -> None:

@@ -1,6 +1,7 @@
 """Commands solve, demo, chain and batch: pairs and sequences of frames become result folders."""
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
@@ -14,8 +15,9 @@ from soup_nlp.batches.run import batch as solve_batch
 from soup_nlp.batches.sources import DATASETS
 from soup_nlp.cli import options
 from soup_nlp.cli.options import Text, in_input, in_method, in_output, option
-from soup_nlp.config.problem import Problem, load_problem, make_problem, title
+from soup_nlp.config.problem import Problem, load_problem, make_problem, shipped_problems, title
 from soup_nlp.data.flow.sources import is_path
+from soup_nlp.data.scenes.catalogue import LAYOUTS
 from soup_nlp.errors import ConfigError, DataError, SoupError
 from soup_nlp.pipeline.run import run as run_problem
 from soup_nlp.report.folder import prepare_folder, write_failure, write_folder
@@ -25,6 +27,7 @@ from soup_nlp.sequence.folder import SINGLE
 from soup_nlp.sequence.frames import IMAGES, VIDEOS, named
 from soup_nlp.sequence.score import chain_exit_code
 from soup_nlp.sequence.solve import solve_chain
+from soup_nlp.storage.each import Row
 from soup_nlp.storage.files import as_path, is_file, is_folder
 from soup_nlp.storage.folders import default_folder
 from soup_nlp.storage.progress import interruptible
@@ -38,7 +41,11 @@ in_flow, in_prior = partial(option, panel="Flow"), partial(option, panel="Depth 
 def solve(
     source: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="PROBLEM | REF NEXT", help=SOURCE),
+        typer.Argument(
+            metavar="PROBLEM | REF NEXT",
+            help=SOURCE,
+            autocompletion=options.starting(shipped_problems),
+        ),
     ] = None,
     intrinsics: options.Intrinsics = None,
     fov: options.Fov = None,
@@ -214,7 +221,10 @@ def demo(
 def chain(
     source: Annotated[
         list[str],
-        typer.Argument(help="Folder, images, 'pattern/*.jpg', video, or scene:NAME."),
+        typer.Argument(
+            help="Folder, images, 'pattern/*.jpg', video, or scene:NAME.",
+            autocompletion=options.starting(lambda: [f"scene:{name}" for name in LAYOUTS]),
+        ),
     ],
     out: Annotated[Path | None, options.out_option("out/chain-SOURCE")] = None,
     intrinsics: options.Intrinsics = None,
@@ -246,6 +256,12 @@ def chain(
     flows = options.given(source=flow, backward=flow_backward)
     prior = options.given(source=depth_prior, kind=depth_prior_kind)
     sections: dict[str, Any] = options.given(flow=flows or None, depth_prior=prior or None)
+    progress, solved = options.row_progress(quiet), list[Row]()
+
+    def say(done: int, total: int, row: Row) -> None:
+        solved.append(row)
+        progress(done, total, row)
+
     kept = options.resumable("pairs that were finished before are kept", f"{out}/pairs")
     with kept, options.SolveLog(quiet).warnings():
         done = solve_chain(
@@ -261,8 +277,10 @@ def chain(
             overrides=options.changed(preset, overrides, superpixels, neighbours, max_size),
             workers=workers,
             overwrite=overwrite,
-            say=options.row_progress(quiet),
+            say=say,
         )
+    if not (solved or quiet):
+        print("every pair was solved before: the chain is finished", file=sys.stderr)
     print("\n".join(done.summary["verdict"]))
     print(f"files       {out}/: " + ", ".join([*SINGLE, "depth/", "pairs/"]))
     code, why = chain_exit_code(done)

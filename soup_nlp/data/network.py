@@ -13,13 +13,15 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.errors import DataError, optional
 from soup_nlp.storage.files import require_file
 
+RANGES = {"255": (0.0, 255.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
+"""Input values of black and white by the metadata `input_range` of an ONNX file; default "255"."""
+
 
 class Network:
     """A network that onnxruntime runs on the CPU.
 
     Its inputs are one or two images (1, 3, H, W), `count`, or one stack (1, 6, H, W) of two, float,
-    RGB from 0 to 255. Images are resized to a fixed size of the inputs, or else padded to a
-    multiple of 8.
+    RGB. Images are resized to a fixed size of the inputs, or else padded to a multiple of 8.
     """
 
     def __init__(self, source: str, count: int) -> None:
@@ -42,6 +44,11 @@ class Network:
             what = f"network does not take {('one image', 'two images')[count - 1]}"
             expected = f"{count} x (1, 3, H, W), or one input (1, {3 * count}, H, W)"
             raise DataError(what, where=source, found=shapes, expected=expected)
+        word = self.session.get_modelmeta().custom_metadata_map.get("input_range", "255")
+        if word not in RANGES:
+            what = "unknown input range of a network"
+            raise DataError(what, where=source, found=word, expected=", ".join(RANGES))
+        self.levels = RANGES[word]
         self.names = [i.name for i in inputs]
         self.kind = np.float16 if "float16" in inputs[0].type else np.float32
         height, width = shapes[0][2:]
@@ -53,16 +60,19 @@ class Network:
         """Outputs for images (H, W, 3) that fit a kind, "map (1, 1, h, w)"; the size of inputs."""
         height, width = images[0].shape[:2]
         rows, cols = self.size or (-(-n // 8) * 8 for n in (height, width))
+        black, white = self.levels
         planes = []
         for image in images:
             if self.size:
                 seen = cv2.resize(image, (cols, rows), interpolation=cv2.INTER_AREA)
             else:
                 seen = np.pad(image, ((0, rows - height), (0, cols - width), (0, 0)), mode="edge")
-            planes.append(np.ascontiguousarray(np.moveaxis(seen, 2, 0)[None], dtype=self.kind))
+            plane = np.ascontiguousarray(np.moveaxis(seen, 2, 0)[None], dtype=np.float32)
+            planes.append((plane / np.float32(255.0)) * np.float32(white - black) + black)
         feed = planes if len(self.names) == len(planes) else [np.concatenate(planes, axis=1)]
+        named = {name: x.astype(self.kind) for name, x in zip(self.names, feed, strict=True)}
         try:
-            outputs = self.session.run(None, dict(zip(self.names, feed, strict=True)))
+            outputs = self.session.run(None, named)
         except Exception as error:  # onnxruntime raises many types
             reason = _first_line(error)
             raise DataError("network failed", where=self.source, found=reason) from error

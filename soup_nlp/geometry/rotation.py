@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from soup_nlp.arrays import Float
+from soup_nlp.errors import DataError, printable, repr_of
 
 
 def hat(w: ArrayLike) -> Float:
@@ -89,8 +90,18 @@ class RigidMotion:
     __repr__ = __str__
 
     def __call__(self, points: Float) -> Float:
-        """The points (..., 3), moved."""
-        return np.asarray(np.asarray(points, float) @ self.R.T + self.t)
+        """The points (..., 3), moved; DataError for what is no array of points."""
+        try:
+            x = np.asarray(points, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            x = np.empty(0)
+        if x.shape[-1:] != (3,):
+            raise DataError(
+                "points are no array of points",
+                found=f"{type(points).__name__} {printable(repr_of(points), 60)}",
+                expected="numbers (..., 3)",
+            )
+        return np.asarray(x @ self.R.T + self.t)
 
     def __matmul__(self, first: RigidMotion) -> RigidMotion:
         """The composition: the other motion first, then this one."""

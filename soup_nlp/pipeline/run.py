@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import FunctionType, NoneType
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
@@ -80,6 +81,12 @@ def run(
     expect(problem, Problem, "problem", "soup_nlp.load_problem(FILE), or make_problem({...})")
     if pair is not None:
         expect(pair, Pair, "pair", PAIR)
+    calls = {"listener": listener, "log": log, "on_stage": on_stage}
+    for name, call in calls.items():
+        if not callable(call):
+            expect(call, (FunctionType, NoneType), name, "a function, such as print, or None")
+    expect(stop, (threading.Event, NoneType), "stop", "threading.Event(), or None")
+    expect(ipopt_log, (str, NoneType), "ipopt_log", "the name of a file, or None")
     seconds, begin = dict[str, float](), time.perf_counter()
 
     def ended(stage: str) -> None:

@@ -18,6 +18,7 @@ from soup_nlp.geometry.components import Component
 from soup_nlp.geometry.rotation import RigidMotion
 from soup_nlp.geometry.surface import joined
 from soup_nlp.report import figures
+from soup_nlp.report.figures import Picture, shown
 
 if TYPE_CHECKING:
     from soup_nlp.report.result import Result
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 UNIT = "soup unit (free scale: the mean distance of the planes is 1)"
 AXES = "x right, y down, z ahead"
 STILL = RigidMotion(np.eye(3), np.zeros(3))
+SHOWN_FRAMES = 12
+"""Largest number of frames of a chain that a notebook shows."""
 NEAR = 5
 """Number of pairs in memory at once: clouds compare a frame with two on either side."""
 SAMPLES = 1_000_000
@@ -153,6 +156,21 @@ class Frame:
         """Continuity to the right and downwards, see `geometry.surface.joined`."""
         return joined(self.planes, self.labels, self.components, self.K)
 
+    def _repr_html_(self) -> str:
+        near, far = figures.depth_range(self.depth)
+        sigma = figures.colourise_shares(self.sigma, 0.3, "viridis")
+        panels = [
+            Picture("image", self.image),
+            self.picture(near, far, "depth, pale = drawn"),
+            Picture("expected depth error (1 sigma), bright = 30 % and more", sigma),
+        ]
+        return shown(str(self), figures.strip(panels, ""))
+
+    def picture(self, near: float, far: float, title: str) -> Picture:
+        """The depth in colours from `near` to `far`, pale where it is drawn."""
+        image = figures.colourise_depth(self.depth, near, far, self.drawn)
+        return Picture(title, image, figures.depth_legend(near, far))
+
 
 @dataclass(frozen=True, eq=False)
 class Chain:
@@ -197,6 +215,12 @@ class Chain:
             f"Chain({len(self)} frames, scales {low:.3g}..{high:.3g}, {flagged} flagged links,"
             f" {self.certainty['drawn']:.0%} drawn)"
         )
+
+    def _repr_html_(self) -> str:
+        near, far = figures.depth_range(self.depths)
+        chosen = sorted({*np.linspace(0, len(self) - 1, min(SHOWN_FRAMES, len(self))).astype(int)})
+        panels = [self[k].picture(near, far, f"depth of frame {self.names[k]}") for k in chosen]
+        return shown(str(self), figures.strip(panels, ""))
 
     @property
     def name(self) -> str:

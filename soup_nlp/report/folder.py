@@ -8,11 +8,12 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import wraps
 from pathlib import Path
-from typing import ParamSpec
+from typing import ParamSpec, Required
 
 import numpy as np
 import psutil
 from PIL.Image import Image
+from typing_extensions import TypedDict
 
 from soup_nlp.arrays import AnyFloat
 from soup_nlp.config.problem import Problem, dump_problem
@@ -30,7 +31,7 @@ from soup_nlp.report.pictures import overview, pictures
 from soup_nlp.report.result import PAGE, result_of
 from soup_nlp.report.verdict import exit_code, facts, summary
 from soup_nlp.storage.each import Row, failed, read_rows
-from soup_nlp.storage.files import as_path, is_file, write_json, write_text
+from soup_nlp.storage.files import as_path, fits, is_file, write_json, write_text
 from soup_nlp.storage.folders import claim, read_sums, staged
 from soup_nlp.storage.store import write_h5
 from soup_nlp.storage.versions import code_version
@@ -191,6 +192,23 @@ run, solve_pair = _writable(pipeline.run), _writable(pipeline.solve_pair)
 # --- pairs of a batch or a chain: each in a folder of its own, with a row in one file -------------
 
 
+class StoredRow(TypedDict, total=False):
+    """What is read back of a row."""
+
+    key: Required[str]
+    error: str | None
+    exit_code: int
+    reason: str
+    mre: float | None
+    constant: float | None
+    drawn: float | None
+    seconds: float
+    cpu_seconds: float
+    peak_bytes: float
+    superpixels: int
+    result: str
+
+
 def head(problem: Problem) -> Row:
     """What a row says of a pair before it is solved: if all of it is the same, so is the result."""
     own = {"key": problem.name, "pair": problem.name, "seed": problem.seed}
@@ -199,7 +217,7 @@ def head(problem: Problem) -> Row:
 
 def kept_rows(folder: Path, heads: Mapping[str, Row]) -> dict[str, Row]:
     """Rows of the pairs that have been solved, or have failed, with the same input and code."""
-    last = {str(row.get("key")): row for row in read_rows(folder / ROWS)}
+    last = {row["key"]: row for row in read_rows(folder / ROWS) if fits(row, StoredRow)}
     same = {k: last[k] for k, own in heads.items() if own.items() <= last.get(k, {}).items()}
     # a command that was killed may have replaced a result before it wrote the row
     stored = {name: _result(folder / PAIRS / name) for name in same}

@@ -129,10 +129,19 @@ _adapter: Callable[[Any], TypeAdapter[Any]] = lru_cache(TypeAdapter)
 """Validator of a type; making one takes tens of milliseconds."""
 
 
+def fits(value: object, kind: Any) -> bool:
+    """Whether a value of JSON has a type, such as a TypedDict; further entries stay."""
+    try:
+        _adapter(kind).validate_python(value, strict=True)
+    except ValidationError:
+        return False
+    return True
+
+
 def read_json(
     path: PathLike, what: str, kind: type[Kind], *, error: type[SoupError] = DataError
 ) -> Kind:
-    """The value of a JSON file, see `parse_json`, which must have a type; further entries stay."""
+    """The value of a JSON file, see `parse_json`, which must have a type, see `fits`."""
     try:
         value: Kind = parse_json(read_text(path, what, error=error))
         _adapter(kind).validate_python(value, strict=True)

@@ -210,11 +210,20 @@ def test_problems_are_found_by_name_anywhere(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_completion_knows_commands():
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("so", "solve"),
+        ("solve moto", "motorcycle"),
+        ("convert out --to ply,col", "ply,colmap"),
+        ("show street --preset pa", "paper"),
+    ],
+)
+def test_completion_knows_commands_problems_and_formats(line, word):
     code = "import sys; sys.argv = ['soup-nlp']; from soup_nlp.cli.main import main; main()"
-    words = {"COMP_WORDS": "soup-nlp so", "COMP_CWORD": "1"}
+    words = {"COMP_WORDS": f"soup-nlp {line}", "COMP_CWORD": str(len(line.split()))}
     surroundings = os.environ | words | {"_SOUP_NLP_COMPLETE": "complete_bash"}
     done = subprocess.run(
         [sys.executable, "-c", code], env=surroundings, capture_output=True, text=True
     )
-    assert done.stdout.split() == ["solve"]
+    assert done.stdout.split() == [word]

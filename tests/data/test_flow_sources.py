@@ -77,7 +77,7 @@ def onnx():
     return pytest.importorskip("onnx", reason="onnx, which writes the test's network, is missing")
 
 
-def tiny_network(onnx, path, size=("h", "w"), stacked=False, gain=2.0, flat=False):
+def tiny_network(onnx, path, size=("h", "w"), stacked=False, gain=2.0, word="255", flat=False):
     """A network whose flow is gain x the mean difference of the images, at half their size."""
     from onnx import parser
 
@@ -85,7 +85,7 @@ def tiny_network(onnx, path, size=("h", "w"), stacked=False, gain=2.0, flat=Fals
     weights = ", ".join([*["-{0}"] * 12, *["{0}"] * 12] * 2).format(f"{gain / 12:.9g}")
     one, two = (f"float[1, {channels}, {height}, {width}]" for channels in (3, 6))
     inputs, join = f"{one} a, {one} b", "x = Concat <axis = 1> (a, b)"
-    text = f"""<ir_version: 8, opset_import: ["" : 13]>
+    text = f"""<ir_version: 8, opset_import: ["" : 13], metadata_props: ["input_range" : "{word}"]>
     tiny ({f"{two} x" if stacked else inputs}) => (float{"[1, n]" if flat else "[1, 2, u, v]"} out)
     <float[2, 6, 2, 2] w = {{{weights}}}>
     {{ {"" if stacked else join} flow = Conv <strides = [2, 2]> (x, w)
@@ -110,19 +110,26 @@ def test_onnx_network(onnx, tmp_path, stacked, size):
     assert flow.source == "tiny.onnx"
 
 
-def test_bad_onnx_networks(onnx, tmp_path, pair):
+def test_onnx_input_range_and_bad_networks(onnx, tmp_path, pair):
     first, second = (np.full((64, 64, 3), g, np.uint8) for g in (0, 51))
-    good = tiny_network(onnx, tmp_path / "good.onnx")
-    flat = tiny_network(onnx, tmp_path / "flat.onnx", flat=True)
-    with pytest.raises(DataError, match="gives no flow"):
-        learned_flow(str(flat), first, second)
+    unit = tiny_network(onnx, tmp_path / "unit.onnx", word="unit", gain=10.0)
+    np.testing.assert_allclose(learned_flow(str(unit), first, second).uv[5, 5], 2.0, rtol=1e-4)
+    signed = tiny_network(onnx, tmp_path / "signed.onnx", word="signed", gain=10.0)
+    np.testing.assert_allclose(learned_flow(str(signed), first, second).uv[5, 5], 4.0, rtol=1e-4)
+    for name, options, match in [
+        ("word", {"word": "percent"}, "input range"),
+        ("flat", {"flat": True}, "gives no flow"),
+    ]:
+        path = tiny_network(onnx, tmp_path / f"{name}.onnx", **options)
+        with pytest.raises(DataError, match=match):
+            learned_flow(str(path), first, second)
     (tmp_path / "no.onnx").write_bytes(b"not a network")
     with pytest.raises(DataError, match="no network"):
         resolve_flow(pair, str(tmp_path / "no.onnx"))
     with pytest.raises(DataError, match="missing"):
         resolve_flow(pair, str(tmp_path / "absent.onnx"))
     with pytest.raises(DataError, match="two RGB images"):
-        learned_flow(str(good), first, second[:32])
+        learned_flow(str(unit), first, second[:32])
     endless = tiny_network(onnx, tmp_path / "endless.onnx", gain=1e38)
     unknown = learned_flow(str(endless), first, second)
     assert (unknown.uv == 0).all()

@@ -92,13 +92,16 @@ def test_a_plausible_focal_length_of_exif_is_taken(
 # --- pictures that are not what they seem --------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["a.NEF", "a.hdr"])
-def test_a_raw_photo_is_refused(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "tags"),
+    [("a.tif", {50706: 1}), ("a.NEF", {}), ("a.tiff", {254: 1}), ("a.hdr", {})],
+)
+def test_a_raw_photo_is_refused(name: str, tags: dict[int, int], tmp_path: Path) -> None:
     path = tmp_path / name
     if path.suffix == ".hdr":
         cv2.imwrite(str(path), texture().astype(np.float32))
     else:
-        Image.fromarray(texture()).save(path, "TIFF")
+        Image.fromarray(texture()).save(path, "TIFF", tiffinfo=tags)
     with pytest.raises(DataError, match=r"raw or HDR photo[\s\S]*expected: [\s\S]*try: develop it"):
         read_image(path)
 
@@ -111,6 +114,44 @@ def test_the_first_of_several_pages_is_used(kind: str, tmp_path: Path) -> None:
     with pytest.warns(DataWarning, match=rf"a\.{kind}: holds 2 pages or frames; the first one"):
         image = read_image(tmp_path / f"a.{kind}")
     np.testing.assert_array_equal(image, np.asarray(one))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("a.jpg", {}),
+        ("b.jpg", {"progressive": True}),
+        ("a.tif", {"compression": "tiff_lzw"}),
+        ("b.tif", {"compression": "tiff_deflate"}),
+        ("c.tif", {"compression": "jpeg"}),
+    ],
+)
+def test_a_picture_damaged_inside_gives_a_warning(
+    name: str, options: dict[str, Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    Image.fromarray(texture(320, 240)).save(path, **options)
+    read_image(path)  # gives no warning
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 400] = np.random.default_rng(0).bytes(400).replace(b"\xff", b"0")
+    path.write_bytes(content)
+    with pytest.warns(DataWarning, match=rf"{re.escape(name)}: is damaged"):
+        read_image(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.slow
+def test_an_interlaced_picture_gives_a_warning(tmp_path: Path) -> None:
+    pair = render_scene("orbit", 0, 320, 136)
+    both = pair.image_ref.copy()
+    both[1::2] = pair.image_next[1::2]
+    for image, combed in ((pair.image_ref, False), (both, True)):
+        Image.fromarray(image).save(tmp_path / "a.png")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_image(tmp_path / "a.png")
+        assert ["looks interlaced" in str(w.message) for w in caught] == [True] * combed
 
 
 # --- pictures of more than 8 bits ----------------------------------------------------------------

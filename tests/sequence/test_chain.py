@@ -224,3 +224,15 @@ def test_a_result_that_another_run_left_is_not_that_of_a_row(tmp_path: Path):
     two = solved("a", 2, told=True)
     assert stored.kept_rows(tmp_path, {"a": two})
     assert not stored.kept_rows(tmp_path, {"a": one})
+
+
+@pytest.mark.parametrize("wrong", [[], {}, True, "text", 5, [1], {"a": 1}])
+def test_a_row_with_an_entry_of_another_type_is_none(wrong, tmp_path):
+    own = stored.head(make_problem({"input": {"kind": "scene", "scene": "orbit"}, "name": "a"}))
+    good = {**own, "error": "no flow", "mre": 0.5, "exit_code": 1}
+    for key, value in good.items():
+        fits = isinstance(wrong, type(value)) and key not in own
+        (tmp_path / "pairs.jsonl").unlink(missing_ok=True)
+        append_row(tmp_path / "pairs.jsonl", good | {key: wrong})
+        if not (fits or (key == "mre" and wrong == 5)):
+            assert not stored.kept_rows(tmp_path, {"a": own}), key

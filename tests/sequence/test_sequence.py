@@ -181,7 +181,9 @@ def test_a_rendered_sequence_has_one_scale(tmp_path, capsys, monkeypatch):
     assert len(np.loadtxt(tmp_path / "out" / "trajectory.tum")) == 3
     # what is solved is not solved again
     rows = (tmp_path / "out" / "pairs.jsonl").read_text()
-    assert main(call) == 0
+    capsys.readouterr()
+    assert main([word for word in call if word != "-q"]) == 0
+    assert "the chain is finished" in capsys.readouterr().err
     assert (tmp_path / "out" / "pairs.jsonl").read_text() == rows
     # a file of the user is overwritten on request only
     (tmp_path / "out" / "chain.json").write_text("mine")
