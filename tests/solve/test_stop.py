@@ -1,4 +1,4 @@
-"""A run that is stopped in any stage, by any way, has a whole result."""
+"""A run that is stopped at any iteration, by any way, has a whole result."""
 
 import os
 import signal
@@ -6,7 +6,6 @@ import threading
 import time
 from collections import Counter
 from functools import cache
-from itertools import groupby
 
 import numpy as np
 import pytest
@@ -38,17 +37,6 @@ def iterations() -> tuple[str, ...]:
     return tuple(seen)
 
 
-def chosen(way: str) -> list[int]:
-    """First, middle and last iteration of every stage; for signals the middle one alone."""
-    numbers = range(len(iterations()))
-    out: set[int] = set()
-    for _, stage in groupby(numbers, key=iterations().__getitem__):
-        these = list(stage)
-        middle = these[len(these) // 2]
-        out |= {middle} if way.startswith("SIG") else {these[0], middle, these[-1]}
-    return sorted(out)
-
-
 def stopped(way: str, last: int, monkeypatch) -> tuple[WritableRun, list[str]]:
     """The run that is stopped at an iteration, and the stages of its iterations."""
     clock, stop, late, seen = time.process_time, threading.Event(), 0.0, list[str]()
@@ -69,11 +57,10 @@ def stopped(way: str, last: int, monkeypatch) -> tuple[WritableRun, list[str]]:
 
 
 @pytest.mark.parametrize("way", ["stop", "SIGINT", "SIGTERM", "time"])
-def test_a_stop_in_every_stage_leaves_a_result(way, monkeypatch):
+def test_a_stop_at_every_iteration_leaves_a_result(way, monkeypatch):
     stages = {"majorant 0.3", "Gauss-Newton 0.9", "exact", "constrained NLP", "refine 1"}
     assert stages <= set(iterations())
-    for last in chosen(way):
-        stage = iterations()[last]
+    for last, stage in enumerate(iterations()):
         done, seen = stopped(way, last, monkeypatch)
         s, where = done.solution, f"iteration {last}, {stage}"
         # later stages begin, see the stop, and end
