@@ -31,9 +31,9 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# a file of tests shares what it solves; the workers take all cores, so each has one thread
+# a file of tests shares what it solves
 test: lint $(VENV)/.optional
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
+	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist loadfile
 
 quick: $(VENV)/.installed
 	$(BIN)/python -m pytest -m 'not slow'
