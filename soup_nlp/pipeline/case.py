@@ -27,7 +27,7 @@ from soup_nlp.start.epipolar import estimate, flow_matches
 from soup_nlp.start.given_depth import GivenDepth, by_prior
 from soup_nlp.start.prior_evidence import JUDGED_PIECES, LEAST_SIGMA, PriorEvidence, judged
 from soup_nlp.start.propose import Start, most_usual, propose
-from soup_nlp.start.regions import ORIGINS, covering
+from soup_nlp.start.regions import ORIGINS, TOO_FAST, covering
 from soup_nlp.start.views import FlowFit, SeededStart
 from soup_nlp.storage.progress import Watch
 from soup_nlp.storage.system import require_memory
@@ -215,7 +215,7 @@ def build_energy(
         # nothing is measured: terms on shape must not undo what is drawn
         drawn, one = np.log(start.soup.depth_at(data.anchor_ray)), np.ones(len(seg))
         prior = drawn, one, LEAST_SIGMA * one
-    placed = start.origin == ORIGINS.index("occlusion")
+    placed = np.isin(start.origin, [ORIGINS.index("occlusion"), TOO_FAST])
     known = Known(start.component, bends, start.variance, start.noise, start.order, placed, prior)
     data = weighted(data, start.soup, known, e)
     if e.units == "paper":

@@ -28,6 +28,7 @@ ORIGIN_WORDS = {
     "fixed in the image": "still in the image though the camera moves",
     "given depth": "its scale from the given depth",
     "occlusion": "placed in front of what it covers",
+    "too fast": "nearer than its contact, at which it would move too far",
 }
 """Words for what gives a component its scale (`regions.ORIGINS`)."""
 USABLE, MATCHED = 0.8, 0.2

@@ -83,7 +83,8 @@ start/component           1     N       rigid component, which has one scale
 start/part                1     N       what moves as one, also before a camera at rest
 start/surface             1     N       region without a flow discontinuity
 start/origin              1     N       what gives its component a scale: 0 it is the scene, \
-1 contact below, 2 outline, 3 nothing, 4 ground, 5 fixed in image, 6 given depth, 7 occlusion
+1 contact below, 2 outline, 3 nothing, 4 ground, 5 fixed in image, 6 given depth, 7 occlusion, \
+8 too fast
 start/bends               1     N       in a region with the energy for surfaces that bend
 start/unexplained         1     N       no motion explains the flow, or it bends although it jumps
 start/bending             1     -       a region bends

@@ -215,7 +215,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     component = _scene_first(component, ~fixed)
     floor = ground(flow, 1 / soup.depth_at(views.anchor), reliable & (component == SCENE))
     order = vote(contrast, component, seg)
-    scale, origin = scaled(flow, soup, component, order, fixed)
+    scale, origin = scaled(flow, soup, component, order, fixed, floor)
     soup = replace(soup, lam=soup.lam * scale)
     soup, lifted = on_ground(flow, soup, floor, reliable, component)
     wrong = (wrong | lifted) & ~bends
@@ -237,7 +237,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
         unexplained=jumping | (wrong & large),
         wrong=wrong,
         noise=limited_noise(error[~bends]),
-        order=held(flow, origin, order, contrast),
+        order=held(flow, soup, component, origin, order, contrast),
     )
 
 
@@ -249,7 +249,7 @@ def _ordered(flow: FlowFit, start: Start, part: Int, contrast: Float) -> Start:
     soup = replace(start.soup, lam=start.soup.lam * scale).normalised()
     origin = np.where(moved, ORIGINS.index("occlusion"), 0)
     component = numbered(np.where(moved, part, SCENE))
-    stays = held(flow, origin, order, contrast)
+    stays = held(flow, soup, component, origin, order, contrast)
     part = part if start.at_rest else component
     return replace(start, soup=soup, origin=origin, component=component, part=part, order=stays)
 

@@ -49,14 +49,16 @@ ORIGINS = (
     "fixed in the image",
     "given depth",
     "occlusion",
+    "too fast",
 )
 """What gives a component its scale. reference: it is the scene and defines the scale.
 contact below: it stands on its lower neighbours. outline: it touches its neighbours. nothing: it
-has no neighbour with a scale. ground: it would lie below it, in earlier results only. fixed in the
-image: it stands still there, though the camera moves, and is placed by its outline. given depth: a
-depth prior gives it. occlusion: it covers its background, and is placed in front of it by the least
-step that is usual."""
-FIXED = ORIGINS.index("fixed in the image")
+has no neighbour with a scale. ground: it would lie below the ground. fixed in the image: it stands
+still there, though the camera moves, and is placed by its outline. given depth: a depth prior gives
+it. occlusion: it covers its background, and is placed in front of it by the least step that is
+usual. too fast: contact is probably wrong, because it would make the component move much farther
+than the scene."""
+FIXED, TOO_FAST = ORIGINS.index("fixed in the image"), ORIGINS.index("too fast")
 
 
 # --- what is not seen continues what is around it -------------------------------------------------

@@ -5,6 +5,8 @@ pair of neighbours and x the log scales, the program adds up
 
 * contact: the pinball loss with the quantile `HIDES` of `x_a - x_b - log(z_b / z_a)` over the
   outline of a component, which hides what is behind it; below it, where it stands, it counts more;
+* displacement: what a component moves farther than the scene;
+* ground: how far a component reaches below the ground of the scene;
 * order: by how much a component that covers another one is less than `LEAST_STEP_IN_FRONT`
   before it.
 
@@ -22,7 +24,7 @@ from scipy.optimize import linprog
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.regions import CONTRAST, FIXED, ORIGINS, SCENE, numbered
+from soup_nlp.start.regions import CONTRAST, FIXED, ORIGINS, SCENE, TOO_FAST, numbered
 from soup_nlp.start.views import JUMP_PX, FlowFit
 
 STEEP_COSINE = 0.5
@@ -32,11 +34,16 @@ HIDES = 0.3
 STRONG = 3.0
 """Weight of the contact below a component and of the order along an outline, relative to the
 contact of a whole outline."""
+FASTER, FREE_DISPLACEMENT = 1.5, 1.0
+"""Price of a log unit by which a component moves farther than the scene, and how many are free."""
+UNDER = 2.0
+"""Price of a log unit by which a component lies below the ground."""
 LEAST_STEP_IN_FRONT = 0.3
 """Least step of log depth along the outline of what covers something: true steps have medians of
 0.2 to 1.9."""
-MOST_LOG_SCALE = 6.0
-"""Largest log scale."""
+MOST_LOG_DISPLACEMENT, MOST_LOG_SCALE = np.log(100.0), 6.0
+"""If motion and contact differ by more, in logarithms, the camera is taken to be at rest; largest
+log scale."""
 
 
 class Rows(NamedTuple):
@@ -101,6 +108,29 @@ def contact(flow: FlowFit, soup: Soup, label: Int, fixed: Mask) -> Rows:
     return Rows(a, b, ratio, weight * (1 - HIDES), weight * HIDES, origin)
 
 
+def displacement(flow: FlowFit, soup: Soup, label: Int) -> Rows:
+    """Rows of how far the anchors of components (N,) move relative to the camera, which turns as
+    the scene does; medians count."""
+    point = soup.points(flow.views.anchor)
+    first = int(np.argmax(label == SCENE))
+    moved = np.einsum("nij,nj->ni", soup.R, point) + soup.translation - point @ soup.R[first].T
+    far = np.linalg.norm(moved, axis=1)
+    median = np.array([np.median(far[label == c]) for c in range(int(label.max()) + 1)])
+    median = np.maximum(median, 1e-12)
+    ratio = np.log(median / median[SCENE])
+    c = np.flatnonzero((np.abs(ratio) < MOST_LOG_DISPLACEMENT) & (np.arange(len(ratio)) != SCENE))
+    return Rows(c, SCENE, FREE_DISPLACEMENT - ratio[c], FASTER, 0.0, TOO_FAST)
+
+
+def above(flow: FlowFit, soup: Soup, label: Int, floor: Float) -> Rows:
+    """Rows of the ground, whose inverse depth is floor (N,), 0 where there is none."""
+    mu, size = 1 / soup.depth_at(flow.views.anchor), flow.seg.sizes
+    at = np.flatnonzero((floor > 0) & (label != SCENE))
+    weight = UNDER * (size[at] / np.bincount(label, size)[label[at]])
+    value = np.log(mu[at] / floor[at])
+    return Rows(label[at], SCENE, value, weight, 0.0, ORIGINS.index("ground"))
+
+
 def before(flow: FlowFit, soup: Soup, label: Int, order: Float) -> Rows:
     """Rows of the order by occlusion (P,) of components (N,), see `Start.order`.
 
@@ -126,32 +156,44 @@ def scaled(
     label: Int,
     order: Float,
     fixed: Mask | None = None,
+    floor: Float | None = None,
 ) -> tuple[Float, Int]:
     """(N,) scale of the component (N,) of every superpixel, and (N,) what decides it.
 
-    The image stands still before a moving camera where it is fixed (N,). For the order (P,) see
-    `Start.order`.
+    The image stands still before a moving camera where it is fixed (N,). The floor (N,) is the
+    inverse depth of the ground, 0 where there is none; None without a rigid scene, with which
+    displacements could be compared. For the order (P,) see `Start.order`.
     """
     count = int(label.max()) + 1
     if count == 1 or not len(flow.seg.pairs):
         return np.ones(len(soup)), np.full(len(soup), ORIGINS.index("reference"))
     fixed = np.zeros(len(soup), bool) if fixed is None else fixed
     parts = [contact(flow, soup, label, fixed), before(flow, soup, label, order)]
+    if floor is not None:
+        parts += [displacement(flow, soup, label), above(flow, soup, label, floor)]
     x, origin = minimum(count, parts, np.array([SCENE]))
     origin = np.where(fixed, FIXED, origin[label])
     return np.exp(x)[label], origin
 
 
-def held(flow: FlowFit, origin: Int, order: Float, contrast: Float) -> Float | None:
+def held(
+    flow: FlowFit, soup: Soup, label: Int, origin: Int, order: Float, contrast: Float
+) -> Float | None:
     """(P,) order that the energy holds, see `Start.order`; None where nothing is known.
 
     It is the order by occlusion (P,) where the images tell it, by contrasts (P,), and along all
-    outlines of the components that it places, by the origin (N,) of their scale.
+    outlines of the components (N,) that it places. Those that contact makes too fast, by their ties
+    (N,), keep the steps of the soup, which the energy would close otherwise.
     """
     pairs = flow.seg.pairs
     by_order = (origin == ORIGINS.index("occlusion"))[pairs].any(axis=1)
     told = np.abs(contrast) > CONTRAST
     out = np.where(told | (by_order & (flow.jump >= JUMP_PX)), order, 0.0)
+    near = (origin == TOO_FAST)[pairs]
+    z = soup.depth_across(pairs, flow.middle)
+    second = np.where(z[1] < z[0], near[:, 1], 0.0)
+    first = np.where(z[0] < z[1], near[:, 0], 0.0)
+    out = np.where((out == 0) & flow.seg.across(label), second - first, out)
     return out if out.any() else None
 
 

@@ -32,7 +32,7 @@ class StartOptions(Section):
     component is scaled by its whole outline."""
     ground: bool = True
     """Use the ground of an upright image, a level plane on which much of the scene lies: unreliable
-    depths below it are lifted."""
+    depths and components below it are lifted."""
 
 
 class SeededStart(StartOptions):

@@ -74,7 +74,7 @@ def test_the_nlp_keeps_a_swinging_box_off_the_wall(seed):
         return run(make_problem(raw, options))
 
     held, free = result(10.0), result(0.0)
-    placed = held.start.origin == ORIGINS.index("occlusion")
+    placed = np.isin(held.start.origin, [ORIGINS.index("occlusion"), ORIGINS.index("too fast")])
     assert placed.any()
     # 0.6 of the 0.369 that a start which disliked slow components had without the order
     assert held.metrics["solution"].mre < min(0.22, 0.75 * free.metrics["solution"].mre)
