@@ -20,6 +20,10 @@ SHORTEST = 0.05
 """Smallest focal length relative to the side of the image (168 degrees of view)."""
 
 
+LARGEST = 1e100
+"""Largest number in a truth, so that sums of squares stay finite."""
+
+
 def check_size(
     what: str,
     shape: tuple[int, ...],
@@ -152,7 +156,17 @@ class Truth:
             where, what = f"truth.{name}", "part of the truth"
             hint = "soup_nlp.Truth(depth_ref=array); files are read by a problem's input"
             made = array_of(value, what, where, expected, kinds, axes, hint)
+            # float32 cannot be compared with a limit beyond its range
             made = made.astype(np.float64) if made.dtype.kind == "f" else made
+            most = np.abs(made[np.isfinite(made)]).max(initial=0)
+            if most > LARGEST:
+                raise DataError(
+                    f"{what} has numbers whose squares overflow",
+                    where=where,
+                    found=f"{most:g}",
+                    expected=f"at most {LARGEST:g}",
+                    hint="NaN marks what is unknown",
+                )
             object.__setattr__(self, name, made)
 
     def known(self) -> list[str]:

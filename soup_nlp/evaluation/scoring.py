@@ -184,9 +184,9 @@ def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
 
     The essential matrix (RANSAC, then a robust refinement of the Sampson distance) is estimated at
     two inlier distances, and the motion with the smaller Cauchy cost is kept: in small images a
-    moving component can lie within one pixel of a wrong motion.
-    Each pixel with confidence is then triangulated by itself without smoothing, so far points with
-    little parallax can have wild depths; only those beyond `FAR` times the median are dropped.
+    moving component can lie within one pixel of a wrong motion. Each pixel with confidence is then
+    triangulated by itself without smoothing, so far points with little parallax can have wild
+    depths; only those beyond `FAR` times the median are dropped.
 
     Returns:
         (H, W) z of the reference frame in lengths of the translation; NaN where the flow has no

@@ -1,5 +1,7 @@
 """Input checks of a pair and its flow; a resized pair shows the same scene."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -174,3 +176,10 @@ def test_a_large_pair_comes_back_at_its_size():
     assert done.full.metrics.mre < 1.1 * done.metrics["solution"].mre
     assert "brought to 256x128" in facts(done)
     assert prepare(make_problem({**settings, "max_size": None})).original is None
+
+
+def test_a_truth_whose_squares_overflow_is_refused():
+    for most, wrong in ((0.9e100, False), (1.1e100, True)):
+        depth = np.array([[1.0, np.nan], [2.0, most]])
+        with pytest.raises(DataError, match="squares overflow") if wrong else nullcontext():
+            Truth(depth_ref=depth)
