@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.linalg import norm
 
-from soup_nlp.arrays import Float, Int
+from soup_nlp.arrays import Float, Int, Mask
 
 State = Mapping[str, Float]
 """lam (N,), n (N, 3), d (N,), R (N, 3, 3), t (N, 3) of a soup."""
@@ -120,6 +120,40 @@ def depth_map(s: State, labels: Int, K: Float) -> Float:
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (s["lam"] * s["d"])[labels] / facing
     return np.where(facing > 1e-6, z, np.nan)
+
+
+def detail(s: State, labels: Int, given: Mapping[str, Any], used: Mask) -> Float:
+    """(H, W) log depth relative to the planes of a soup by the flow of the pixels, equation 30.
+
+    Args:
+        s: State of the soup.
+        labels: (H, W) superpixels.
+        given: Flow, its confidence and intrinsics, as stored under "input".
+        used: (N,) superpixels with detail.
+    """
+    v, u = np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]]
+    pixel = np.stack([u, v, np.ones_like(u)], -1)
+    z, step, c = depth_map(s, labels, given["K_ref"]), 1e-30, given["confidence"].astype(float)
+    X = np.einsum("hwij,hwj->hwi", s["R"][labels], pixel @ np.linalg.inv(given["K_ref"]).T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # a complex step: the imaginary part is the derivative by the relative inverse depth
+        X = X * (z / (1 + 1j * step))[..., None] + (s["lam"][:, None] * s["t"])[labels]
+        image = X @ given["K_next"].T
+        image = image[..., :2] / image[..., 2:]
+        e, g = pixel[..., :2] + given["flow"] - image.real, image.imag / step
+        change = (e * g).sum(-1) / (g**2).sum(-1)
+        off = norm(e - change[..., None] * g, axis=-1)
+        known = used[labels] & (c > 0) & (change >= -0.5) & (change <= 1)
+    of, c, count, change = labels[known], c[known], len(used), change[known]
+    mean = np.maximum(np.bincount(of, c, count), 1e-300)
+    both, error = (
+        (np.bincount(of, c * x**2, count) / mean)[of]
+        for x in (change * norm(g[known], axis=-1), off[known])
+    )
+    share = 1 - (error - np.log(c) / 2) / np.maximum(both, 1e-300)
+    out = np.zeros(labels.shape)
+    out[known] = -np.log(1 + c * np.maximum(share, 0) * change)
+    return out
 
 
 def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float]:

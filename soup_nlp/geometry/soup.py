@@ -126,6 +126,7 @@ class Reconstruction:
             where nothing lands.
         sigma_ref: (H, W) standard deviation of log z of the reference frame, scale left out
             (`evaluation.confidence`); None where it was not computed.
+        detail: (H, W) log z relative to the planes (`refine.detail`); None for the planes alone.
     """
 
     depth_ref: Float
@@ -137,6 +138,7 @@ class Reconstruction:
     labels: NDArray[np.int32]
     source_next: Int
     sigma_ref: Float | None = None
+    detail: Float | None = None
 
     @property
     def normals(self) -> Float:
@@ -164,24 +166,27 @@ def reconstruct(
     K_ref: Float,
     K_next: Float,
     size_next: tuple[int, int] | None = None,
+    detail: Float | None = None,
 ) -> Reconstruction:
     """Dense reconstruction of both frames, whose cameras are (3, 3).
 
     `labels` (H, W) are the superpixels of the pixels, `size_next` is the (height, width) of the
-    next frame, by default that of the reference.
+    next frame, by default that of the reference, `detail` that of a `Reconstruction`.
     """
     uv = pixel_grid(*labels.shape)
     r = rays(K_ref, uv)
     facing = -np.einsum("hwc,hwc->hw", soup.n[labels], r)
     with np.errstate(divide="ignore", invalid="ignore"):
         z = np.where(facing > LEAST_FACING, soup.distance[labels] / facing, np.nan)
+        z = z if detail is None else z * np.exp(detail)
         points = z[..., None] * r
         moved = np.einsum("hwij,hwj->hwi", soup.R[labels], points) + soup.translation[labels]
         target = project(K_next, moved)
     depth = moved[..., 2]
     source = nearest_on_top(target, depth, size_next or labels.shape)
     depth_next = np.where(source >= 0, depth.ravel()[source], np.nan)
-    return Reconstruction(z, points, moved, target - uv, depth_next, soup, labels, source)
+    flow = target - uv
+    return Reconstruction(z, points, moved, flow, depth_next, soup, labels, source, detail=detail)
 
 
 def nearest_on_top(target: Float, z: Float, size: tuple[int, int]) -> Int:

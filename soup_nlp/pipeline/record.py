@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from soup_nlp.arrays import Float, FloatMap
+from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.working_size import full_depth
+from soup_nlp.data.working_size import full_depth, resized
 from soup_nlp.evaluation.confidence import Confidence
 from soup_nlp.evaluation.metrics import DepthMetrics
 from soup_nlp.evaluation.scoring import score_depths
@@ -18,6 +18,7 @@ from soup_nlp.geometry.constraints import Constraints, constraints
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.rotation import RigidMotion
 from soup_nlp.geometry.soup import Reconstruction, Soup
+from soup_nlp.geometry.superpixels import Labels
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
@@ -203,18 +204,31 @@ class Run(Case):
         return solved and (self.refined is None or self.refined.status != "interrupted")
 
 
-def full_size(full: Pair, result: Reconstruction) -> FullSize:
-    """Bring a reconstruction of a smaller pair to the pair's own size.
+def full_size(full: Pair, pair: Pair, result: Reconstruction) -> FullSize:
+    """Bring a reconstruction of a smaller pair to the size of the full one.
 
-    Planes are evaluated at every pixel, in the next frame after their motions.
+    Planes are evaluated at every pixel, in the next frame after their motions. With detail, their
+    depth is changed as that of the nearest pixel of the smaller pair.
     """
-    soup = result.soup
-    depth_ref = full_depth(result.labels, full.size, soup.n, soup.distance, full.K_ref)
+
+    def enlarged(
+        labels: Labels, normal: Float, offset: Float, depth: Float, *frames: tuple[Image, Float]
+    ) -> FloatMap:
+        (large, K), (_, K_small) = frames
+        z = full_depth(labels, large.shape[:2], normal, offset, K)
+        if result.detail is None:
+            return z
+        flat = full_depth(labels, depth.shape, normal, offset, K_small)
+        return z * resized(depth.astype(np.float32) / flat, z.shape)
+
+    soup, source = result.soup, result.source_next
+    frames = [((p.image_ref, p.K_ref), (p.image_next, p.K_next)) for p in (full, pair)]
+    ref, following = zip(*frames, strict=True)
+    depth_ref = enlarged(result.labels, soup.n, soup.distance, result.depth_ref, *ref)
     # X' = R X + t carries n . X + D = 0 to (R n) . X' + D - (R n) . t = 0
     turned = np.einsum("nij,nj->ni", soup.R, soup.n)
     moved = soup.distance - np.einsum("ni,ni->n", turned, soup.translation)
-    source = result.source_next
     shown = np.where(source >= 0, result.labels.ravel()[source], -1).astype(np.int32)
-    depth_next = full_depth(shown, full.image_next.shape[:2], turned, moved, full.K_next)
+    depth_next = enlarged(shown, turned, moved, result.depth_next, *following)
     scores = score_depths(full.truth, {"full": depth_ref.astype(np.float64)})
     return FullSize(depth_ref, depth_next, scores.get("full"))

@@ -11,6 +11,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from pydantic import BaseModel
 
+from soup_nlp.arrays import Float
 from soup_nlp.config.problem import (
     Expected,
     OutputOptions,
@@ -36,6 +37,7 @@ from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.model.reweighting import first_edges
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run, full_size
+from soup_nlp.refine.detail import detail
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined, RefineOptions
@@ -150,18 +152,22 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     pair, labels = case.pair, case.segmentation.labels
     size = pair.image_next.shape[0], pair.image_next.shape[1]
 
-    def dense(soup: Soup) -> Reconstruction:
-        return reconstruct(soup, labels, pair.K_ref, pair.K_next, size)
+    def dense(soup: Soup, finer: Float | None = None) -> Reconstruction:
+        return reconstruct(soup, labels, pair.K_ref, pair.K_next, size, finer)
 
     unrefined = dense(solution.soup)
-    after = unrefined if refined is None else dense(refined.soup)
+    planes = unrefined if refined is None else dense(refined.soup)
     assert pair.flow is not None
     # one superpixel coupled to all of the scene would fill the factors of the information
     data = first_edges(case.data, len(case.segmentation.edges))
     energy = data, case.weights, case.formulation()
-    sure = confidence(after, pair, case.start, *energy, case.given)
+    sure = confidence(planes, pair, case.start, *energy, case.given)
+    after = planes
+    if refined is not None and case.problem.refine.detail and not case.start.at_rest:
+        used = ~case.start.bends & case.data.pixel_weight.any(axis=1)
+        after = dense(refined.soup, detail(planes, pair.flow, pair.K_next, used))
     after = replace(after, sigma_ref=sure.sigma)
-    full = None if case.original is None else full_size(case.original, after)
+    full = None if case.original is None else full_size(case.original, pair, after)
     depths = {"solution": after.depth_ref, "start": dense(case.start.soup).depth_ref}
     if refined is not None and solution.stages:
         depths["nlp"] = unrefined.depth_ref

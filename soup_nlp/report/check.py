@@ -152,13 +152,17 @@ def _constraints(r: Stored) -> Iterator[Claim]:
 
 
 def _depths(r: Stored) -> Iterator[Claim]:
-    """Largest relative difference of the depth maps of the reference frame from the planes."""
+    """Largest relative difference of the depth maps of the reference frame from the planes, that of
+    the solution with the detail that the flow adds."""
     labels, K = require(r.tree, "segmentation/labels"), require(r.tree, "input/K_ref")
     for which in ("solution", "nlp", "start"):
         if DEPTHS[which] not in r.tree["depth"]:
             continue
         depth = require(r.tree, f"depth/{DEPTHS[which]}")
         z = recompute.depth_map(r.soup(which), labels, K)
+        if which == "solution" and "detail" in r.tree["depth"]:
+            used = (r.tree["start"]["bends"] == 0) & r.tree["energy"]["pixel_weight"].any(axis=1)
+            z = z * np.exp(recompute.detail(r.soup(which), labels, r.tree["input"], used))
         both = np.isfinite(depth) & np.isfinite(z)
         off, note = float(np.abs(z[both] / depth[both] - 1).max(initial=0.0)), ""
         lost = float((np.isfinite(depth) != np.isfinite(z)).mean())

@@ -106,6 +106,7 @@ iterations/*/ls_trials    1     I       trial points of the line search, by iter
 
 depth/ref                 soup  H,W     z of the reference frame, NaN if none
 depth/next                soup  H,W     z of the next frame, NaN if none
+depth/detail              1     H,W     log z of the reference frame relative to the planes
 depth/start_ref           soup  H,W     the start's z, reference frame
 depth/rigid_ref           translations  H,W  z by one rigid motion, reference frame
 depth/nlp_ref             soup  H,W     the NLP's z, reference frame
@@ -181,6 +182,7 @@ def result_tree(run: Run) -> ReadTree:
         "depth": {
             "ref": rec.depth_ref,
             "next": rec.depth_next,
+            "detail": rec.detail,
             **{DEPTHS[name]: run.depth_maps.get(name) for name in ("start", "rigid", "nlp")},
             "sigma_ref": rec.sigma_ref,
             "sigma_next": rec.sigma_next,

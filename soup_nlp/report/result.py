@@ -240,7 +240,8 @@ def load(folder: str | Path) -> Result:
         sigma = require(tree, "depth/sigma_ref")
         given = {f.name: tree["segmentation"].get(f.name) for f in fields(Segmentation)}
         seg, (height, width) = Segmentation(**given), tree["depth"]["next"].shape
-        rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width))
+        detail = tree["depth"].get("detail")
+        rec = reconstruct(soup, seg.labels, K_ref, K_next, (height, width), detail)
         start = tree["start"]
         for name, older in RENAMED.items():
             if older in start:

@@ -14,6 +14,7 @@ from soup_nlp.errors import DataError
 from soup_nlp.geometry.camera import intrinsics, pixel_grid, project, rays
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, skipped
+from soup_nlp.refine.records import Refined
 from soup_nlp.report.verdict import facts
 
 IMAGE = np.zeros((40, 60, 3), np.uint8)
@@ -167,13 +168,18 @@ def test_a_large_pair_comes_back_at_its_size():
         "segmentation": {"superpixels": 60, "neighbours": 6},
     }
     case = prepare(make_problem(settings), pair=pair)
-    done = make_run(case, skipped(case))
+    start = skipped(case)
+    refined = Refined(start.soup, {}, {}, {}, (), "rounds", 0.0)
+    done = make_run(case, start, refined)
     assert done.pair.size[0] * done.pair.size[1] <= 12_500
     assert done.full.depth_ref.shape == (128, 256)
     covered = np.isfinite(done.full.depth_next)
     assert covered.mean() > 0.9
-    # the error does not grow at full size
-    assert done.full.metrics.mre < 1.1 * done.metrics["solution"].mre
+    # the error of planes does not grow at full size, and detail lowers it at both
+    planes = make_run(case, start)
+    assert planes.full.metrics.mre < 1.1 * planes.metrics["solution"].mre
+    assert done.full.metrics.mre < 0.8 * planes.full.metrics.mre
+    assert done.metrics["solution"].mre < 0.2 * planes.metrics["solution"].mre
     assert "brought to 256x128" in facts(done)
     assert prepare(make_problem({**settings, "max_size": None})).original is None
 

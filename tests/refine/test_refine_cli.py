@@ -1,6 +1,7 @@
 """`solve` refines by default; each half can be left out; the history is stored and checked."""
 
 import json
+import shutil
 import threading
 from pathlib import Path
 
@@ -11,8 +12,11 @@ from helpers_files import sets
 
 from soup_nlp.cli.main import main
 from soup_nlp.config.problem import load_problem
+from soup_nlp.evaluation.metrics import depth_metrics
+from soup_nlp.geometry.soup import reconstruct
 from soup_nlp.pipeline.run import run
 from soup_nlp.report.check import check_folder
+from soup_nlp.report.result import load
 
 pytestmark = pytest.mark.slow
 
@@ -58,6 +62,29 @@ def test_solve_delivers_the_refined_soup_and_keeps_the_nlps(result):
         assert file["depth/nlp_ref"].shape == file["depth/ref"].shape
         assert np.abs(file["nlp/R"][:] - file["solution/R"][:]).max() > 0
     assert check_folder(result).ok
+
+
+def test_the_depth_of_the_solution_has_detail(result, tmp_path):
+    stored = load(result)
+    rec = stored.reconstruction
+    planes = reconstruct(rec.soup, rec.labels, stored.K, stored.K_next)
+    assert 0 < np.abs(rec.detail).max() <= np.log(2)
+    np.testing.assert_allclose(rec.depth_ref, planes.depth_ref * np.exp(rec.detail), rtol=1e-12)
+    np.testing.assert_array_equal(rec.depth_ref, stored.depth_maps["solution"])
+    # the planes alone are less exact than flow of 1 px allows
+    gt = stored.true_depth
+    with_it, without = (depth_metrics(x.depth_ref, gt).mre for x in (rec, planes))
+    assert with_it < without
+    damaged = tmp_path / "damaged"
+    shutil.copytree(result, damaged)
+    with h5py.File(damaged / "result.h5", "a") as file:
+        file["depth/ref"][:] = planes.depth_ref
+    assert "depth map solution" in {row.name for row in check_folder(damaged).rows if not row.ok}
+    code, summary = solve(tmp_path / "flat", "--set", "refine.detail=false")
+    assert code == 0
+    flat = load(tmp_path / "flat").reconstruction
+    assert flat.detail is None
+    assert check_folder(tmp_path / "flat").ok
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-/* The page of a pair or a chain: rebuilds its frames from superpixels, planes and motions. */
+/* The page of a pair or a chain: rebuilds its frames from superpixels, planes, detail and motions. */
 "use strict";
 const $ = (id) => document.getElementById(id);
 const data = JSON.parse($("data").textContent), pairs = data.pairs, last = pairs.length;
@@ -165,13 +165,13 @@ async function unpack(text, Kind) {
 }
 
 /* points of the reference frame; camera axes: x right, y down, z ahead */
-function points({ K: [[fx, skew, cx], [, fy, cy]], grid: [w, h], step }, labels, planes) {
+function points({ K: [[fx, skew, cx], [, fy, cy]], grid: [w, h], step }, labels, planes, detail) {
   const out = new Float32Array(3 * w * h);
   for (let v = 0, p = 0; v < h; v++)
     for (let u = 0; u < w; u++, p++) {
       const y = (v * step - cy) / fy, x = (u * step - cx - skew * y) / fx, i = 3 * labels[p];
       const inverse = planes[i] * x + planes[i + 1] * y + planes[i + 2];
-      const z = inverse > 0 ? 1 / inverse : NaN;
+      const z = inverse > 0 ? Math.exp(detail[p] / 1000) / inverse : NaN;
       out.set([x * z, y * z, z], 3 * p);
     }
   return out;
@@ -205,7 +205,7 @@ function motionTexture(values, component) {
 
 async function makePart(k) {
   const pair = pairs[k], [w, h] = pair.grid, kinds = {
-    labels: Uint16Array, planes: Float32Array, motion: Float32Array, motionCamera: Float32Array,
+    labels: Uint16Array, planes: Float32Array, detail: Int16Array, motion: Float32Array, motionCamera: Float32Array,
     seen: Uint8Array, surface: Uint8Array, sigma: Uint8Array, kind: Uint8Array, component: Uint16Array, origin: Uint8Array,
   };
   const part = { k, w, h, step: pair.step, pictures: pair.pictures, textures: {}, group: new THREE.Group() };
@@ -224,7 +224,7 @@ async function makePart(k) {
     side: THREE.DoubleSide,
   });
   const own = {
-    position: [points(pair, part.labels, part.planes), 3], label: [Float32Array.from(part.labels), 1],
+    position: [points(pair, part.labels, part.planes, part.detail), 3], label: [Float32Array.from(part.labels), 1],
     seen: [Float32Array.from(part.seen), 1], sigma: [Float32Array.from(part.sigma, (x) => x / 255), 1],
     kind: [Float32Array.from(part.kind), 1],
   };

@@ -1,0 +1,89 @@
+"""Detail is exact for exact flow, small for noise, and none where the flow is no evidence."""
+
+import numpy as np
+import pytest
+from helpers_model import HEIGHT, K_NEXT, K_REF, WIDTH, Tiny, random_soup
+
+from soup_nlp.data.pair import Flow
+from soup_nlp.evaluation import recompute
+from soup_nlp.geometry.camera import pixel_grid
+from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
+from soup_nlp.refine.detail import detail
+
+LABELS = np.kron(np.arange(12).reshape(3, 4), np.ones((HEIGHT // 3, WIDTH // 4), int))
+EVERY = np.ones(12, bool)
+BUMPS = 0.3 * np.sin(pixel_grid(HEIGHT, WIDTH) / 5).prod(axis=-1)
+"""Log depth of a surface relative to planes."""
+
+
+def planes_of(turned: bool) -> Reconstruction:
+    """Random planes that share a translation to the side, or turn and move as they like."""
+    soup = random_soup(0, 12)
+    if not turned:
+        side = np.array([0.2, -0.1, 0.0]) / soup.lam[:, None]
+        soup = Soup(soup.lam, soup.n, soup.d, np.eye(3)[None].repeat(12, 0), side)
+    return reconstruct(soup, LABELS, K_REF, K_NEXT)
+
+
+def flow_of(planes: Reconstruction, noise: float = 0.0, depth: np.ndarray | None = None) -> Flow:
+    bumps = np.zeros(LABELS.shape) if depth is None else depth
+    exact = reconstruct(planes.soup, LABELS, K_REF, K_NEXT, detail=bumps).flow
+    error = np.random.default_rng(0).normal(0, noise, exact.shape)
+    return Flow(exact + error, np.ones(LABELS.shape), "test")
+
+
+def test_a_surface_beside_its_planes_is_found():
+    planes = planes_of(turned=False)
+    found = detail(planes, flow_of(planes, depth=BUMPS), K_NEXT, EVERY)
+    # a step to the side is linear in the inverse depth
+    np.testing.assert_allclose(found, BUMPS, atol=1e-9)
+    # any other motion nearly is
+    planes = planes_of(turned=True)
+    found = detail(planes, flow_of(planes, depth=BUMPS), K_NEXT, EVERY)
+    assert np.abs(found - BUMPS).mean() < 0.1 * np.abs(BUMPS).mean()
+
+
+def test_noise_in_all_directions_gives_little_detail():
+    planes = planes_of(turned=False)
+    flow = flow_of(planes, noise=0.3)
+    found = detail(planes, flow, K_NEXT, EVERY)
+    # without a comparison of directions all of it would be depth, with a deviation of
+    length = np.linalg.norm(planes.flow - flow_of_far_points(planes), axis=-1)
+    assert np.sqrt((found**2).mean()) < 0.3 * np.sqrt(((0.3 / length) ** 2).mean())
+    # the round trip of a pixel tells of its error, too
+    flow = flow_of(planes, noise=0.1, depth=BUMPS)
+    less = Flow(flow.uv, np.full(LABELS.shape, np.exp(-1.0)), "test")
+    sure, unsure = (np.abs(detail(planes, f, K_NEXT, EVERY)).mean() for f in (flow, less))
+    assert unsure < 0.5 * sure
+
+
+def flow_of_far_points(planes: Reconstruction) -> np.ndarray:
+    return reconstruct(planes.soup, LABELS, K_REF, K_NEXT, detail=np.full(LABELS.shape, 30.0)).flow
+
+
+def test_flow_that_is_no_evidence_gives_no_detail():
+    planes = planes_of(turned=False)
+    flow = flow_of(planes, depth=np.where(LABELS == 5, 1.0, BUMPS))
+    flow.confidence[:8] = 0.0
+    used = EVERY & (np.arange(12) != 7)
+    found = detail(planes, flow, K_NEXT, used)
+    # a point at e times the depth of its plane is on another surface
+    none = (LABELS == 5) | (LABELS == 7) | (pixel_grid(HEIGHT, WIDTH)[..., 1] < 8)
+    assert not found[none].any()
+    np.testing.assert_allclose(found[~none], BUMPS[~none], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_independent_computation_agrees(seed):
+    tiny, rng = Tiny(seed=seed), np.random.default_rng(seed)
+    K = K_NEXT.copy()
+    K[0, 1] = 1.5
+    planes = reconstruct(tiny.soup, tiny.seg.labels, K_REF, K)
+    rough = reconstruct(tiny.soup, tiny.seg.labels, K_REF, K, detail=3 * BUMPS)
+    uv = rough.flow + rng.normal(0, 0.3, rough.flow.shape)
+    flow, used = Flow(uv, tiny.flow.confidence, "test"), rng.random(len(tiny.soup)) < 0.8
+    found = detail(planes, flow, K, used)
+    given = {"flow": uv, "confidence": flow.confidence, "K_ref": K_REF, "K_next": K}
+    again = recompute.detail(vars(tiny.soup), tiny.seg.labels, given, used)
+    np.testing.assert_allclose(found, again, atol=1e-11)
+    assert 0.02 < np.abs(found).mean() < 0.2
