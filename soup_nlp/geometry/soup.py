@@ -160,6 +160,13 @@ class Reconstruction:
     __repr__ = __str__
 
 
+def plane_depth(soup: Soup, labels: NDArray[np.int32], K: Float) -> Float:
+    """(H, W) z of the planes of superpixels `labels` (H, W); NaN where one faces away."""
+    facing = -np.einsum("hwc,hwc->hw", soup.n[labels], rays(K, pixel_grid(*labels.shape)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(facing > LEAST_FACING, soup.distance[labels] / facing, np.nan)
+
+
 def reconstruct(
     soup: Soup,
     labels: NDArray[np.int32],
@@ -173,13 +180,10 @@ def reconstruct(
     `labels` (H, W) are the superpixels of the pixels, `size_next` is the (height, width) of the
     next frame, by default that of the reference, `detail` that of a `Reconstruction`.
     """
-    uv = pixel_grid(*labels.shape)
-    r = rays(K_ref, uv)
-    facing = -np.einsum("hwc,hwc->hw", soup.n[labels], r)
+    uv, z = pixel_grid(*labels.shape), plane_depth(soup, labels, K_ref)
+    z = z if detail is None else z * np.exp(detail)
     with np.errstate(divide="ignore", invalid="ignore"):
-        z = np.where(facing > LEAST_FACING, soup.distance[labels] / facing, np.nan)
-        z = z if detail is None else z * np.exp(detail)
-        points = z[..., None] * r
+        points = z[..., None] * rays(K_ref, uv)
         moved = np.einsum("hwij,hwj->hwi", soup.R[labels], points) + soup.translation[labels]
         target = project(K_next, moved)
     depth = moved[..., 2]

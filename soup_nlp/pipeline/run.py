@@ -5,13 +5,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from types import FunctionType, NoneType
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from pydantic import BaseModel
 
-from soup_nlp.arrays import Float
 from soup_nlp.config.problem import (
     Expected,
     OutputOptions,
@@ -30,7 +30,7 @@ from soup_nlp.evaluation.confidence import confidence
 from soup_nlp.evaluation.scoring import rigid_depth, score_depths
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.plane import tilt_to_camera
-from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
+from soup_nlp.geometry.soup import Soup, plane_depth, reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
@@ -150,30 +150,27 @@ def _refined(case: Case, soup: Soup, watch: Watch) -> Refined:
 def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> Run:
     """Reconstruct and score a solution and its refinement: a whole run except its times."""
     pair, labels = case.pair, case.segmentation.labels
+    soup = solution.soup if refined is None else refined.soup
     size = pair.image_next.shape[0], pair.image_next.shape[1]
-
-    def dense(soup: Soup, finer: Float | None = None) -> Reconstruction:
-        return reconstruct(soup, labels, pair.K_ref, pair.K_next, size, finer)
-
-    unrefined = dense(solution.soup)
-    planes = unrefined if refined is None else dense(refined.soup)
+    dense = partial(reconstruct, soup, labels, pair.K_ref, pair.K_next, size)
+    after = planes = dense()
     assert pair.flow is not None
     # one superpixel coupled to all of the scene would fill the factors of the information
     data = first_edges(case.data, len(case.segmentation.edges))
     energy = data, case.weights, case.formulation()
     sure = confidence(planes, pair, case.start, *energy, case.given)
-    after = planes
     if refined is not None and case.problem.refine.detail and not case.start.at_rest:
         used = ~case.start.bends & case.data.pixel_weight.any(axis=1)
-        after = dense(refined.soup, detail(planes, pair.flow, pair.K_next, used))
+        after = dense(detail(planes, pair.flow, pair.K_next, used))
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.original is None else full_size(case.original, pair, after)
-    depths = {"solution": after.depth_ref, "start": dense(case.start.soup).depth_ref}
+    start = plane_depth(case.start.soup, labels, pair.K_ref)
+    depths = {"solution": after.depth_ref, "start": start}
     if refined is not None and solution.stages:
-        depths["nlp"] = unrefined.depth_ref
+        depths["nlp"] = plane_depth(solution.soup, labels, pair.K_ref)
     if pair.truth is not None and (rigid := rigid_depth(pair)) is not None:
         depths["rigid"] = rigid
-    fields = vars(case) | {"soup": solution.soup if refined is None else refined.soup}
+    fields = vars(case) | {"soup": soup}
     return Run(
         **fields,
         solution=solution,

@@ -80,7 +80,7 @@ def test_the_depth_of_the_solution_has_detail(result, tmp_path):
     with h5py.File(damaged / "result.h5", "a") as file:
         file["depth/ref"][:] = planes.depth_ref
     assert "depth map solution" in {row.name for row in check_folder(damaged).rows if not row.ok}
-    code, summary = solve(tmp_path / "flat", "--set", "refine.detail=false")
+    code, _ = solve(tmp_path / "flat", "--set", "refine.detail=false")
     assert code == 0
     flat = load(tmp_path / "flat").reconstruction
     assert flat.detail is None
