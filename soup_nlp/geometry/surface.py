@@ -11,7 +11,7 @@ from soup_nlp.geometry.soup import Reconstruction
 BEHIND = 0.05
 """Share of its depth by which a hidden point lies behind the nearest surface."""
 JUMP = 0.1
-"""Share of the depth by which two planes may differ where they meet."""
+"""Share of the depth by which two pixels may differ where they meet."""
 
 
 def hidden(rec: Reconstruction) -> Mask:
@@ -28,25 +28,23 @@ def hidden(rec: Reconstruction) -> Mask:
 
 
 def joined(
-    planes: Float, labels: NDArray[np.integer], group: NDArray[np.integer], K: Float
+    planes: Float, labels: NDArray[np.integer], group: NDArray[np.integer], K: Float, detail: Float
 ) -> tuple[Mask, Mask]:
     """Whether pixels are on one continuous surface with those to the right, (H, W - 1), and below.
 
-    They are within a superpixel, and across the border of two superpixels, `labels` (H, W), of one
-    `group` (H, W), such as a rigid component, whose `planes` (N, 3), m with depth 1 / (m . ray),
-    meet there.
+    They are if they belong to one `group` (H, W), such as a rigid component, and their depths are
+    nearly the same halfway: those of the `planes` (N, 3) of their superpixels `labels` (H, W), m
+    with depth 1 / (m . ray), with their `detail` (H, W).
     """
     ray = rays(K, pixel_grid(*labels.shape))
     out = []
     for a, b in (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:]):
-        i, k = labels[a], labels[b]
-        continuous = i == k
-        across = ~continuous & (group[a] == group[b])
+        across, step = labels[a] != labels[b], detail[a] - detail[b]
         between = 0.5 * (ray[a][across] + ray[b][across])
-        ends = np.stack([np.sum(planes[x[across]] * between, axis=1) for x in (i, k)])
-        far, near = ends.min(axis=0), ends.max(axis=0)
-        continuous[across] = near - far <= JUMP * far
-        out.append(continuous)
+        ends = [np.sum(planes[labels[x][across]] * between, axis=1) for x in (a, b)]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step[across] += np.log(ends[1] / ends[0])
+        out.append((group[a] == group[b]) & (np.abs(step) <= np.log1p(JUMP)))
     return out[0], out[1]
 
 

@@ -112,6 +112,7 @@ class Frame:
         sure: (H, W) pixels of clouds, see `Result.sure`.
         labels: (H, W) superpixel of its pair; 0 where the depth is unknown.
         planes: (N, 3) m of every superpixel with depth 1 / (m . ray).
+        detail: (H, W) log depth relative to the planes; 0 where it is unknown.
         flow: (H, W, 2) flow to the next frame, pixels; None of the last frame.
         unit: Unit of length as a phrase for headers of files.
     """
@@ -127,6 +128,7 @@ class Frame:
     sure: Mask
     labels: NDArray[np.integer]
     planes: Float
+    detail: Float
     flow: NDArray[np.floating] | None
     unit: str
 
@@ -154,7 +156,7 @@ class Frame:
     @cached_property
     def surface(self) -> tuple[Mask, Mask]:
         """Continuity to the right and downwards, see `geometry.surface.joined`."""
-        return joined(self.planes, self.labels, self.components, self.K)
+        return joined(self.planes, self.labels, self.components, self.K, self.detail)
 
     def _repr_html_(self) -> str:
         near, far = figures.depth_range(self.depth)
@@ -278,6 +280,7 @@ class Chain:
             "drawn": (pair.drawn, False),
             "sure": (pair.sure, False),
             "labels": (pair.labels, 0),
+            "detail": (pair.detail, 0.0),
             "components": (tracks[pair.components.of_pixel].astype(np.int32), -1),
         }
         return Frame(

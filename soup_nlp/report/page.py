@@ -205,12 +205,11 @@ def make_pair(chain: Chain, k: int, most: float = PIXELS[0]) -> dict[str, Any]:
     home = T @ camera.R.T + scale * camera.t
     pivot = _pivots(result, scale)
     labels, sigma, known = rec.labels[every], result.sigma[every], np.isfinite(rec.depth_ref)
-    detail = np.zeros(rec.labels.shape) if rec.detail is None else rec.detail
     byte = np.where(np.isfinite(sigma), 254 * np.clip(sigma / 0.5, 0, 1), 255)
     return {
         "labels": labels.astype(np.uint16),
         "planes": _single(result.planes[0] / scale),
-        "detail": (1000 * detail[every]).round().astype(np.int16),
+        "detail": (1000 * result.detail[every]).round().astype(np.int16),
         "motion": _single(_motion(camera.R @ R, home, pivot)),
         "motionCamera": _single(_motion(R, T, pivot)),
         "seen": (~hidden(rec)[every]).astype(np.uint8),

@@ -167,6 +167,12 @@ class Result:
         return str(self.summary.get("truth_unit") or "m")
 
     @property
+    def detail(self) -> Float:
+        """(H, W) log depth of the reference frame relative to the planes."""
+        found = self.reconstruction.detail
+        return np.zeros(self.labels.shape) if found is None else found
+
+    @property
     def labels(self) -> NDArray[np.integer]:
         """(H, W) superpixel of every pixel."""
         return self.reconstruction.labels
@@ -195,7 +201,7 @@ class Result:
     @cached_property
     def surface(self) -> tuple[Mask, Mask]:
         """Continuity of the surface to the right and downwards, see `geometry.surface.joined`."""
-        return joined(self.planes[0], self.labels, self.components.of_pixel, self.K)
+        return joined(self.planes[0], self.labels, self.components.of_pixel, self.K, self.detail)
 
     @cached_property
     def sure(self) -> Mask:

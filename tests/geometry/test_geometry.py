@@ -17,7 +17,7 @@ from soup_nlp.geometry.plane import (
     tilt_to_camera,
 )
 from soup_nlp.geometry.soup import Soup, nearest_on_top, reconstruct
-from soup_nlp.geometry.surface import at_jumps
+from soup_nlp.geometry.surface import at_jumps, joined
 
 unit = st.floats(-1.0, 1.0)
 vectors = hnp.arrays(float, (5, 3), elements=unit)
@@ -237,3 +237,14 @@ def test_both_sides_of_a_break_of_the_surface_are_at_a_jump():
     expected = np.zeros((3, 4), bool)
     expected[0, 1:3] = expected[1:, 3] = True
     np.testing.assert_array_equal(at_jumps(right, below), expected)
+
+
+def test_a_surface_breaks_where_depth_jumps():
+    labels, group = np.array([[0, 0, 1, 1]]), np.zeros((1, 4), int)
+    planes, detail = np.array([[0, 0, 0.5], [0, 0, 0.48]]), np.array([[0, 0.2, 0.2, 0.25]])
+    # 22 % within a superpixel, 4 % between two planes, 5 % within
+    right, below = joined(planes, labels, group, K_REF, detail)
+    np.testing.assert_array_equal(right, [[False, True, True]])
+    assert below.shape == (0, 4)
+    right, _ = joined(planes, labels, np.array([[0, 0, 1, 1]]), K_REF, detail)
+    np.testing.assert_array_equal(right, [[False, False, True]])

@@ -30,7 +30,7 @@ from soup_nlp.report.verdict import summary
 def small_run(small_run):
     """The run with detail."""
     rec, pair = small_run.reconstruction, small_run.pair
-    detail = 0.1 * np.sin(pixel_grid(*pair.size)[..., 0])
+    detail = 0.05 * np.sin(pixel_grid(*pair.size)[..., 0])
     fine = reconstruct(rec.soup, rec.labels, pair.K_ref, pair.K_next, detail=detail)
     return replace(small_run, reconstruction=replace(fine, sigma_ref=rec.sigma_ref))
 
