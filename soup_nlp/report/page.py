@@ -89,7 +89,7 @@ def _css(colour: Any) -> str:
 def _packed(array: NDArray[Any]) -> str:
     """Numbers, deflated, as base64."""
     little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-    return base64.b64encode(zlib.compress(little.tobytes(), 9)).decode("ascii")
+    return base64.b64encode(zlib.compress(little.tobytes())).decode("ascii")
 
 
 def _figure(picture: Picture, pairs: int) -> dict[str, str]:
