@@ -66,7 +66,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 SLOWEST = (
     *("test_batches", "test_bending", "test_walkthrough", "test_sequence", "test_stop"),
-    *("test_symbolic", "test_sums", "test_compare", "test_given_depth", "test_family"),
+    *("test_symbolic", "test_compare", "test_given_depth", "test_family"),
     *("test_odd_inputs", "test_stored_json"),
 )
 
