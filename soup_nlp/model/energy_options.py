@@ -87,9 +87,6 @@ class EnergyOptions(Section):
     across: Share = 0.03
     """Factor of E_arap, E_prior and, over gaps in depth, E_cont between superpixels of different
     components; 1 is the paper's."""
-    arap_scene: Share = 0.1
-    """Weight w1 of further edges of E_arap, from the scene's superpixel of median depth to all of
-    the scene with a flow and depth of their own; 0 is the paper's graph."""
     pixel_samples: Whole | Literal["all"] = 16
     """Pixels per superpixel in E_proj, or all."""
     weights: WeightOptions = WeightOptions()

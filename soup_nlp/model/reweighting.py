@@ -3,7 +3,6 @@ their units. See docs/formulation.md, 14.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -14,9 +13,6 @@ from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import BENDING, BENDING_TURN_PX, GAP, EnergyOptions
 from soup_nlp.model.formulas import relief
 
-OF_EDGES: tuple[str, ...] = ("edges", "edge_weight", "edge_unit", "rotation_scale")
-OF_EDGES += ("prior_weight", "prior_relief", "depth_weight", "depth_change")
-"""Arrays of `EnergyData` with a row per edge."""
 HELD = 30.0
 """Factor of E_prior where it keeps the relief of the start: of what is not seen, and from there to
 what is. With 1, unseen parts run away on alley_1 and kitti_tracking 0 (MRE 33 and 0.66)."""
@@ -90,7 +86,7 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
 
     steep = len(data) / 1000 * BENDING["orient"]
     shown = bending("prior", data.edges) * (1 - by_prior)
-    out = replace(
+    return replace(
         data,
         edge_weight=joined * data.edge_weight,
         prior_weight=shown * np.where(held, HELD, joined) * prior,
@@ -103,34 +99,6 @@ def weighted(data: EnergyData, soup: Soup, known: Known, options: EnergyOptions)
         order_weight=order,
         order_step=step,
     )
-    return _with_scene(out, soup, known, options.arap_scene)
-
-
-def _with_scene(data: EnergyData, soup: Soup, known: Known, weight: float) -> EnergyData:
-    """The data with E_arap edges from the superpixel of median depth to all of the scene.
-
-    K-NN edges join the near and the far part of a scene by few links. E_arap is truncated, so that
-    cutting these costs little, and each part gets a translation of a length of its own.
-    """
-    scene = (known.component == 0) & ~known.bends & np.isfinite(known.variance)
-    members = np.flatnonzero(scene & (data.pixel_weight.sum(axis=1) > 0.5))
-    if weight == 0 or len(members) < 2:
-        return data
-    z = soup.depth_at(data.anchor_ray)[members]
-    centre = members[np.argsort(z)[len(z) // 2]]
-    edges = np.sort(np.column_stack([np.full(len(members), centre), members]), axis=1)
-    n = len(data)
-    edges = edges[~np.isin(edges @ [n, 1], np.append(data.edges @ [n, 1], centre * (n + 1)))]
-    values = {"edge_weight": weight, "edge_unit": 1.0, "rotation_scale": 1.0}
-    more = {k: np.full(len(edges), values.get(k, 0.0)) for k in OF_EDGES} | {"edges": edges}
-    rows: dict[str, Any] = {k: np.concatenate([getattr(data, k), v]) for k, v in more.items()}
-    return replace(data, **rows)
-
-
-def first_edges(data: EnergyData, count: int) -> EnergyData:
-    """The same data with the first `count` edges: those of the K-NN graph precede others."""
-    rows: dict[str, Any] = {k: getattr(data, k)[:count] for k in OF_EDGES}
-    return replace(data, **rows)
 
 
 def in_pixels(

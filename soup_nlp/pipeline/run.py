@@ -34,7 +34,6 @@ from soup_nlp.geometry.soup import Soup, plane_depth, reconstruct
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
-from soup_nlp.model.reweighting import first_edges
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run, full_size
 from soup_nlp.refine.detail import detail
@@ -155,9 +154,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     dense = partial(reconstruct, soup, labels, pair.K_ref, pair.K_next, size)
     after = planes = dense()
     assert pair.flow is not None
-    # one superpixel coupled to all of the scene would fill the factors of the information
-    data = first_edges(case.data, len(case.segmentation.edges))
-    energy = data, case.weights, case.formulation()
+    energy = case.data, case.weights, case.formulation()
     sure = confidence(planes, pair, case.start, *energy, case.given)
     if refined is not None and case.problem.refine.detail and not case.start.at_rest:
         used = ~case.start.bends & case.data.pixel_weight.any(axis=1)

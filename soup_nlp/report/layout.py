@@ -42,7 +42,7 @@ energy/radius             1     N       largest distance of a rim pixel from the
 energy/pixel_ray          1     N,S,3   rays of the sampled pixels of E_proj
 energy/pixel_target       px    N,S,2   where the flow brings the sampled pixels
 energy/pixel_weight       1     N,S     confidence x usable share / sample size; 0 drops a pixel
-energy/edges              1     E,2     edges i < k: K-NN, and those that join the scene
+energy/edges              1     E,2     edges i < k of the K-NN graph
 energy/edge_weight        1     E       w1 = w2 of both directions, less between two components
 energy/prior_weight       1     E       weight of E_prior: flow noise / K for each direction
 energy/prior_relief       1     E       relative difference of 1/z that costs nothing in E_prior

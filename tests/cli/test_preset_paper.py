@@ -38,7 +38,6 @@ PAPER = {
     # Eq. 1 to 7: factor 1 of E_arap, the same everywhere; rho and rho_n alone truncate; four terms
     "energy.units": "paper",
     "energy.across": 1.0,
-    "energy.arap_scene": 0.0,
     "energy.weights.prior": 0.0,
     "energy.weights.order": 0.0,
     "energy.weights.sigma_arap": np.inf,

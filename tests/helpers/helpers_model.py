@@ -24,7 +24,7 @@ from soup_nlp.model.layout import GAUGES as GAUGES
 from soup_nlp.model.layout import Layout, MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp
-from soup_nlp.model.reweighting import OF_EDGES, in_pixels
+from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.model.superpixel import matrix_view, tangent_view
 
 Float = NDArray[np.float64]
@@ -265,13 +265,15 @@ def cut_by_part(
     return labels, low == high
 
 
+EDGE_FIELDS = ("edges", "edge_weight", "edge_unit", "rotation_scale")
+EDGE_FIELDS += ("prior_weight", "prior_relief", "depth_weight", "depth_change")
 PAIR_FIELDS = ("pairs", "boundary_ray", "pair_weight", "pair_factor", "pair_unit")
 PAIR_FIELDS += ("orient_weight", "order_weight", "order_step")
 
 
 def with_graph(data: EnergyData, edges: list[int], pairs: list[int]) -> EnergyData:
     """The data with some rows of the K-NN graph and of the neighbour graph."""
-    rows = {**dict.fromkeys(OF_EDGES, edges), **dict.fromkeys(PAIR_FIELDS, pairs)}
+    rows = {**dict.fromkeys(EDGE_FIELDS, edges), **dict.fromkeys(PAIR_FIELDS, pairs)}
     return replace(data, **{k: getattr(data, k)[np.array(v, int)] for k, v in rows.items()})
 
 

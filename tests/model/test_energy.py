@@ -210,7 +210,7 @@ def test_weights_are_shares_across_components_and_factors_where_surfaces_bend():
     assert 0 < gap[part[i] != part[k]].sum() < (part[i] != part[k]).sum()
     joined = np.where(part[a] == part[b], 1.0, 0.2)
     meets = np.where((part[i] != part[k]) & gap, 0.2, 1.0)
-    options = EnergyOptions(across=0.2, arap_scene=0.0)
+    options = EnergyOptions(across=0.2)
     # wherever bending begins, it does so at superpixels that both bend
     factor = {
         name: [np.where(bends[p] & bends[q], value, 1.0) for p, q in ((a, b), (i, k))]
@@ -235,7 +235,7 @@ def test_what_a_prior_decides_keeps_its_slopes_and_has_its_depths():
     prior = log_depth, ambiguity, np.full(len(soup), 0.12)
     known = of_scene(len(soup), component=part, prior=prior)
     plain = replace(data, orient_turn=0 * data.orient_turn)
-    found = weighted(plain, soup, known, EnergyOptions(across=1.0, arap_scene=0.0))
+    found = weighted(plain, soup, known, EnergyOptions(across=1.0))
     i, k = data.edges.T
     # between components the flow says nothing
     by_prior = np.where(part[i] == part[k], np.maximum(ambiguity[i], ambiguity[k]), 1.0)
@@ -259,9 +259,7 @@ def test_what_is_not_seen_keeps_the_relief_of_the_start():
     data, soup = tiny("pixels").data, tiny().soup
     unseen = np.arange(len(soup)) < 7
     variance = np.where(unseen, np.inf, 1.0)
-    found = weighted(
-        data, soup, of_scene(len(soup), variance=variance), EnergyOptions(arap_scene=0.0)
-    )
+    found = weighted(data, soup, of_scene(len(soup), variance=variance), EnergyOptions())
     held = unseen[data.edges].any(axis=1)
     assert 0 < held.sum() < len(held)
     np.testing.assert_allclose(found.prior_weight, np.where(held, HELD, 1.0) * data.prior_weight)
@@ -283,34 +281,6 @@ def test_order_weighs_by_the_noise_and_asks_for_steps_where_it_places():
     assert not found.order_step[~beside].any()
     off = options.replace(weights=options.weights.replace(order=0.0))
     assert not weighted(data, soup, of_scene(count, order=first), off).order_weight.any()
-
-
-def test_the_scene_is_joined_through_its_superpixel_of_median_depth():
-    """Edges to members with a flow that are no K-NN edges; E_arap alone has them."""
-    problem = tiny()
-    soup, count = problem.soup.normalised(), len(problem.soup)
-    usable = np.where(np.arange(count) == 5, 0.4, 0.6)
-    pixels = problem.data.pixel_weight.shape[1]
-    data = replace(problem.data, pixel_weight=np.tile(usable[:, None] / pixels, pixels))
-    scene = np.arange(count) != 3
-    # without depth of its own a superpixel is not joined
-    variance = np.where(scene, 1.0, np.inf)
-    plain, joined = (
-        weighted(data, soup, of_scene(count, variance=variance), EnergyOptions(arap_scene=w))
-        for w in (0.0, 0.25)
-    )
-    np.testing.assert_array_equal(plain.edges, data.edges)
-    Z, known = soup.depth_at(data.anchor_ray), {tuple(e) for e in data.edges.tolist()}
-    members = sorted(set(range(count)) - {3, 5}, key=Z.__getitem__)
-    centre = members[len(members) // 2]
-    expected = {(min(i, centre), max(i, centre)) for i in members if i != centre} - known
-    assert 1 < len(expected) < len(members) - 1
-    np.testing.assert_array_equal(joined.edges[: len(data.edges)], data.edges)
-    assert sorted(map(tuple, joined.edges[len(data.edges) :].tolist())) == sorted(expected)
-
-    values = {"edge_weight": 0.25, "edge_unit": 1, "rotation_scale": 1, "prior_weight": 0}
-    for field, value in {**values, "depth_weight": 0}.items():
-        assert (getattr(joined, field)[len(data.edges) :] == value).all(), field
 
 
 def test_one_superpixel_is_a_valid_problem():
