@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from soup_nlp.arrays import Float, FloatMap, Image
+from soup_nlp.arrays import Float, FloatMap
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.working_size import full_depth, resized
@@ -212,23 +212,22 @@ def full_size(full: Pair, pair: Pair, result: Reconstruction) -> FullSize:
     """
 
     def enlarged(
-        labels: Labels, normal: Float, offset: Float, depth: Float, *frames: tuple[Image, Float]
+        frame: str, labels: Labels, normal: Float, offset: Float, depth: Float
     ) -> FloatMap:
-        (large, K), (_, K_small) = frames
-        z = full_depth(labels, large.shape[:2], normal, offset, K)
+        K, K_small = (getattr(p, f"K_{frame}") for p in (full, pair))
+        size = getattr(full, f"image_{frame}").shape[:2]
+        z = full_depth(labels, size, normal, offset, K)
         if result.detail is None:
             return z
         flat = full_depth(labels, depth.shape, normal, offset, K_small)
-        return z * resized(depth.astype(np.float32) / flat, z.shape)
+        return z * resized(depth.astype(np.float32) / flat, size)
 
     soup, source = result.soup, result.source_next
-    frames = [((p.image_ref, p.K_ref), (p.image_next, p.K_next)) for p in (full, pair)]
-    ref, following = zip(*frames, strict=True)
-    depth_ref = enlarged(result.labels, soup.n, soup.distance, result.depth_ref, *ref)
+    depth_ref = enlarged("ref", result.labels, soup.n, soup.distance, result.depth_ref)
     # X' = R X + t carries n . X + D = 0 to (R n) . X' + D - (R n) . t = 0
     turned = np.einsum("nij,nj->ni", soup.R, soup.n)
     moved = soup.distance - np.einsum("ni,ni->n", turned, soup.translation)
     shown = np.where(source >= 0, result.labels.ravel()[source], -1).astype(np.int32)
-    depth_next = enlarged(shown, turned, moved, result.depth_next, *following)
+    depth_next = enlarged("next", shown, turned, moved, result.depth_next)
     scores = score_depths(full.truth, {"full": depth_ref.astype(np.float64)})
     return FullSize(depth_ref, depth_next, scores.get("full"))

@@ -30,7 +30,8 @@ from soup_nlp.report.verdict import summary
 def small_run(small_run):
     """The run with detail."""
     rec, pair = small_run.reconstruction, small_run.pair
-    detail = 0.05 * np.sin(pixel_grid(*pair.size)[..., 0])
+    # as the page rounds it
+    detail = np.round(0.05 * np.sin(pixel_grid(*pair.size)[..., 0]), 3)
     fine = reconstruct(rec.soup, rec.labels, pair.K_ref, pair.K_next, detail=detail)
     return replace(small_run, reconstruction=replace(fine, sigma_ref=rec.sigma_ref))
 
@@ -101,8 +102,8 @@ def test_planes_and_motions_rebuild_both_frames(text, small_run):
     ray = rays(np.array(s["K"]), pixel_grid(*labels.shape))
     detail = unpack(s["detail"], "<i2", labels.shape) / 1000
     points = ray * (np.exp(detail) / np.einsum("hwc,hwc->hw", planes[labels], ray))[..., None]
-    # detail is rounded to 0.0005; single precision, about 1e-7, grows at small angles
-    np.testing.assert_allclose(points[..., 2], scale * run.reconstruction.depth_ref, rtol=6e-4)
+    # single precision, about 1e-7, grows where a plane is seen at a small angle
+    np.testing.assert_allclose(points[..., 2], scale * run.reconstruction.depth_ref, rtol=1e-4)
     for name, pose in (("motionCamera", np.eye(4)), ("motion", pose_next)):
         w, pivot, shift = (
             unpack(s[name], "<f4", (n, 9))
@@ -113,7 +114,7 @@ def test_planes_and_motions_rebuild_both_frames(text, small_run):
         moved = np.einsum("hwij,hwj->hwi", exp(w), points - pivot) + pivot + shift
         want = scale * run.reconstruction.points_next @ pose[:3, :3].T + pose[:3, 3]
         far = np.linalg.norm(want, axis=-1, keepdims=True)
-        np.testing.assert_allclose(moved / far, want / far, atol=6e-4)
+        np.testing.assert_allclose(moved / far, want / far, atol=1e-4)
 
 
 def test_curtains_are_cut(shown, small_run):
