@@ -103,11 +103,9 @@ class Flow:
         """Share of the pixels whose flow is used."""
         return float(np.mean(self.confidence > 0))
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         h, w = self.confidence.shape
         return f"Flow({self.source}, {w}x{h}, {self.usable:.1%} usable)"
-
-    __repr__ = __str__
 
 
 _PARTS = {
@@ -173,10 +171,8 @@ class Truth:
         """Names of the parts that are not None."""
         return [name for name, value in vars(self).items() if value is not None and name != "unit"]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return f"Truth({', '.join(self.known()) or 'nothing'}; {self.unit})"
-
-    __repr__ = __str__
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -293,11 +289,9 @@ class Pair:
         K_ref, K_next = longer * self.K_ref, longer * self.K_next
         return replace(self, K_ref=K_ref, K_next=K_next, focal_sigma=sigma)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         h, w = self.size
         return f"Pair({self.name}, {w}x{h}, {self.flow or 'no flow'}, {self.truth or 'no truth'})"
-
-    __repr__ = __str__
 
 
 def _check_focal(K: Float, image: Image, where: str) -> None:

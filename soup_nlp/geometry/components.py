@@ -44,13 +44,11 @@ class Component:
     interpolated: float
     centre: Float
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return (
             f"Component({self.label}, {self.superpixels} superpixels, {self.pixels} pixels,"
             f" {self.motion}, residual {self.residual_px:.2g} px)"
         )
-
-    __repr__ = __str__
 
     def scaled(self, factor: float) -> "Component":
         """The same in another unit of length, of which `factor` are one of now."""
@@ -88,11 +86,9 @@ class Components:
     def __iter__(self) -> Iterator[Component]:
         return iter(self.members)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         share = self.background.pixels / self.of_pixel.size
         return f"Components({len(self)}, background {share:.0%} of the pixels)"
-
-    __repr__ = __str__
 
     @property
     def background(self) -> Component:

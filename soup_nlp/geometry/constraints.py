@@ -130,11 +130,9 @@ class Constraints(dict[str, Kind]):
             k.largest <= (tol if tol is not None and k.limit else k.limit) for k in self.values()
         )
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         units = (f"     {name:<9} in units of {DEFINITIONS[name].unit}" for name in self)
         return "\n".join([table(self.values()), *units])
-
-    __repr__ = __str__
 
 
 def constraints(

@@ -54,14 +54,12 @@ class Segmentation:
     def __len__(self) -> int:
         return len(self.anchors)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         height, width = self.labels.shape
         return (
             f"Segmentation({len(self)} superpixels of {width}x{height}, K = {self.knn.shape[1]},"
             f" {len(self.edges)} K-NN edges, {len(self.pairs)} neighbour pairs)"
         )
-
-    __repr__ = __str__
 
     def across(self, label: Int | Mask) -> Mask:
         """(P,) True where two neighbours have different labels (N,)."""

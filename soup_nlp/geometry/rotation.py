@@ -83,11 +83,9 @@ class RigidMotion:
     R: Float
     t: Float
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         x, y, z = self.t
         return f"RigidMotion(turn {self.angle:.3g} deg, t ({x:.3g}, {y:.3g}, {z:.3g}))"
-
-    __repr__ = __str__
 
     def __call__(self, points: Float) -> Float:
         """The points (..., 3), moved; DataError for what is no array of points."""

@@ -39,14 +39,12 @@ class Soup:
     def __len__(self) -> int:
         return len(self.lam)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         D, T = self.distance, np.linalg.norm(self.translation, axis=1)
         return (
             f"Soup({len(self)} superpixels, plane distance {D.min():.3g}..{D.max():.3g},"
             f" translation {T.min():.3g}..{T.max():.3g})"
         )
-
-    __repr__ = __str__
 
     @property
     def distance(self) -> Float:
@@ -152,12 +150,10 @@ class Reconstruction:
             return None
         return np.where(self.source_next >= 0, self.sigma_ref.ravel()[self.source_next], np.nan)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         z = self.depth_ref[np.isfinite(self.depth_ref)]
         seen = np.isfinite(self.depth_next).mean()
         return f"Reconstruction(depth {z.min():.3g}..{z.max():.3g}, next frame {seen:.0%} covered)"
-
-    __repr__ = __str__
 
 
 def plane_depth(soup: Soup, labels: NDArray[np.int32], K: Float) -> Float:
