@@ -4,7 +4,6 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from soup_nlp.arrays import Image, Labels
@@ -111,12 +110,6 @@ def split_components(labels: Labels, min_size: int) -> Labels:
     if small.any():
         hole = small[pieces]
         nearest = ndimage.distance_transform_edt(hole, return_distances=False, return_indices=True)
-        pieces = pieces[tuple(nearest)]
         # filling may cut a fragment off from the rest of its label: another pass makes it a label
-        return split_components(_relabel(pieces), 1)
-    return _relabel(pieces)
-
-
-def _relabel(labels: NDArray[np.int32]) -> Labels:
-    present = np.bincount(labels.ravel()) > 0
-    return (np.cumsum(present, dtype=np.int32) - 1)[labels]
+        return split_components(pieces[tuple(nearest)], 1)
+    return pieces
