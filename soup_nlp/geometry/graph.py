@@ -119,14 +119,12 @@ def build_segmentation(
 def _nearest(anchors: Float, k: int) -> Int:
     """(N, k) nearest other anchors, nearest first, of equal distances the lower index first."""
     n = len(anchors)
-    if n == 1:
-        return np.zeros((1, 0), np.int64)
     most = min(n, k + 1 + TIED)
     _, index = scipy.spatial.cKDTree(anchors).query(anchors, k=most)
     index = np.sort(index.reshape(n, most), axis=1)
     far = np.round(((anchors[index] - anchors[:, None]) ** 2).sum(axis=2), 6)
     far[index == np.arange(n)[:, None]] = np.inf
-    order = np.argsort(far, axis=1, kind="stable")[:, :k]
+    order = np.argsort(far, axis=1, kind="stable")[:, : min(k, n - 1)]
     return np.take_along_axis(index, order, axis=1).astype(np.int64)
 
 

@@ -52,8 +52,7 @@ def log(R: ArrayLike) -> Float:
 
 def cayley(w: ArrayLike) -> Float:
     """Cayley map (..., 3, 3) of (..., 3): equals `exp(w)` to third order, rational in w."""
-    w = np.asarray(w, float)
-    h = 0.5 * w
+    h = 0.5 * np.asarray(w, float)
     n2 = np.sum(h * h, axis=-1)[..., None, None]
     W = hat(h)
     return np.eye(3) + (2.0 / (1.0 + n2)) * (W + W @ W)
@@ -63,7 +62,6 @@ def nearest(M: ArrayLike) -> Float:
     """Rotation (..., 3, 3) nearest to M in the Frobenius norm (orthogonal Procrustes)."""
     U, _, Vt = np.linalg.svd(np.asarray(M, float))
     sign = np.sign(np.linalg.det(U @ Vt))
-    U = U.copy()
     U[..., :, 2] *= sign[..., None]
     return U @ Vt
 
