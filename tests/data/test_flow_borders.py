@@ -5,7 +5,7 @@ import pytest
 from helpers_truth import assert_partition, majority
 
 from soup_nlp.config.problem import make_problem
-from soup_nlp.data.flow.borders import fit_affine, follow_depth, follow_flow
+from soup_nlp.data.flow.borders import AffineFlow, follow_depth, follow_flow
 from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Flow
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -82,10 +82,10 @@ def test_a_superpixel_without_flow_attracts_nothing():
     flow.confidence[hole] = 0
     flow.uv[hole] = 50
     np.testing.assert_array_equal(follow_flow(before, flow), before)
-    fit, weight = fit_affine(flow, before)
+    fit = AffineFlow(flow, before)
     assert not fit.fitted[before[20, 20]]
     assert fit.fitted.sum() == 47
-    assert len(weight) == (~hole).sum()
+    assert len(fit.weight) == (~hole).sum()
 
 
 def test_scattered_pixels_are_no_outliers():
@@ -98,8 +98,7 @@ def test_scattered_pixels_are_no_outliers():
     lone = (labels == 1) & (rng.random(labels.shape) < 0.02)
     uv = uv + rough + np.where(lone, 2.0, 0.0)[..., None]
     flow = Flow(uv.astype(np.float32), np.ones(labels.shape, np.float32), "test")
-    _, weight = fit_affine(flow, labels)
-    weight = weight.reshape(labels.shape)
+    weight = AffineFlow(flow, labels).weight.reshape(labels.shape)
     assert np.median(weight[labels == 0]) > 0.4
     assert weight[lone].max() < 0.1
     assert weight[(labels == 1) & ~lone].min() > 0.9

@@ -5,8 +5,6 @@ smaller part have an unavoidable re-projection error and the depth of the other 
 are moved to the neighbouring superpixel with their flow. The flow of a superpixel is an affine fit.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +26,7 @@ LEAST_STEP = 0.05
 def follow_flow(labels: NDArray[np.integer], flow: Flow, margin_px: float = 1.0) -> Labels:
     """Move borders of superpixels, labels (H, W), to discontinuities of the flow.
 
-    In every sweep a border pixel changes to the neighbour whose affine flow (see `fit_affine`) is
+    In every sweep a border pixel changes to the neighbour whose affine flow (see `AffineFlow`) is
     nearest to the flow of the pixel, if it is nearer than that of its superpixel by more than the
     margin. Pixels without confidence do not change. Each new label 0..N'-1 is connected
     (4-neighbourhood) and not empty; N' may differ from N.
@@ -37,7 +35,7 @@ def follow_flow(labels: NDArray[np.integer], flow: Flow, margin_px: float = 1.0)
     count = int(current.max()) + 1
     for sweep in range(2 * SWEEPS):
         if sweep % SWEEPS == 0:
-            fit, _ = fit_affine(flow, current)
+            fit = AffineFlow(flow, current)
             near = np.ones(current.shape, bool)
         framed = np.pad(current, 1, mode="edge")
         sides = (framed[:-2, 1:-1], framed[2:, 1:-1], framed[1:-1, :-2], framed[1:-1, 2:])
@@ -71,21 +69,51 @@ def follow_depth(labels: NDArray[np.integer], log_depth: Float) -> Labels:
     return follow_flow(labels, Flow(both.astype(np.float32), finite.astype(np.float32), "depth"))
 
 
-@dataclass(frozen=True)
 class AffineFlow:
-    """An affine flow for every superpixel, which approximates that of a small rigid plane.
+    """Affine flows fitted to superpixels (H, W), which approximate those of small rigid planes.
+
+    Least squares are re-weighted by the confidence times Cauchy's `1 / (1 + (r / s)^2)`. s is the
+    larger of `SCALE_PX` and 1.48 times the weighted mean absolute residual of the superpixel. The
+    first weights follow from the distance to its median flow, since plain least squares would fit a
+    slope across two motions without outliers.
 
     Attributes:
         coefficients: (N, 3, 2) of (1, (u - u0) / size, (v - v0) / size) -> flow, pixels.
         centre: (N, 2) u0, v0.
         size: (N,) square root of the number of pixels with positive confidence.
         fitted: (N,) False for superpixels with fewer than six such pixels, too few for a fit.
+        weight: (P,) last weights of all such pixels.
     """
 
-    coefficients: Float
-    centre: Float
-    size: Float
-    fitted: NDArray[np.bool_]
+    def __init__(self, flow: Flow, labels: NDArray[np.integer]) -> None:
+        v, u = np.nonzero(flow.confidence > 0)
+        which, n = labels[v, u].astype(np.int64), int(labels.max()) + 1
+        base = flow.confidence[v, u].astype(np.float64)
+        total = np.maximum(np.bincount(which, base, n), 1e-30)
+        self.centre = np.stack([np.bincount(which, base * x, n) / total for x in (u, v)], axis=1)
+        pixels = np.bincount(which, minlength=n)
+        # coordinates are normalised by the size of the superpixel
+        self.size, self.fitted = np.sqrt(np.maximum(pixels, 1)), pixels >= 6
+        self.coefficients, self.weight = np.zeros((n, 3, 2)), base
+        if not len(which):
+            return
+        X = self.basis(which, u, v)
+        Y = flow.uv[v, u].astype(np.float64)
+
+        def medians(values: Float) -> Float:
+            return np.asarray(median(values, which, np.arange(n)))
+
+        def weights(r: Float, spread: Float) -> Float:
+            return 1.0 / (1.0 + (r / np.maximum(spread, SCALE_PX)[which]) ** 2)
+
+        r = np.linalg.norm(Y - np.stack([medians(y) for y in Y.T], axis=1)[which], axis=1)
+        self.weight = weights(r, 1.48 * medians(r))
+        for _ in range(ROUNDS):
+            w = base * self.weight
+            self.coefficients = _weighted(which, X, Y, w, n)
+            r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, self.coefficients[which]), axis=1)
+            mass = np.maximum(np.bincount(which, w, n), 1e-30)
+            self.weight = weights(r, 1.48 * np.bincount(which, w * r, n) / mass)
 
     def basis(self, which: Int, u: Int, v: Int) -> Float:
         """(P, 3) the three functions at pixels of superpixels `which` (P,)."""
@@ -96,42 +124,6 @@ class AffineFlow:
         """(P,) distance of flows (P, 2) from those fitted to superpixels `which` (P,), pixels."""
         predicted = np.einsum("pa,pac->pc", self.basis(which, u, v), self.coefficients[which])
         return np.where(self.fitted[which], np.linalg.norm(uv - predicted, axis=1), np.inf)
-
-
-def fit_affine(flow: Flow, labels: NDArray[np.integer]) -> tuple[AffineFlow, Float]:
-    """Affine flow of superpixels, and last weights (P,) of the pixels with positive confidence.
-
-    Least squares are re-weighted by the confidence times Cauchy's `1 / (1 + (r / s)^2)`. s is the
-    larger of `SCALE_PX` and 1.48 times the weighted mean absolute residual of the superpixel. The
-    first weights follow from the distance to its median flow, since plain least squares would fit a
-    slope across two motions without outliers.
-    """
-    v, u = np.nonzero(flow.confidence > 0)
-    which, n = labels[v, u].astype(np.int64), int(labels.max()) + 1
-    base = flow.confidence[v, u].astype(np.float64)
-    total = np.maximum(np.bincount(which, base, n), 1e-30)
-    centre = np.stack([np.bincount(which, base * x, n) / total for x in (u, v)], axis=1)
-    pixels = np.bincount(which, minlength=n)
-    # coordinates are normalised by the size of the superpixel
-    fit = AffineFlow(np.zeros((n, 3, 2)), centre, np.sqrt(np.maximum(pixels, 1)), pixels >= 6)
-    X = fit.basis(which, u, v)
-    Y = flow.uv[v, u].astype(np.float64)
-    C = fit.coefficients
-    if not len(which):
-        return fit, base
-
-    def medians(values: Float) -> Float:
-        return np.asarray(median(values, which, np.arange(n)))
-
-    r = np.linalg.norm(Y - np.stack([medians(y) for y in Y.T], axis=1)[which], axis=1)
-    weight = 1.0 / (1.0 + (r / np.maximum(1.48 * medians(r), SCALE_PX)[which]) ** 2)
-    for _ in range(ROUNDS):
-        C = _weighted(which, X, Y, base * weight, n)
-        r = np.linalg.norm(Y - np.einsum("pa,pac->pc", X, C[which]), axis=1)
-        mass = np.maximum(np.bincount(which, base * weight, n), 1e-30)
-        spread = 1.48 * np.bincount(which, base * weight * r, n) / mass
-        weight = 1.0 / (1.0 + (r / np.maximum(spread, SCALE_PX)[which]) ** 2)
-    return AffineFlow(C, fit.centre, fit.size, fit.fitted), weight
 
 
 def _weighted(which: Int, X: Float, Y: Float, w: Float, n: int) -> Float:
