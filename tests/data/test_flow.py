@@ -15,7 +15,6 @@ from soup_nlp.data.datasets.benchmarks import KittiInput
 from soup_nlp.data.flow import dis
 from soup_nlp.data.flow.consistency import (
     confidence_of,
-    leaves,
     round_trip_error,
 )
 from soup_nlp.data.flow.dis import dominant_homographies, guided_flow
@@ -52,9 +51,8 @@ def test_dis_finds_a_shift_at_any_size(height: int, width: int, du: int, dv: int
     assert flow.uv.dtype == flow.confidence.dtype == np.float32
     assert flow.confidence.min() >= 0
     assert flow.confidence.max() <= 1
-    inside = ~leaves(np.broadcast_to(np.float32([du, dv]), (height, width, 2)), (height, width))
-    inside[:4] = inside[-4:] = inside[:, :4] = inside[:, -4:] = False
-    error = np.linalg.norm(flow.uv - [du, dv], axis=2)[inside]
+    # the targets of these pixels are in the image
+    error = np.linalg.norm(flow.uv - [du, dv], axis=2)[4:-4, 4:-4]
     assert np.median(error) < 0.1
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import DataError
+from soup_nlp.geometry.camera import pixel_grid
 
 SUPPORT = 15
 """Side of the window over which the round-trip error is averaged, pixels: a wrong flow may be
@@ -32,13 +33,14 @@ def round_trip_error(forward: FloatMap, backward: FloatMap) -> FloatMap:
     It is infinite where the forward flow (H, W, 2) leaves the second image, or where it or the
     backward flow (H', W', 2) is not finite.
     """
-    height, width = forward.shape[:2]
-    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    inside = ~leaves(forward, backward.shape)
-    x = np.where(inside, u + forward[:, :, 0], 0.0).astype(np.float32)
-    y = np.where(inside, v + forward[:, :, 1], 0.0).astype(np.float32)
-    back = sampled(backward, x, y)
-    error = np.hypot(x + back[:, :, 0] - u, y + back[:, :, 1] - v)
+    pixel = pixel_grid(*forward.shape[:2])
+    target = pixel + forward
+    # False for NaN
+    fits = (target >= 0) & (target <= np.subtract(backward.shape[1::-1], 1))
+    inside = np.asarray(fits.all(axis=2))
+    at = np.where(inside[..., None], target, 0.0).astype(np.float32)
+    gap = at + sampled(backward, at[..., 0], at[..., 1]) - pixel.astype(np.float32)
+    error = np.hypot(gap[..., 0], gap[..., 1])
     error[~inside | ~np.isfinite(error)] = np.inf
     return np.asarray(error, dtype=np.float32)
 
@@ -48,15 +50,6 @@ def sampled(image: NDArray[Any], x: FloatMap, y: FloatMap) -> FloatMap:
     values = np.ascontiguousarray(image, dtype=np.float32)
     kind, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
     return np.asarray(cv2.remap(values, x, y, kind, borderMode=border))
-
-
-def leaves(flow: NDArray[np.floating], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """(H, W) bool, True where a flow (H, W, 2) is not finite or points outside the next image."""
-    height, width = flow.shape[:2]
-    x = np.arange(width)[None, :] + flow[:, :, 0]
-    y = np.arange(height)[:, None] + flow[:, :, 1]
-    inside = (x >= 0) & (x <= shape[1] - 1) & (y >= 0) & (y <= shape[0] - 1)
-    return np.asarray(~inside)
 
 
 def confidence_of(gap: FloatMap, support: int = SUPPORT) -> FloatMap:

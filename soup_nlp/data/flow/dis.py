@@ -14,6 +14,7 @@ import numpy as np
 from soup_nlp.arrays import Float, FloatMap, Image
 from soup_nlp.data.flow.consistency import LIMIT, SURE, confidence_of, round_trip_error, sampled
 from soup_nlp.data.pair import Flow
+from soup_nlp.geometry.camera import pixel_grid
 
 Match = Callable[[Image, Image], tuple[FloatMap, FloatMap]]
 """Forward and backward flow of two grey images of one size."""
@@ -78,14 +79,14 @@ def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, Fl
         nxt, H, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
     )
     residual, back = match(ref, near)
-    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
-    at = np.stack([u + residual[..., 0], v + residual[..., 1], np.ones_like(u)], axis=-1) @ H.T
+    pixel = pixel_grid(height, width)
+    at = np.dstack([pixel + residual, np.ones(ref.shape)]) @ H.T
     behind = at[..., 2] <= 1e-6
     at = at[..., :2] / np.where(behind, 1.0, at[..., 2])[..., None]
     gap = round_trip_error(residual, back)
     inside = (at >= 0).all(axis=-1) & (at <= np.array(nxt.shape[::-1]) - 1.0).all(axis=-1)
     gap[behind | ~inside] = np.inf
-    flow = np.stack([at[..., 0] - u, at[..., 1] - v], axis=-1)
+    flow = at - pixel
     flow[behind] = 0.0
     return flow.astype(np.float32), gap
 
