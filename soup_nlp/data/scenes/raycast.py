@@ -128,17 +128,13 @@ class Frame:
 
     def __init__(self, scene: Scene, K: Float, frame: int) -> None:
         self.K = K
-        self.parts = [part for body in scene.bodies for part in body.parts]
+        numbered = [(k, part) for k, body in enumerate(scene.bodies) for part in body.parts]
+        self.body = np.array([k for k, _ in numbered], np.int32)
+        self.parts = [part for _, part in numbered]
         self.shapes = [(frame and part.bent) or part.shape for part in self.parts]
-        self.body = np.repeat(
-            np.arange(len(scene.bodies), dtype=np.int32), [len(b.parts) for b in scene.bodies]
-        )
-        poses = []
-        for body in scene.bodies:
-            view = scene.next_from_scene @ body.motion if frame else scene.ref_from_scene
-            for part in body.parts:
-                poses.append((view @ part.motion if frame else view) @ part.scene_from_part)
-        self.poses = np.array(poses)
+        moving = [scene.next_from_scene @ body.motion for body in scene.bodies]
+        views = [moving[k] @ p.motion if frame else scene.ref_from_scene for k, p in numbered]
+        self.poses = np.array([v @ p.scene_from_part for v, p in zip(views, self.parts)])
 
     def trace(self, uv: Float) -> tuple[Float, Int]:
         """Depth z (N,) and part (N,) of the first hits of pixels (N, 2); inf and -1 without."""
