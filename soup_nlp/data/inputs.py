@@ -3,7 +3,7 @@
 import hashlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import cv2
 import numpy as np
@@ -120,7 +120,6 @@ class FilesInput(FramesInput):
 
     def load(self, path: Resolve) -> Pair:
         """See `PairInput`."""
-
         if self.intrinsics is not None and self.fov is not None:
             what, found = "two cameras are given", "intrinsics and fov"
             raise ConfigError(what, where="input", found=found, expected="one of them")
@@ -200,7 +199,7 @@ class MemoryInput(PairInput):
     hash: str
     """Of the images, cameras and flow."""
 
-    def load(self, path: Resolve) -> Pair:
+    def load(self, path: Resolve) -> NoReturn:
         """Raise ConfigError: the pair was in memory only."""
         raise ConfigError(
             "pair of this problem was in memory and is not stored",
@@ -213,7 +212,6 @@ class MemoryInput(PairInput):
     def files(self) -> list[str]:
         """Raise ConfigError, see `load`."""
         self.load(Path)
-        return []
 
 
 Input = Annotated[

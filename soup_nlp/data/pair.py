@@ -18,8 +18,6 @@ from soup_nlp.errors import DataError, expect, one_line, printable, repr_of
 
 SHORTEST = 0.05
 """Smallest focal length relative to the side of the image (168 degrees of view)."""
-
-
 LARGEST = 1e100
 """Largest number in a truth, so that sums of squares stay finite."""
 

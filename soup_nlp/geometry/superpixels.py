@@ -104,7 +104,7 @@ def split_components(labels: Labels, min_size: int) -> Labels:
 
     pieces = label(labels, background=-1, connectivity=1).astype(np.int32) - 1
     sizes = np.bincount(pieces.ravel())
-    small = sizes < max(1, min_size)
+    small = sizes < min_size
     if small.all():
         small[np.argmax(sizes)] = False
     if small.any():
