@@ -73,13 +73,10 @@ def guided_flow(
 
 def _under(H: Float, ref: Image, nxt: Image, match: Match) -> tuple[FloatMap, FloatMap]:
     """Flow and round-trip error after the next image has been warped to the first by H."""
-    height, width = ref.shape
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    near = cv2.warpPerspective(
-        nxt, H, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
-    )
+    flags, edge = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
+    near = cv2.warpPerspective(nxt, H, ref.shape[::-1], flags=flags, borderMode=edge)
     residual, back = match(ref, near)
-    pixel = pixel_grid(height, width)
+    pixel = pixel_grid(*ref.shape)
     at = np.dstack([pixel + residual, np.ones(ref.shape)]) @ H.T
     behind = at[..., 2] <= 1e-6
     at = at[..., :2] / np.where(behind, 1.0, at[..., 2])[..., None]
@@ -131,10 +128,8 @@ def dis_flow(image_ref: Image, image_next: Image, consistency: bool = True) -> F
     a zero flow with confidence 0.
     """
     ref, nxt = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (image_ref, image_next))
-    height, width = ref.shape
     if min(float(ref.std()), float(nxt.std())) < _FLAT:
-        zero = np.zeros((height, width), np.float32)
-        return Flow(np.zeros((height, width, 2), np.float32), zero, "dis")
+        return Flow(np.zeros((*ref.shape, 2), np.float32), np.zeros(ref.shape, np.float32), "dis")
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(FINEST_SCALE)
     dis.setPatchSize(PATCH_SIZE)
