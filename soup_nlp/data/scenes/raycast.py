@@ -156,10 +156,9 @@ class Frame:
             corners = np.array(list(product((-1, 1), repeat=3))) * shape.bound
             seen = moved(pose, corners)
             if seen[:, 2].min() > NEAR:
-                at, (u, v) = camera.project(self.K, seen), uv.T
-                low, high = at.min(axis=0) - 1e-6, at.max(axis=0) + 1e-6
-                across, down = (u >= low[0]) & (u <= high[0]), (v >= low[1]) & (v <= high[1])
-                return np.flatnonzero(across & down)
+                at = camera.project(self.K, seen)
+                inside = (uv >= at.min(axis=0) - 1e-6) & (uv <= at.max(axis=0) + 1e-6)
+                return np.flatnonzero(inside[:, 0] & inside[:, 1])
         return np.arange(len(uv))
 
     def image(self, depth: Float, part: Int, size: tuple[int, int]) -> Image:
@@ -241,7 +240,6 @@ def render(scene: Scene, K: Float, height: int, width: int) -> Pair:
         components=ref.body[part].reshape(size),
         motions=motions,
         scene_flow=(X_next - X).reshape(*size, 3),
-        unit="m",
     )
     images = ref.image(depth, part, size), following.image(depth_next, part_next, size)
     return Pair(*images, K.copy(), K.copy(), truth=truth)
