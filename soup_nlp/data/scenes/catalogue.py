@@ -117,10 +117,10 @@ class SceneBuilder:
     """
 
     rng: np.random.Generator
-    half_width: float = 0.5
-    half_height: float = 0.5
-    contrast: float = 1.0
-    seed: int = 0
+    half_width: float
+    half_height: float
+    contrast: float
+    seed: int
 
     def __post_init__(self) -> None:
         self.uniform = self.rng.uniform
