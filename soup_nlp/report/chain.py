@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,28 +51,17 @@ class Lazy(Sequence[Item]):
         return self._make(range(self._count)[number])
 
 
-class Brief(NamedTuple):
-    """What a chain keeps of a pair: components, some depths of its reference frame, `certainty`.
+def some_depths(pair: Result, count: int = 1) -> Float:
+    """Depths of the reference frame of one of `count` pairs, from which colours are found."""
+    step = max(7, -(-pair.labels.size * count // SAMPLES))
+    # a view would keep the whole map
+    return pair.depths[0].ravel()[::step].copy()
 
-    Images and maps are read again when they are needed.
-    """
 
-    parts: tuple[Component, ...]
-    depths: Float
-    certainty: Mapping[str, float | None]
-
-    @classmethod
-    def of(cls, pair: Result, count: int = 1) -> Brief:
-        """That of one of `count` pairs."""
-        step = max(7, -(-pair.labels.size * count // SAMPLES))
-        # a view would keep the whole map
-        depths = pair.depths[0].ravel()[::step].copy()
-        return cls(pair.components.members, depths, pair.summary["certainty"])
-
-    def scaled(self, factor: float) -> Brief:
-        """The same in another unit, of which `factor` are one of now."""
-        parts = tuple(part.scaled(factor) for part in self.parts)
-        return Brief(parts, factor * self.depths, self.certainty)
+def mean_shares(rows: Sequence[Mapping[str, float | None]]) -> dict[str, float]:
+    """Means over pairs of the shares in `report.verdict.certainty`."""
+    known = {k: [v for row in rows if (v := row[k]) is not None] for k in rows[0]}
+    return {k: float(np.mean(values)) if values else np.nan for k, values in known.items()}
 
 
 @dataclass(frozen=True)
@@ -181,7 +170,9 @@ class Chain:
     Attributes:
         pairs: Results of the frames k and k + 1, in the unit of the first; those of a folder are
             read when they are needed.
-        briefs: What is kept of every pair.
+        parts: Components of every pair.
+        depths: Some depths of all pairs.
+        certainty: Means over the pairs of the shares in `report.verdict.certainty`.
         world_from_camera: Camera poses of the K + 1 frames.
         tracks: (C,) track of every component, for every pair.
         names: Names of the K + 1 frames in files.
@@ -191,7 +182,9 @@ class Chain:
     """
 
     pairs: Sequence[Result]
-    briefs: Sequence[Brief]
+    parts: Sequence[tuple[Component, ...]]
+    depths: Float
+    certainty: Mapping[str, float]
     world_from_camera: tuple[RigidMotion, ...]
     tracks: tuple[Int, ...]
     names: tuple[str, ...]
@@ -202,10 +195,18 @@ class Chain:
     @classmethod
     def of(cls, result: Result) -> Chain:
         """A result as a chain of two frames."""
-        poses = STILL, result.components.camera.inverse
-        tracks, briefs = np.arange(len(result.components)), Lazy(lambda _: Brief.of(result), 1)
-        parts = (result,), briefs, poses, (tracks,), ("ref", "next"), np.ones(1)
-        return cls(*parts, summary=result.summary)
+        parts = result.components
+        return cls(
+            pairs=(result,),
+            parts=(parts.members,),
+            depths=some_depths(result),
+            certainty=mean_shares([result.summary["certainty"]]),
+            world_from_camera=(STILL, parts.camera.inverse),
+            tracks=(np.arange(len(parts)),),
+            names=("ref", "next"),
+            scales=np.ones(1),
+            summary=result.summary,
+        )
 
     def __len__(self) -> int:
         return len(self.pairs) + 1
@@ -250,22 +251,10 @@ class Chain:
         """Unit of length as a phrase for headers of files."""
         return self.pairs[0].unit if self.single else f"{UNIT} of the first pair"
 
-    @property
-    def depths(self) -> Float:
-        """Some depths of all pairs."""
-        return np.concatenate([brief.depths for brief in self.briefs])
-
     @cached_property
     def depth_range(self) -> tuple[float, float]:
         """(near, far) of the colours of depth in the shown unit, one for all frames."""
         return figures.depth_range(self.depths * (self.metre or 1.0))
-
-    @cached_property
-    def certainty(self) -> dict[str, float]:
-        """Means over the pairs of the shares in `report.verdict.certainty`."""
-        rows = [brief.certainty for brief in self.briefs]
-        known = {k: [v for row in rows if (v := row.get(k)) is not None] for k in rows[0]}
-        return {k: float(np.mean(values)) if values else np.nan for k, values in known.items()}
 
     def __getitem__(self, number: int) -> Frame:
         """A frame by its number; FrameError if there is none."""
@@ -309,14 +298,14 @@ class Chain:
     def motion(self, pair: int, label: int) -> RigidMotion:
         """Motion of a component in the world from a frame to the next; label 0 does not move."""
         before, after = self.world_from_camera[pair], self.world_from_camera[pair + 1]
-        return after @ self.briefs[pair].parts[label].motion @ before.inverse
+        return after @ self.parts[pair][label].motion @ before.inverse
 
     @cached_property
     def paths(self) -> dict[int, dict[int, Float]]:
         """Centre (3,) in the world by frame, of every track; the static scene, 0, is none."""
         out = defaultdict[int, dict[int, Float]](dict)
-        for k, (brief, tracks) in enumerate(zip(self.briefs, self.tracks, strict=True)):
-            for part, track in zip(brief.parts[1:], tracks[1:].tolist(), strict=True):
+        for k, (parts, tracks) in enumerate(zip(self.parts, self.tracks, strict=True)):
+            for part, track in zip(parts[1:], tracks[1:].tolist(), strict=True):
                 out[track][k] = self.world_from_camera[k](part.centre)
                 out[track][k + 1] = self.motion(k, part.label)(out[track][k])
         return dict(out)

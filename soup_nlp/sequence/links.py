@@ -6,13 +6,12 @@ from itertools import count
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from soup_nlp.arrays import Float, Mask
+from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.errors import DataError
 from soup_nlp.geometry.superpixels import Labels
-from soup_nlp.report.chain import STILL, Brief, Chain, Lazy, Link
+from soup_nlp.report.chain import STILL, Chain, Lazy, Link, mean_shares, some_depths
 from soup_nlp.report.result import Result
 
 MIN_PIXELS = 200
@@ -92,10 +91,13 @@ def make_chain(pairs: Sequence[Result], summary: Mapping[str, Any] | None = None
     `summary` has the contents of chain.json. A pair that shares no pixel with those before it is a
     DataError.
     """
-    near, bridges, matches, briefs = list[Link | None](), list[Link | None](), [], list[Brief]()
+    near, bridges = list[Link | None](), list[Link | None]()
+    depths, parts, shares, matches = [], [], [], []
     # every pair is read once
     for k, pair in enumerate(pairs):
-        briefs.append(Brief.of(pair, len(pairs)))
+        depths.append(some_depths(pair, len(pairs)))
+        parts.append(pair.components.members)
+        shares.append(pair.summary["certainty"])
         if k + 1 < len(pairs):
             near.append(near_link(pairs, k))
             bridges.append(bridge(pairs, k))
@@ -103,16 +105,22 @@ def make_chain(pairs: Sequence[Result], summary: Mapping[str, Any] | None = None
             matches.append(follow(before, pairs[k + 1].components.of_pixel))
     links = [one for one in (*near, *bridges) if one]
     scales = chained_scales(len(pairs), links)
-    briefs = [brief.scaled(s) for brief, s in zip(briefs, scales, strict=True)]
+    parts = [tuple(part.scaled(s) for part in own) for own, s in zip(parts, scales, strict=True)]
     poses = [STILL]
-    for brief in briefs:
-        poses.append(poses[-1] @ brief.parts[0].motion.inverse)
-    numbers = number(matches, [len(brief.parts) for brief in briefs])
-    tracks = (np.array([of[label] for label in range(len(of))]) for of in numbers)
-    names = tuple(f"{k:04d}" for k in range(len(poses)))
-    results = Lazy(lambda k: pairs[k].scaled(scales[k]), len(pairs))
-    parts = results, tuple(briefs), tuple(poses), tuple(tracks), names
-    return Chain(*parts, scales, tuple(links), {} if summary is None else summary)
+    for background, *_ in parts:
+        poses.append(poses[-1] @ background.motion.inverse)
+    return Chain(
+        pairs=Lazy(lambda k: pairs[k].scaled(scales[k]), len(pairs)),
+        parts=parts,
+        depths=np.concatenate([s * z for s, z in zip(scales, depths, strict=True)]),
+        certainty=mean_shares(shares),
+        world_from_camera=tuple(poses),
+        tracks=tuple(number(matches, [len(own) for own in parts])),
+        names=tuple(f"{k:04d}" for k in range(len(poses))),
+        scales=scales,
+        links=tuple(links),
+        summary=summary or {},
+    )
 
 
 def follow(before: Labels, after: Labels) -> dict[int, int]:
@@ -121,7 +129,11 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
     `before` and `after` (H, W) are labels in the common frame; -1 is unknown, 0 the background.
     """
     visible = before >= 0
-    share = overlap_shares(before[visible], after[visible])
+    first, second = before[visible], after[visible]
+    shared = np.zeros((first.max() + 1, second.max() + 1), np.int64)
+    np.add.at(shared, (first, second), 1)
+    # intersection over union
+    share = shared / np.maximum(shared.sum(0) + shared.sum(1, keepdims=True) - shared, 1)
     # the background has no track
     share[0], share[:, 0] = 0, 0
     share[share < LEAST_OVERLAP] = 0
@@ -129,23 +141,14 @@ def follow(before: Labels, after: Labels) -> dict[int, int]:
     return {int(i): int(k) for i, k in matched if share[i, k] > 0}
 
 
-def overlap_shares(first: NDArray[np.integer], second: NDArray[np.integer]) -> Float:
-    """(A, B) intersection over union of the labels 0..A-1 and 0..B-1 of the same pixels (M,)."""
-    count = int(second.max()) + 1
-    flat, size = first.astype(np.int64) * count + second, count * (int(first.max()) + 1)
-    shared = np.bincount(flat, minlength=size).reshape(-1, count)
-    union = shared.sum(axis=0) + shared.sum(axis=1, keepdims=True) - shared
-    return np.asarray(shared / np.maximum(union, 1))
-
-
-def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[dict[int, int]]:
-    """Tracks by component of every pair; 0 is the background.
+def number(matches: Sequence[dict[int, int]], counts: Sequence[int]) -> list[Int]:
+    """Track of every component, for every pair; 0 is the background.
 
     `matches` come from `follow`; `counts` are the components of every pair with the background.
     """
-    out, new_number = list[dict[int, int]](), count(1)
+    out, new_number = list[Int](), count(1)
     for match, total in zip([{}, *matches], counts, strict=True):
-        numbers = {new: out[-1][old] for old, new in match.items()}
-        rest = {label: next(new_number) for label in range(1, total) if label not in numbers}
-        out.append({0: 0, **numbers, **rest})
+        known = {0: 0, **{new: out[-1][old] for old, new in match.items()}}
+        tracks = [known[k] if k in known else next(new_number) for k in range(total)]
+        out.append(np.array(tracks))
     return out
