@@ -1,6 +1,6 @@
 """Links between solved pairs, their common scale, the camera path, and tracks of components."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -45,31 +45,25 @@ def link(
     return Link(*ends, middle, spread, len(ratio), flagged=flagged or len(ratio) < MIN_PIXELS)
 
 
-def bridge(pairs: Sequence[Result], a: int) -> Link | None:
-    """The link of a pair to the one after a run of pairs without parallax; None if there is none.
+def links_from(pairs: Sequence[Result], a: int) -> Iterator[Link]:
+    """The links of a pair to the next one, and over pairs without parallax to the one after them.
 
-    The depth of the pair is moved by the flow of the run.
+    Pixels are static and confident in both. The first link is flagged where a pair has no parallax,
+    or where no pixel is confident in both. For the second, the depth is moved by the flow of the
+    pairs between.
     """
     z, keep, b = pairs[a].depths[1], pairs[a].in_next(pairs[a].static, False), a + 1
+    depth, flagged = pairs[b].depths[0], still(pairs[a]) or still(pairs[b])
+    near = link((a, b), z, depth, keep & pairs[b].static, flagged)
+    if near := near or link((a, b), z, depth, np.ones_like(keep), flagged=True):
+        yield near
     while not still(pairs[a]) and b < len(pairs) and still(pairs[b]):
         keep = pairs[b].in_next(keep & (pairs[b].components.of_pixel == 0), False)
         z, b = pairs[b].in_next(z, np.nan), b + 1
-    if not a + 1 < b < len(pairs):
-        return None
-    found = link((a, b), z, pairs[b].depths[0], keep & pairs[b].static)
-    return found and replace(found, bridge=True)
-
-
-def near_link(pairs: Sequence[Result], a: int) -> Link | None:
-    """The link of a pair and the next one, from static pixels that are confident in both.
-
-    It is flagged where a pair has no parallax, or where no pixel is confident in both.
-    """
-    first, second = pairs[a], pairs[a + 1]
-    z, keep = first.depths[1], first.in_next(first.static, False)
-    flagged, every = still(first) or still(second), np.ones_like(keep)
-    near = link((a, a + 1), z, second.depths[0], keep & second.static, flagged)
-    return near or link((a, a + 1), z, second.depths[0], every, flagged=True)
+    if a + 1 < b < len(pairs):
+        far = link((a, b), z, pairs[b].depths[0], keep & pairs[b].static)
+        if far:
+            yield replace(far, bridge=True)
 
 
 def chained_scales(total: int, links: Sequence[Link]) -> Float:
@@ -91,19 +85,17 @@ def make_chain(pairs: Sequence[Result], summary: Mapping[str, Any] | None = None
     `summary` has the contents of chain.json. A pair that shares no pixel with those before it is a
     DataError.
     """
-    near, bridges = list[Link | None](), list[Link | None]()
-    depths, parts, shares, matches = [], [], [], []
+    links, depths, parts, shares, matches = list[Link](), [], [], [], []
     # every pair is read once
     for k, pair in enumerate(pairs):
         depths.append(some_depths(pair, len(pairs)))
         parts.append(pair.components.members)
         shares.append(pair.summary["certainty"])
         if k + 1 < len(pairs):
-            near.append(near_link(pairs, k))
-            bridges.append(bridge(pairs, k))
+            links += links_from(pairs, k)
             before = pair.in_next(pair.components.of_pixel, -1)
             matches.append(follow(before, pairs[k + 1].components.of_pixel))
-    links = [one for one in (*near, *bridges) if one]
+    links.sort(key=lambda one: one.bridge)
     scales = chained_scales(len(pairs), links)
     parts = [tuple(part.scaled(s) for part in own) for own, s in zip(parts, scales, strict=True)]
     poses = [STILL]
