@@ -115,11 +115,10 @@ def colourise_flow(uv: AnyFloat, limit: float) -> Image:
 
 def colourise_normals(n_map: AnyFloat) -> Image:
     """Unit normals (H, W, 3) in colour: (x, -y, -z) from [-1, 1] to RGB, grey where not finite."""
-    known: Mask = np.asarray(np.isfinite(n_map).all(axis=2))
-    signed = np.where(known[:, :, None], n_map, 0.0) * np.array([1.0, -1.0, -1.0])
+    known = np.isfinite(n_map).all(axis=2, keepdims=True)
+    signed = np.where(known, n_map, 0.0) * [1.0, -1.0, -1.0]
     out = ((np.clip(signed, -1, 1) + 1) * 127.5).round().astype(np.uint8)
-    out[~known] = UNKNOWN
-    return np.asarray(out)
+    return np.where(known, out, np.uint8(UNKNOWN))
 
 
 def draw_superpixels(image: Image, labels: NDArray[np.integer]) -> Image:

@@ -130,12 +130,6 @@ def _shift(run: Run, label: int, shift: Float) -> str:
     return f"by {size} {WAYS[axis][int(shift[axis] < 0)]}{sure}"
 
 
-def flow_words(run: Run) -> str:
-    """Usable flow and its noise."""
-    assert run.pair.flow is not None
-    return f"usable at {run.pair.flow.usable:.0%} of the pixels, noise {run.start.noise:.2f} px"
-
-
 def hints(run: Run) -> list[str]:
     """What would give a better depth."""
     assert run.pair.flow is not None

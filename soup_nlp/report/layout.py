@@ -288,9 +288,5 @@ class Stored:
 
 
 def _wrong(path: str, found: object, expected: str) -> DataError:
-    return DataError(
-        "array of a result does not fit the others",
-        where=f"result.h5, {path}",
-        found=found,
-        expected=expected,
-    )
+    what, where = "array of a result does not fit the others", f"result.h5, {path}"
+    return DataError(what, where=where, found=found, expected=expected)

@@ -12,7 +12,7 @@ from soup_nlp.evaluation.metrics import DepthMetrics, skill
 from soup_nlp.evaluation.scoring import SURE
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.pipeline.record import Run
-from soup_nlp.report.findings import certainty_lines, drawn_line, flow_words, found_words, hints
+from soup_nlp.report.findings import certainty_lines, drawn_line, found_words, hints
 from soup_nlp.report.result import PAGE
 from soup_nlp.storage.versions import versions
 
@@ -44,7 +44,6 @@ TITLES = {
 """Rows of the table of scores; the others have their own names."""
 RULES = {"none": "no scale", "affine": "one scale and shift each, of least squares"}
 """Words for rules of the scale of scores."""
-PAD = " " * 12
 
 
 def verdict(
@@ -108,7 +107,7 @@ def facts(run: Run, limit: float | None = None, details: bool = True) -> str:
 def sectioned(sections: Mapping[str, Sequence[str]]) -> str:
     """Lines of sections, each after its title; empty sections are left out."""
     return "\n".join(
-        (PAD if k else f"{title:<12}") + line
+        f"{'' if k else title:<12}{line}"
         for title, lines in sections.items()
         for k, line in enumerate(lines)
     )
@@ -116,7 +115,8 @@ def sectioned(sections: Mapping[str, Sequence[str]]) -> str:
 
 def _details(run: Run) -> dict[str, list[str]]:
     """Sections on the flow and the solver: iterations, exact energies by term, residuals."""
-    s, r, solver = run.solution, run.refined, list[str]()
+    s, r, flow, solver = run.solution, run.refined, run.pair.flow, list[str]()
+    assert flow is not None
     if s.stages:
         every = sum(stage.iterations for stage in s.stages)
         solver.append(
@@ -133,7 +133,7 @@ def _details(run: Run) -> dict[str, list[str]]:
         )
     energies = {"start": s.energy_start, "NLP": s.energy, "solution": run.energy}
     return {
-        "flow": [flow_words(run)],
+        "flow": [f"usable at {flow.usable:.0%} of the pixels, noise {run.start.noise:.2f} px"],
         "solver": solver,
         "energy": [f"{name:<9} {_numbers(e, '.5g')}" for name, e in energies.items()],
         "residuals": [_numbers(run.residuals, ".1e")],
