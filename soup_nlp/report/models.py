@@ -130,8 +130,8 @@ def fuse(chain: Chain, most: int = MOST_POINTS) -> Cloud:
     return cloud[first][:: max(1, -(-len(first) // most))]
 
 
-def _projected(frame: Frame, points: Float) -> tuple[Mask, Int, Int, Float]:
-    """Points (M, 3) of the world in a frame: mask of those in the image, rows, columns, depths."""
+def _projected(frame: Frame, points: Float) -> tuple[Mask, tuple[Int, Int], Float, Float]:
+    """Points (M, 3) of the world in a frame: which are in its image, rows and columns, z, uv."""
     local = frame.pose.inverse(points)
     height, width = frame.depth.shape
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -139,15 +139,15 @@ def _projected(frame: Frame, points: Float) -> tuple[Mask, Int, Int, Float]:
         inside = (uv >= -0.5).all(1) & (uv < [width - 0.5, height - 0.5]).all(1)
     inside &= local[:, 2] > 0
     u, v = np.rint(np.where(inside[:, None], uv, 0)).astype(np.int64).T
-    return inside, v, u, local[:, 2]
+    return inside, (v, u), local[:, 2], uv
 
 
 def _contradicts(cloud: Cloud, frame: Frame) -> Mask:
     """(M,) points in front of the static surface of a frame that is more certain there."""
-    inside, v, u, z = _projected(frame, cloud["points"])
+    inside, at, z, _ = _projected(frame, cloud["points"])
     with np.errstate(invalid="ignore"):
-        inside &= (z < IN_FRONT * frame.depth[v, u]) & (frame.sigma[v, u] <= cloud["sigma"])
-    return inside & frame.static[v, u]
+        inside &= (z < IN_FRONT * frame.depth[at]) & (frame.sigma[at] <= cloud["sigma"])
+    return inside & frame.static[at]
 
 
 # --- meshes ---------------------------------------------------------------------------------------
@@ -270,8 +270,7 @@ def write_colmap(folder: Path, chain: Chain) -> None:
 
 def _seen(cloud: Cloud, frame: Frame) -> tuple[Int, Float]:
     """Indices of the points that a frame shows, and their pixels (M, 2)."""
-    inside, v, u, z = _projected(frame, cloud["points"])
+    inside, at, z, uv = _projected(frame, cloud["points"])
     with np.errstate(invalid="ignore", divide="ignore"):
-        near = np.abs(np.log(z / frame.depth[v, u])) < VISIBLE
-    at = np.flatnonzero(inside & near)
-    return at, project(frame.K, frame.pose.inverse(cloud["points"][at]))
+        inside &= np.abs(np.log(z / frame.depth[at])) < VISIBLE
+    return np.flatnonzero(inside), uv[inside]
