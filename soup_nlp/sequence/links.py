@@ -68,14 +68,13 @@ def links_from(pairs: Sequence[Result], a: int) -> Iterator[Link]:
 
 def chained_scales(total: int, links: Sequence[Link]) -> Float:
     """(total,) scales of pairs, 1 for the first: links in a row, a bridge before flagged ones."""
-    out, ending = np.ones(total), dict[int, list[Link]]()
-    for one in links:
-        ending.setdefault(one.second, []).append(one)
+    out = np.ones(total)
     for k in range(1, total):
-        before = sorted(ending.get(k, ()), key=lambda one: one.flagged)
-        if not before:
+        ending = [one for one in links if one.second == k]
+        if not ending:
             raise DataError("a pair shares no pixel with the others", where=f"pair {k}")
-        out[k] = out[before[0].first] * np.exp(before[0].log_ratio)
+        best = min(ending, key=lambda one: one.flagged)
+        out[k] = out[best.first] * np.exp(best.log_ratio)
     return out
 
 

@@ -109,8 +109,8 @@ def chain_lines(chain: Chain) -> list[str]:
     for k in chain.links:
         note = "  bridge" if k.bridge else "  doubtful" if k.flagged else ""
         ends = f"{k.first}, {k.second}"
-        ratio = f"{np.exp(k.log_ratio):.3f}"
-        lines.append(f"{ends:<9}{ratio:<17}{k.spread:<14.3f}{k.pixels}{note}")
+        ratio = np.exp(k.log_ratio)
+        lines.append(f"{ends:<9}{ratio:<17.3f}{k.spread:<14.3f}{k.pixels}{note}")
     long = sum(len(path) > 2 for path in chain.paths.values())
     lines.append(f"tracks      {long} components followed over two pairs or more")
     lines.append(sectioned({"certainty": certainty_lines(chain.certainty, "all images")}))
