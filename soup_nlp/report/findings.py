@@ -115,10 +115,8 @@ def unmatched(run: Run) -> bool:
 
 
 def _shift(run: Run, label: int, shift: Float) -> str:
-    """Length, main direction and certainty of a component's displacement (3,).
-
-    The length is in the unit of the truth, or relative to the median depth without a truth.
-    """
+    """Length, in the unit of the truth or relative to the median depth, main direction and
+    certainty of a component's displacement (3,)."""
     axis = int(np.argmax(np.abs(shift)))
     length, score = float(np.linalg.norm(shift)), run.metrics.get("solution")
     share = length / float(np.nanmedian(run.reconstruction.depth_ref))

@@ -63,7 +63,6 @@ def page(chain: Chain, drawn: Mapping[str, Picture] | None = None) -> str:
 
 
 def _file(name: str) -> str:
-    """Text of a script, style or template of the page."""
     return (files("soup_nlp.report") / "web" / name).read_text(encoding="utf-8")
 
 
@@ -82,14 +81,10 @@ def _headline(chain: Chain) -> str:
     return " &middot; ".join([*strong, *map(escape, words)])
 
 
-def _css(colour: Any) -> str:
-    return "#" + "".join(f"{int(c):02x}" for c in colour)
-
-
 def _packed(array: NDArray[Any]) -> str:
     """Numbers, deflated, as base64."""
-    little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
-    return base64.b64encode(zlib.compress(little.tobytes())).decode("ascii")
+    data = array.astype(array.dtype.newbyteorder("<")).tobytes()
+    return base64.b64encode(zlib.compress(data)).decode()
 
 
 def _figure(picture: Picture, pairs: int) -> dict[str, str]:
@@ -108,7 +103,7 @@ def _figure(picture: Picture, pairs: int) -> dict[str, str]:
 def _legend(legend: Legend | None) -> str:
     if legend is None:
         return ""
-    count, colours = legend.colours.shape[1], [*map(_css, legend.colours[0])]
+    count, colours = legend.colours.shape[1], [f"#{c.tobytes().hex()}" for c in legend.colours[0]]
     if legend.of_classes:
         stops = [f"{c} {k / count:.1%} {(k + 1) / count:.1%}" for k, c in enumerate(colours)]
     else:
@@ -173,7 +168,7 @@ def _paths(chain: Chain, metre: float) -> list[dict[str, Any]]:
         points = [metre * point for point in path.values()]
         moved = np.linalg.norm(points[-1] - points[0]) > 0.01 * abs(points[0][2])
         if moved if chain.single else len(points) >= LEAST_PATH:
-            out.append({"colour": _css(colours[track]), "points": points})
+            out.append({"colour": f"#{colours[track].tobytes().hex()}", "points": points})
     return out
 
 

@@ -52,7 +52,6 @@ def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
 
 
 def _components(chain: Chain, k: int) -> Picture:
-    """The image in the colours of the components."""
     result, track = chain.pairs[k], chain.tracks[k]
     part, count = result.components.of_pixel, len(track)
     colours = figures.component_colours(max(track) + 1)[track]
@@ -66,7 +65,6 @@ def _components(chain: Chain, k: int) -> Picture:
 
 
 def _flow(result: Result) -> tuple[Picture, Picture]:
-    """Flow and its confidence."""
     sure = np.clip(result.flow_confidence, 0, 1).astype(float)
     used = np.where((sure > 0)[..., None], result.flow.astype(float), np.nan)
     limit = figures.flow_limit(used)
@@ -120,10 +118,8 @@ def relative_error(result: Result, scale: float | None) -> AnyFloat | None:
     truth, z = result.true_depth, result.depths[0]
     if truth is None or scale is None:
         return None
-    known = (truth > 0) & (z > 0)
-    error = np.full(truth.shape, np.nan)
-    error[known] = np.abs(truth[known] - scale * z[known]) / truth[known]
-    return error
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((truth > 0) & (z > 0), np.abs(truth - scale * z) / truth, np.nan)
 
 
 def _shares(title: str, values: AnyFloat, colours: str, ticks: Sequence[float]) -> Picture:

@@ -227,13 +227,7 @@ def result_of(run: Run, summary: Mapping[str, Any]) -> Result:
 
 
 def load(folder: str | Path) -> Result:
-    """A result that `solve`, `import` or `Run.save` wrote: depth, points, sigma, motions, scores.
-
-    Its `reconstruction`, `components`, `camera` and `metrics` are those of the `Run`.
-
-    Raises:
-        DataError: the folder holds no result, or a damaged one.
-    """
+    """The result of a folder, see `sequence.folder.load`."""
     stored = Stored.read(folder)
     tree, summary = stored.tree, stored.claims
     try:
@@ -262,9 +256,8 @@ def load(folder: str | Path) -> Result:
             kind=require(tree, "confidence/kind"),
         )
     except (LookupError, ValueError, TypeError, AttributeError) as error:
-        raise DataError(
-            "result does not hold together", where=stored.folder, found=error
-        ) from error
+        what = "result does not hold together"
+        raise DataError(what, where=stored.folder, found=error) from error
 
 
 def _metrics(row: Mapping[str, Any]) -> DepthMetrics:
