@@ -256,8 +256,11 @@ def write_colmap(folder: Path, chain: Chain) -> None:
         cameras.append(f"{i} PINHOLE {width} {height} {lens}")
         x, y, z, w = pose.quaternion
         place = " ".join(f"{a:.17g}" for a in (w, x, y, z, *pose.t))
-        seen, uv = _seen(cloud, frame)
-        shown = (f"{u:.6g} {v:.6g} {point + 1}" for point, (u, v) in zip(seen, uv + 0.5))
+        inside, at, depth, uv = _projected(frame, cloud["points"])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            inside &= np.abs(np.log(depth / frame.depth[at])) < VISIBLE
+        seen = np.flatnonzero(inside)
+        shown = (f"{u:.6g} {v:.6g} {point + 1}" for point, (u, v) in zip(seen, uv[seen] + 0.5))
         images += [f"{i} {place} {i} {frame.name}.png", " ".join(shown)]
         for k, point in enumerate(seen):
             tracks[point].append(f"{i} {k}")
@@ -266,11 +269,3 @@ def write_colmap(folder: Path, chain: Chain) -> None:
         points.append(f"{i} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} 0 {' '.join(track)}")
     for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
         write_text(model / f"{name}.txt", "\n".join(lines) + "\n")
-
-
-def _seen(cloud: Cloud, frame: Frame) -> tuple[Int, Float]:
-    """Indices of the points that a frame shows, and their pixels (M, 2)."""
-    inside, at, z, uv = _projected(frame, cloud["points"])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        inside &= np.abs(np.log(z / frame.depth[at])) < VISIBLE
-    return np.flatnonzero(inside), uv[inside]

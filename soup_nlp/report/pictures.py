@@ -42,8 +42,11 @@ def pictures(chain: Chain, k: int = 0) -> dict[str, Picture]:
         "flow": flow,
         **_depths(chain, k),
     }
-    error = relative_error(result, chain.metre)
-    if error is not None:
+    truth, z = result.true_depth, result.depths[0]
+    if truth is not None and chain.metre is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.abs(truth - chain.metre * z) / truth
+        error = np.where((truth > 0) & (z > 0), error, np.nan)
         title = "depth error relative to the truth; grey = no truth"
         drawn["error"] = _shares(title, _enlarged(error), "inferno", ERROR_TICKS)
     title = "expected depth error (1 sigma)"
@@ -111,15 +114,6 @@ def _enlarged(values: AnyFloat) -> AnyFloat:
         return values
     distance, nearest = distance_transform_edt(~known, return_indices=True)
     return np.where(distance < 1.5, values[tuple(nearest)], np.nan)
-
-
-def relative_error(result: Result, scale: float | None) -> AnyFloat | None:
-    """(H, W) |z_gt - s z| / z_gt of the reference frame, NaN where unknown; None without truth."""
-    truth, z = result.true_depth, result.depths[0]
-    if truth is None or scale is None:
-        return None
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where((truth > 0) & (z > 0), np.abs(truth - scale * z) / truth, np.nan)
 
 
 def _shares(title: str, values: AnyFloat, colours: str, ticks: Sequence[float]) -> Picture:
