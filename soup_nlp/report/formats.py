@@ -11,7 +11,7 @@ from soup_nlp.errors import ConfigError, optional, printable, repr_of
 from soup_nlp.report.chain import AXES, Chain, Frame
 from soup_nlp.report.figures import encode_png
 from soup_nlp.report.models import write_colmap, write_fused, write_glb, write_points, write_views
-from soup_nlp.storage.files import write_bytes, write_json, write_text
+from soup_nlp.storage.files import write_bytes, write_json
 
 OfFrame: TypeAlias = Callable[[Path, Frame], object]
 OfChain: TypeAlias = Callable[[Path, Chain], object]
@@ -96,26 +96,23 @@ def _write_cameras(path: Path, chain: Chain) -> None:
     """Intrinsics of all frames, 3 x 3; of one alone where they have the same."""
     cameras = [np.array(frame.K) for frame in chain]
     same = all(np.array_equal(cameras[0], K) for K in cameras)
-    rows = np.concatenate(cameras[:1] if same else cameras)
-    write_text(path, "".join(" ".join(f"{x:.17g}" for x in row) + "\n" for row in rows))
+    np.savetxt(path, np.concatenate(cameras[:1] if same else cameras), "%.17g")
 
 
 def _write_kitti(path: Path, chain: Chain) -> None:
     """world_from_camera of every frame, the first 3 rows in one line (KITTI odometry)."""
-    rows = (" ".join(f"{x:.9g}" for x in p.matrix[:3].ravel()) for p in chain.world_from_camera)
-    write_text(path, "\n".join(rows) + "\n")
+    np.savetxt(path, [pose.matrix[:3].ravel() for pose in chain.world_from_camera], "%.9g")
 
 
 def _write_tum(path: Path, chain: Chain) -> None:
     """world_from_camera of every frame in the format of the TUM benchmark."""
-    lines = [
-        "# timestamp tx ty tz qx qy qz qw: position and orientation of the camera in the first"
-        " frame's camera coordinates",
-        printable(f"# axes: {AXES}; timestamp: frame number; unit: {chain.unit}"),
-    ]
-    for k, pose in enumerate(chain.world_from_camera):
-        lines.append(f"{k} " + " ".join(f"{x:.9g}" for x in (*pose.t, *pose.quaternion)))
-    write_text(path, "\n".join(lines) + "\n")
+    about = (
+        "timestamp tx ty tz qx qy qz qw: position and orientation of the camera in the first"
+        " frame's camera coordinates\n"
+        + printable(f"axes: {AXES}; timestamp: frame number; unit: {chain.unit}")
+    )
+    rows = [(k, *pose.t, *pose.quaternion) for k, pose in enumerate(chain.world_from_camera)]
+    np.savetxt(path, rows, "%.9g", header=about, encoding="utf-8")
 
 
 def _write_transforms(folder: Path, chain: Chain) -> None:
