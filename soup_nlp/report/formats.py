@@ -1,6 +1,5 @@
 """Files for other programs, by the name of their format; each is written from frames."""
 
-import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
@@ -79,7 +78,7 @@ def _write_flo(path: Path, frame: Frame) -> None:
     """Middlebury .flo; 1e10 where unknown."""
     assert frame.flow is not None
     uv = np.nan_to_num(frame.flow, nan=1e10).astype("<f4")
-    write_bytes(path, b"PIEH" + struct.pack("<ii", uv.shape[1], uv.shape[0]) + uv.tobytes())
+    write_bytes(path, b"PIEH" + np.array(uv.shape[1::-1], "<i4").tobytes() + uv.tobytes())
 
 
 def _write_labels(path: Path, frame: Frame) -> None:
