@@ -55,7 +55,8 @@ def links_from(pairs: Sequence[Result], a: int) -> Iterator[Link]:
     z, keep, b = pairs[a].depths[1], pairs[a].in_next(pairs[a].static, False), a + 1
     depth, flagged = pairs[b].depths[0], still(pairs[a]) or still(pairs[b])
     near = link((a, b), z, depth, keep & pairs[b].static, flagged)
-    if near := near or link((a, b), z, depth, np.ones_like(keep), flagged=True):
+    near = near or link((a, b), z, depth, np.ones_like(keep), flagged=True)
+    if near:
         yield near
     while not still(pairs[a]) and b < len(pairs) and still(pairs[b]):
         keep = pairs[b].in_next(keep & (pairs[b].components.of_pixel == 0), False)
