@@ -11,7 +11,7 @@ import typer
 from benchmarks import chain as chains
 from benchmarks import paper as papers
 from benchmarks import speed as speeds
-from benchmarks.accuracy import comparison, read_pages, write_suite
+from benchmarks.accuracy import comparison, read_pages, suite_page
 from benchmarks.family.instances import (
     FORMULATIONS,
     SCENES,
@@ -23,7 +23,7 @@ from benchmarks.family.instances import (
 )
 from benchmarks.family.write import check_sol, family_tasks, write_family
 from benchmarks.scores import measure_pair
-from benchmarks.sigma import write_sigma
+from benchmarks.sigma import sigma_page
 from benchmarks.solvers import write_results
 from benchmarks.suites import SUITES, Options, list_suite
 from benchmarks.table import Cell, Item, frame_of, measure
@@ -67,10 +67,9 @@ def cells_of(items: list[Item], overrides: Words) -> list[Cell]:
     return [Cell(item, tuple(overrides or ())) for item in items]
 
 
-def finish(page: Path, frame: pd.DataFrame, text: str | None = None) -> int:
-    """Write a page, if its text is given, and print it; 1 if a row failed."""
-    if text is not None:
-        write_text(page, text)
+def finish(page: Path, frame: pd.DataFrame, text: str) -> int:
+    """Write a page and print it; 1 if a row failed."""
+    write_text(page, text)
     print(page.read_text(encoding="utf-8"))
     return int(not frame["ok"].eq(True).all())
 
@@ -97,8 +96,8 @@ def accuracy(
         cells, page = cells_of(items, overrides), out / f"{name or each}.md"
         rows = page.with_suffix(".jsonl")
         frame = measure(cells, measure_pair, rows, workers, cluster=cluster)
-        write_suite(page, frame, f"Suite `{each}`: {SUITES[each].text}.")
-        codes.append(finish(page, frame))
+        text = suite_page(page, frame, f"Suite `{each}`: {SUITES[each].text}.")
+        codes.append(finish(page, frame, text))
     return max(codes)
 
 
@@ -111,7 +110,8 @@ def sigma(folder: Path) -> int:
         hint = "python -m benchmarks accuracy -o FOLDER"
         raise DataError("no rows with pixels", where=folder, found="no such .jsonl", hint=hint)
     frame = frame_of(rows).drop_duplicates("key", keep="last")
-    return finish(folder / "sigma.md", frame, write_sigma(folder / "sigma.md", frame))
+    page = folder / "sigma.md"
+    return finish(page, frame, sigma_page(page, frame))
 
 
 @app.command()
@@ -136,8 +136,7 @@ def paper(
     page, cells = out / "README.md", list(plan.drop_duplicates("key")["cell"])
     frame = measure(cells, measure_pair, page.with_suffix(".jsonl"), workers)
     note = f"Superpixels wanted: {superpixels} in the comparison, {analysis} elsewhere."
-    papers.write_paper(page, frame, plan, note)
-    return finish(page, frame)
+    return finish(page, frame, papers.paper_page(frame, plan, note))
 
 
 @app.command()

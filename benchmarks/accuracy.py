@@ -67,14 +67,8 @@ ABOUT_HALVES = (
 )
 
 
-def write_suite(page: Path, frame: pd.DataFrame, note: str = "") -> None:
-    """Write the page of the rows of one suite, and its picture beside it."""
-    picture = plot_sigma(page.with_suffix(".png"), frame)
-    page.write_text(suite_page(page.stem, frame, note, picture), encoding="utf-8")
-
-
-def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = False) -> str:
-    """The page of the rows of one suite, with or without its picture."""
+def suite_page(page: Path, frame: pd.DataFrame, note: str = "") -> str:
+    """The page of the rows of one suite; its picture is written beside it."""
     good = frame[frame["ok"].eq(True)]
     scored = good[metric(good).notna()]
     settings = ", ".join(sorted(frame["settings"].astype(str).unique()))
@@ -85,7 +79,7 @@ def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = F
         " `rigid` on the pixels where it has a depth)."
     )
     about = f"{provenance(frame)}; settings {settings} (one a flow source)."
-    blocks = [f"# Accuracy on {name}", note, verdict, about]
+    blocks = [f"# Accuracy on {page.stem}", note, verdict, about]
     if len(scored):
         by_pair = scored.set_axis(pd.Index(scored["title"], name="pair, flow"))
         blocks += ["## MRE, one median scale per image, no cap", _by_pair(by_pair)]
@@ -94,8 +88,8 @@ def suite_page(name: str, frame: pd.DataFrame, note: str = "", picture: bool = F
         blocks += ["## Sigma", ABOUT_SIGMA]
         sigma = {t: numbers(by_pair, c) for c, t in SIGMA_COLUMNS.items() if t in SIGMA_BY_PAIR}
         blocks.append(markdown(pd.DataFrame(sigma).dropna(axis=1, how="all")))
-        if picture:
-            blocks.append(f"![Sparsification by sigma, and its reliability]({name}.png)")
+        if plot_sigma(page.with_suffix(".png"), frame):
+            blocks.append(f"![Sparsification by sigma, and its reliability]({page.stem}.png)")
     return page_text(blocks, frame)
 
 

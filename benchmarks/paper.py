@@ -227,8 +227,8 @@ def _with_truth(data: Path | None) -> list[Item]:
 # --- the page -------------------------------------------------------------------------------------
 
 
-def write_paper(page: Path, frame: pd.DataFrame, plan: pd.DataFrame, note: str) -> None:
-    """Write the page; `note` gives the sizes of the rows."""
+def paper_page(frame: pd.DataFrame, plan: pd.DataFrame, note: str) -> str:
+    """The page of all rows; `note` gives their sizes."""
     rows = plan.join(frame.set_index("key").drop(columns="variant"), on="key")
     rows["mre"] = metric(rows)
     sections = dict(list(rows.groupby("section", sort=False)))
@@ -246,7 +246,7 @@ def write_paper(page: Path, frame: pd.DataFrame, plan: pd.DataFrame, note: str) 
             medians[method, len(table)] = table.median()
         table = pd.DataFrame(medians).T.rename_axis(["method", "pairs"])
         blocks.append(markdown(table))
-    page.write_text(page_text([*blocks, *_departures(sections["departures"])], frame), "utf-8")
+    return page_text([*blocks, *_departures(sections["departures"])], frame)
 
 
 def _pivot(rows: pd.DataFrame, index: str, columns: str) -> pd.DataFrame:

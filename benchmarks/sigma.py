@@ -73,7 +73,7 @@ def family_scores(pairs: Pairs, factors: Mapping[str, Mapping[str, float]]) -> l
     return rows
 
 
-def write_sigma(page: Path, frame: pd.DataFrame) -> str:
+def sigma_page(page: Path, frame: pd.DataFrame) -> str:
     """The page of the fit; its picture is written beside it.
 
     It has today's factors, those of all families and the range of those with a family left out, and

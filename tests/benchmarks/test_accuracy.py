@@ -1,11 +1,13 @@
 """Accuracy of pairs: suites, contents of rows, scores of sigma, the page, two pages compared."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.accuracy import comparison, read_pages, suite_page, write_suite
+from benchmarks.accuracy import comparison, read_pages, suite_page
 from benchmarks.scores import LAST, METHODS, STEPS, measure_pair, sigma_scores, sparsification
 from benchmarks.suites import SUITES, Options, every_pair, list_suite, spread
 from benchmarks.table import Cell, Item, frame_of
@@ -77,7 +79,7 @@ def row_of(item: Item, overrides: tuple[str, ...] = QUICK) -> Row:
 
 
 def text_of(*rows: Row) -> str:
-    return suite_page("T", frame_of(rows))
+    return suite_page(Path("T.md"), frame_of(rows))
 
 
 def test_a_pair_that_cannot_be_measured_has_a_reason(tmp_path):
@@ -160,7 +162,8 @@ def test_two_pages_are_compared_by_family_and_half(tmp_path):
     after.append(solved("shared", "new", "sheet"))
     for name, rows in (("before", before), ("after", after)):
         (tmp_path / name).mkdir()
-        write_suite(tmp_path / name / "shared.md", frame_of(rows))
+        page = tmp_path / name / "shared.md"
+        page.write_text(suite_page(page, frame_of(rows)))
     text = comparison(read_pages(tmp_path / "before"), read_pages(tmp_path / "after"))
     assert "| street | dis | 2 | 0.0300 | 0.0450 | 1.4142 |" in text
     assert "half A, dis: 1.1892 over 2; worse by 10 %: 1, better: 0" in text
