@@ -13,7 +13,7 @@ from benchmarks.suites import HALF_B
 from benchmarks.table import (
     geometric,
     markdown,
-    metric,
+    mre_of,
     numbers,
     page_text,
     panels,
@@ -70,7 +70,7 @@ ABOUT_HALVES = (
 def suite_page(page: Path, frame: pd.DataFrame, note: str = "") -> str:
     """The page of the rows of one suite; its picture is written beside it."""
     good = frame[frame["ok"].eq(True)]
-    scored = good[metric(good).notna()]
+    scored = good[mre_of(good).notna()]
     settings = ", ".join(sorted(frame["settings"].astype(str).unique()))
     open_ends = ", ".join(good["title"][~numbers(good, "good").gt(0)]) or "none"
     verdict = (
@@ -97,14 +97,14 @@ def _best(frame: pd.DataFrame) -> pd.Series:
     out = pd.Series(True, frame.index)
     for baseline in BASELINES:
         own = "solution_rigid" if baseline == "rigid" else "solution"
-        out &= ~(metric(frame, baseline) <= metric(frame, own).fillna(metric(frame)))
+        out &= ~(mre_of(frame, baseline) <= mre_of(frame, own).fillna(mre_of(frame)))
     return out
 
 
 def _by_pair(frame: pd.DataFrame) -> str:
     """Table of family, MRE of every method but the filled rigid depth, and time."""
     shown = [m for m in METHODS if m != "rigid_filled"]
-    table = pd.DataFrame({m: metric(frame, m) for m in shown}).dropna(axis=1, how="all")
+    table = pd.DataFrame({m: mre_of(frame, m) for m in shown}).dropna(axis=1, how="all")
     table.insert(0, "family", frame["family"])
     table["CPU s"] = frame["cpu_seconds"]
     return markdown(table, dict.fromkeys(table, ".4f") | {"CPU s": ".0f"})

@@ -20,7 +20,7 @@ from benchmarks.table import (
     Overrides,
     geometric,
     markdown,
-    metric,
+    mre_of,
     page_text,
     provenance,
 )
@@ -230,7 +230,7 @@ def _with_truth(data: Path | None) -> list[Item]:
 def paper_page(frame: pd.DataFrame, plan: pd.DataFrame, note: str) -> str:
     """The page of all rows; `note` gives their sizes."""
     rows = plan.join(frame.set_index("key").drop(columns="variant"), on="key")
-    rows["mre"] = metric(rows)
+    rows["mre"] = mre_of(rows)
     sections = dict(list(rows.groupby("section", sort=False)))
     measured = f"{int(frame['ok'].eq(True).sum())} of the {len(frame)} rows were measured."
     blocks = ["# The paper, row by row", f"{provenance(frame)}; {os.cpu_count()} cores."]
@@ -258,10 +258,10 @@ def _pivot(rows: pd.DataFrame, index: str, columns: str) -> pd.DataFrame:
 def _comparison(rows: pd.DataFrame) -> list[str]:
     groups = rows.groupby(["dataset", "method"])["mre"].mean()
     table = PUBLISHED.add_suffix(" (published)").join(groups.unstack())
-    constant = metric(rows, "constant").groupby(rows["dataset"]).mean()
+    constant = mre_of(rows, "constant").groupby(rows["dataset"]).mean()
     table["constant depth"] = constant.reindex(table.index)
     maps = {"start": "start", "NLP": "nlp", "refined": "solution", "constant": "constant"}
-    by_pair = pd.DataFrame({title: metric(rows, name) for title, name in maps.items()})
+    by_pair = pd.DataFrame({title: mre_of(rows, name) for title, name in maps.items()})
     by_pair[["status", "CPU s"]] = rows[["status", "cpu_seconds"]]
     index = pd.MultiIndex.from_frame(rows[["name", "method"]])
     forms = dict.fromkeys(by_pair, ".4f") | {"CPU s": ".0f"}

@@ -127,9 +127,9 @@ def numbers(frame: pd.DataFrame, column: str) -> pd.Series:
     return frame[column].astype(float) if known else pd.Series(np.nan, frame.index, float)
 
 
-def metric(frame: pd.DataFrame, method: str = "solution", name: str = "mre") -> pd.Series:
-    """A metric of every row; NaN where it is not known."""
-    return numbers(frame, f"metrics.{method}.{name}")
+def mre_of(frame: pd.DataFrame, method: str = "solution") -> pd.Series:
+    """The MRE of every row; NaN where it is not known."""
+    return numbers(frame, f"metrics.{method}.mre")
 
 
 def geometric(values: pd.Series) -> float:

@@ -128,16 +128,8 @@ RECORDS = Path(__file__).with_name("records")
 
 
 def load_frozen(scene: str, size: int) -> Frozen:
-    """The record of a scene and size, see `read_frozen`."""
-    return read_frozen(RECORDS / f"{scene}-{size}.npz")
-
-
-def read_frozen(path: Path) -> Frozen:
-    """Read the record of a scene from a file.
-
-    Raises:
-        DataError: the file is missing or cannot be read.
-    """
+    """The record of a scene and size, from its file."""
+    path = RECORDS / f"{scene}-{size}.npz"
     try:
         with np.load(path, allow_pickle=False) as a:
             return Frozen(
