@@ -16,7 +16,6 @@ from benchmarks.family.frozen import Frozen
 from soup_nlp.arrays import Float
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError
-from soup_nlp.geometry.graph import build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
@@ -25,7 +24,7 @@ from soup_nlp.model.layout import Layout, TangentLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_tangent_nlp, exact_chart
 from soup_nlp.model.reweighting import in_pixels
-from soup_nlp.pipeline.case import solver_options
+from soup_nlp.pipeline.case import segmented, solver_options
 from soup_nlp.pipeline.record import Case
 from soup_nlp.start.labelling import limited_noise
 from soup_nlp.start.propose import Start
@@ -140,10 +139,7 @@ def case_of(record: Frozen, pair: Pair | None = None) -> Case:
     problem = record.problem
     pair = pair or problem.load_pair()
     pair = pair.with_flow(problem.flow.load(pair, problem.path))
-    s = problem.segmentation
-    samples = None if s.boundary_samples == "all" else s.boundary_samples
-    seg = build_segmentation(record.labels, pair.image_ref, s.neighbours, boundary_samples=samples)
-    seg = replace(seg, pair_weight=record.pair_weight)
+    seg = replace(segmented(problem, pair, record.labels), pair_weight=record.pair_weight)
     # entries that the energy does not use are 0
     none = np.zeros(len(seg), np.int64)
     start = Start(

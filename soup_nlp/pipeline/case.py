@@ -33,13 +33,17 @@ from soup_nlp.storage.progress import Watch
 from soup_nlp.storage.system import require_memory
 
 
+def _silent(line: str) -> None:
+    """Tell nobody."""
+
+
 def prepare(
     problem: Problem,
     presolve: bool = False,
     *,
     pair: Pair | None = None,
-    log: Callable[[str], None] | None = None,
-    on_stage: Callable[[str], None] | None = None,
+    log: Callable[[str], None] = _silent,
+    on_stage: Callable[[str], None] = _silent,
 ) -> Case:
     """Load, segment, start and weight a problem: everything before a solve.
 
@@ -51,14 +55,7 @@ def prepare(
         on_stage: Called with the name of a stage at its end: "load", "flow", "segmentation",
             "start".
     """
-
-    def done(stage: str, line: object = None) -> None:
-        if log and line is not None:
-            log(str(line))
-        if on_stage:
-            on_stage(stage)
-
-    full, pair, labels, seg = _observed(problem, pair, log, done)
+    full, pair, labels, seg = _observed(problem, pair, log, on_stage)
     begun, evidence, given_depth = _begun(problem, pair, seg), None, None
     if pair.depth_prior is not None and problem.energy.weights.depth > 0:
         begun, evidence = _judged(problem, labels, begun)
@@ -66,9 +63,9 @@ def prepare(
     seg = flow.seg
     if evidence is not None:
         start, given_depth = by_prior(*begun, evidence)
-        if log:
-            log(str(evidence))
-    done("start", start)
+        log(str(evidence))
+    log(str(start))
+    on_stage("start")
     data, weights = build_energy(problem, pair, seg, start, given_depth)
     stages = solver_options(problem, start)
     larger = None if pair.size == full.size else full
@@ -79,43 +76,43 @@ def prepare(
     # a solve has at least one iteration of the constrained NLP
     limit = stages.presolve_iterations or ITERATIONS
     once = stages.replace(presolve_iterations=limit, max_iter=1)
-    watch = Watch(say=log) if log else None
-    answer = solve_soup(start.soup, data, weights, case.formulation(), once, watch=watch)
+    answer = solve_soup(start.soup, data, weights, case.formulation(), once, watch=Watch(say=log))
     return replace(case, soup=answer.soup)
 
 
 def observed_pair(problem: Problem) -> Pair:
     """The pair of a problem with its flow, and the focal length by it where it was a guess."""
-    return _observed(problem, None, None, lambda *_: None)[1]
+    return _observed(problem)[1]
 
 
 def _observed(
     problem: Problem,
-    pair: Pair | None,
-    log: Callable[[str], None] | None,
-    done: Callable[..., None],
+    pair: Pair | None = None,
+    log: Callable[[str], None] = _silent,
+    on_stage: Callable[[str], None] = _silent,
 ) -> tuple[Pair, Pair, Labels, Segmentation]:
     """Everything before the start: the pair in full size, the pair that is solved, labels and
     graphs of the superpixels; see `prepare`."""
     full = problem.depth_prior.load(pair or problem.load_pair(), problem.path)
     pair = working_size(full, problem.max_size)
     check_fits(problem, pair)
-    if pair is not full and log:
+    if pair is not full:
         (h, w), (rows, columns) = full.size, pair.size
         log(f"{w}x{h} is solved at {columns}x{rows} (max_size {problem.max_size:g} megapixels)")
-    done("load")
+    on_stage("load")
     pair = with_flow(problem, full, pair, log)
-    done("flow", pair)
+    log(str(pair))
+    on_stage("flow")
     labels = superpixels(problem, pair)
-    seg = _segmented(problem, pair, labels)
-    done("segmentation", seg)
+    seg = segmented(problem, pair, labels)
+    log(str(seg))
+    on_stage("segmentation")
     if pair.focal_sigma >= GUESS_SIGMA:
         matches = _flow_fit(problem, pair, seg).views.matches()
         error = camera_error(matches, "focal length", pair.focal_sigma)
         better = float(np.exp(error.mean)), error.deviation
         full, pair = full.with_focal(*better), pair.with_focal(*better)
-        if log:
-            log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
+        log(f"focal length {pair.K_ref[0, 0]:.0f} px by the flow, right to {better[1]:.0%}")
     return full, pair, labels, seg
 
 
@@ -123,7 +120,7 @@ Begun = tuple[Start, Pair, FlowFit]
 """A start, its pair, and the flow of its superpixels as affine maps."""
 
 
-def _segmented(problem: Problem, pair: Pair, labels: Labels) -> Segmentation:
+def segmented(problem: Problem, pair: Pair, labels: Labels) -> Segmentation:
     """Superpixels with their graphs."""
     s = problem.segmentation
     samples = None if s.boundary_samples == "all" else s.boundary_samples
@@ -163,13 +160,13 @@ def _judged(problem: Problem, labels: Labels, begun: Begun) -> tuple[Begun, Prio
     s, pair, few = problem.segmentation, begun[1], begun
     if s.superpixels > JUDGED_PIECES:
         pieces = superpixels(problem, pair, JUDGED_PIECES)
-        few = _begun(problem, pair, _segmented(problem, pair, pieces))
+        few = _begun(problem, pair, segmented(problem, pair, pieces))
     evidence = judged(*few, problem.depth_prior.kind)
     if evidence.used and not evidence.confirmed and s.follow_flow_px is not None:
         assert pair.depth_prior is not None
         # the flow does not show where surfaces end
         followed = follow_depth(labels, evidence.log_depth(pair.depth_prior))
-        begun = _begun(problem, pair, _segmented(problem, pair, followed))
+        begun = _begun(problem, pair, segmented(problem, pair, followed))
     return begun, evidence
 
 
@@ -233,7 +230,9 @@ LEAST_FLOW = 2.0
 """Median displacement and parallax, pixels, below which the camera may be at rest, or turn only."""
 
 
-def with_flow(problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] | None) -> Pair:
+def with_flow(
+    problem: Problem, full: Pair, pair: Pair, log: Callable[[str], None] = _silent
+) -> Pair:
     """A pair with its flow; one that is computed here is searched again by the camera's motion.
 
     If a layer stands still, the scene behind it is searched for, else what is not sure. A flow that
@@ -254,8 +253,7 @@ def with_flow(problem: Problem, full: Pair, pair: Pair, log: Callable[[str], Non
     behind = see_through(pair, problem.seed)
     if behind is None:
         return pair.with_flow(search_again(pair, problem.seed))
-    if log:
-        log("a layer stands still before the scene: flow searched for behind it")
+    log("a layer stands still before the scene: flow searched for behind it")
     return pair.with_flow(behind)
 
 

@@ -100,7 +100,7 @@ def run(
             raise StoppedError(what, where=f"after stage {stage}")
 
     watch = Watch(listener, stop or threading.Event(), log or (lambda line: None), ipopt_log)
-    case = prepare(problem, pair=pair, log=log, on_stage=ended)
+    case = prepare(problem, pair=pair, log=watch.say, on_stage=ended)
 
     if problem.refine.enabled and problem.refine.from_start:
         solution = skipped(case)
@@ -111,8 +111,7 @@ def run(
     refined = None
     if problem.refine.enabled:
         refined = _refined(case, solution.soup, watch)
-        if log:
-            log(str(refined))
+        watch.say(str(refined))
         ended("refine")
     done = make_run(case, solution, refined)
     ended("evaluation")

@@ -291,6 +291,6 @@ def test_only_computed_flow_is_searched_again(reflecting, monkeypatch, source, o
     reflected = given(reflecting, still=True, source=source)
     monkeypatch.setattr(FlowOptions, "load", lambda *_: reflected.flow)
     problem = make_problem({**memory, "flow": options})
-    loaded = with_flow(problem, reflecting, reflecting, None)
+    loaded = with_flow(problem, reflecting, reflecting)
     assert bool((loaded.flow.uv[BEHIND] == 0).all()) is not searched
-    assert with_flow(problem, loaded, loaded, None) is loaded
+    assert with_flow(problem, loaded, loaded) is loaded
