@@ -173,11 +173,7 @@ def plot_sigma(path: Path, frame: pd.DataFrame) -> bool:
 
 
 def read_pages(path: Path) -> pd.DataFrame:
-    """The numbers by pair of a page, or of all pages of a folder: `pair, flow` is the index.
-
-    Raises:
-        DataError: there is no table by pair.
-    """
+    """The numbers by pair of a page, or of all pages of a folder: `pair, flow` is the index."""
     pages = sorted(path.glob("*.md")) if path.is_dir() else [path]
     texts = [page.read_text(encoding="utf-8") for page in pages if page.is_file()]
     by_pair = re.compile(r"^\| pair, flow \|.*\n(?:^\|.*\n)*", re.MULTILINE)
@@ -193,9 +189,6 @@ def comparison(before: pd.DataFrame, after: pd.DataFrame) -> str:
     """Ratios of the MRE by family and half, after over before, on the pairs that both have.
 
     A family's ratio is the geometric mean of its pairs; a half's is that of its families.
-
-    Raises:
-        DataError: there is no such pair.
     """
     both = after.index.intersection(before.index, sort=False)
     if both.empty:

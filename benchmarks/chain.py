@@ -44,11 +44,7 @@ def sequences(data: Path | None) -> list[Item]:
 
 
 def measure_chain(cell: Cell, frames: int = 10) -> Row:
-    """Errors of a sequence with a scale for every frame and with one for all.
-
-    Raises:
-        DataError: the sequence has no truth.
-    """
+    """Errors of a sequence with a scale for every frame and with one for all."""
     item = cell.item
     source = item.input.get("path", f"scene:{item.family}")
     with TemporaryDirectory() as folder:

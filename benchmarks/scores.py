@@ -36,11 +36,7 @@ PIXELS = 500
 
 
 def measure_pair(cell: Cell) -> Row:
-    """Solve and score one pair.
-
-    Raises:
-        SoupError: the pair cannot be solved, or has no true depth.
-    """
+    """Solve and score one pair."""
     item = cell.item
     problem = item.problem(cell.overrides)
     pair = problem.load_pair()

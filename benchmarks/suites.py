@@ -244,10 +244,6 @@ def list_suite(
 
     `data` is the root folder of the dataset, or a folder that holds it. `say` is called with a line
     on the number of pairs that were found, and of those of the list.
-
-    Raises:
-        DataError: the suite is unknown, or none of its pairs is in the folder; the message names
-            the source of the dataset and its folder layout.
     """
     if name not in SUITES:
         raise DataError("unknown suite", found=repr(name), expected=", ".join(SUITES))

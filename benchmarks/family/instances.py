@@ -79,11 +79,7 @@ class Instance:
 
 
 def parse_name(name: str) -> Instance:
-    """The instance of a name; a name without start gets the first start.
-
-    Raises:
-        ConfigError: the name is not one of the family.
-    """
+    """The instance of a name; a name without start gets the first start."""
     if name in _by_name():
         return _by_name()[name]
     raise ConfigError(
@@ -107,11 +103,7 @@ def select(
     forms: Sequence[str],
     starts: Sequence[str] = STARTS,
 ) -> list[Instance]:
-    """Instances of sizes, scenes, formulations and starts.
-
-    Raises:
-        ConfigError: one of them is not part of the family.
-    """
+    """Instances of sizes, scenes, formulations and starts."""
     known = {
         "sizes": (sizes, SIZES),
         "scenes": (scenes, SCENES),

@@ -63,10 +63,6 @@ def write_family(
     Returns:
         Entries of the index. "published" says whether the bytes are those of the published
         version; None if that version has no such instance.
-
-    Raises:
-        DataError: there is no record of a size, or the folder holds other files or cannot be
-            written.
     """
     if folder.is_dir() and any(folder.iterdir()) and not (folder / INDEX).is_file():
         raise DataError(
@@ -166,10 +162,6 @@ def check_sol(path: Path) -> tuple[str, bool]:
 
     Returns:
         What was found, and whether the point is verified.
-
-    Raises:
-        ConfigError: the name is not one of the family.
-        ExportError: the file cannot be read.
     """
     instance = parse_name(path.stem)
     record = load_frozen(instance.scene, instance.size)
@@ -190,11 +182,7 @@ def check_sol(path: Path) -> tuple[str, bool]:
 
 
 def family_tasks(folder: Path) -> Iterator[Labelled]:
-    """The tasks of all instances in a folder, for `export.compare.compare`.
-
-    Raises:
-        DataError: the index cannot be read.
-    """
+    """The tasks of all instances in a folder, for `export.compare.compare`."""
     for entry in read_json(folder / INDEX, "index of the family", _Index)["instances"]:
         instance = parse_name(entry["name"])
         label = {
