@@ -26,7 +26,7 @@ from benchmarks.scores import measure_pair
 from benchmarks.sigma import sigma_page
 from benchmarks.solvers import write_results
 from benchmarks.suites import SUITES, Options, list_suite
-from benchmarks.table import Cell, Item, frame_of, measure
+from benchmarks.table import Cell, frame_of, measure
 from soup_nlp import SoupError
 from soup_nlp.errors import DataError
 from soup_nlp.export.compare import compare as run_solvers
@@ -62,11 +62,6 @@ def numbers(text: str) -> list[int]:
         raise typer.BadParameter(f"{text!r} is no comma-separated list of whole numbers") from None
 
 
-def cells_of(items: list[Item], overrides: Words) -> list[Cell]:
-    """Pairs under overrides."""
-    return [Cell(item, tuple(overrides or ())) for item in items]
-
-
 def finish(page: Path, frame: pd.DataFrame, text: str) -> int:
     """Write a page and print it; 1 if a row failed."""
     write_text(page, text)
@@ -93,7 +88,8 @@ def accuracy(
     codes, say = [], partial(print, file=sys.stderr)
     # a suite without data ends the command before anything is measured
     for each, items in {each: list_suite(each, data, wanted, say) for each in suite}.items():
-        cells, page = cells_of(items, overrides), out / f"{name or each}.md"
+        cells = [Cell(item, tuple(overrides or ())) for item in items]
+        page = out / f"{name or each}.md"
         rows = page.with_suffix(".jsonl")
         frame = measure(cells, measure_pair, rows, workers, cluster=cluster)
         text = suite_page(page, frame, f"Suite `{each}`: {SUITES[each].text}.")
@@ -170,7 +166,7 @@ def chain(
 ) -> int:
     """What one scale costs on rendered sequences, and on kitti_tracking in the --data folder."""
     chosen = [i for i in chains.sequences(data) if not only or any(w in i.name for w in only)]
-    cells, page = cells_of(chosen, overrides), out / "chain.md"
+    cells, page = [Cell(item, tuple(overrides or ())) for item in chosen], out / "chain.md"
     frame = measure(cells, chains.measure_chain, page.with_suffix(".jsonl"))
     return finish(page, frame, chains.chain_page(frame))
 

@@ -7,7 +7,7 @@ depend on the processor. Every number of the NLP is therefore rounded to 20 sign
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -80,21 +80,15 @@ class Instance:
 
 def parse_name(name: str) -> Instance:
     """The instance of a name; a name without start gets the first start."""
-    if name in _by_name():
-        return _by_name()[name]
+    for instance in select(SIZES, SCENES, [*FORMULATIONS]):
+        if name in (instance.name, instance.problem):
+            return instance
     raise ConfigError(
         "no instance of the family",
         found=name,
         expected="SOUP-SCENE-GAUGE-NORM-NSIZE-START",
         hint="such as SOUP-street-unit-offset-smooth-N100-easy",
     )
-
-
-@cache
-def _by_name() -> dict[str, Instance]:
-    every = select(SIZES, SCENES, [*FORMULATIONS])
-    first = {i.problem: i for i in every if i.start == STARTS[0]}
-    return first | {i.name: i for i in every}
 
 
 def select(
@@ -117,13 +111,8 @@ def select(
             raise ConfigError(
                 "not of the family", where=f"--{name}", found=found, expected=expected
             )
-    return [
-        Instance(scene, form, size, start)
-        for scene in dict.fromkeys(scenes)
-        for form in dict.fromkeys(forms)
-        for size in dict.fromkeys(sizes)
-        for start in dict.fromkeys(starts)
-    ]
+    chosen = product(scenes, forms, sizes, starts)
+    return [*dict.fromkeys(Instance(*parts) for parts in chosen)]
 
 
 def case_of(record: Frozen, pair: Pair | None = None) -> Case:

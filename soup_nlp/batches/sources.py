@@ -3,7 +3,7 @@
 import csv
 import glob
 import io
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ def _listed(pairs: Source, overrides: Sequence[str]) -> Iterator[Problem]:
     dataset, _, folder = str(pairs).partition(":")
     path = as_path(pairs, "pairs", home=True)
     if dataset in DATASETS and folder:
-        raws: Iterable[dict[str, Any]] = _dataset(dataset, as_path(folder, "data set", home=True))
+        raws = _dataset(dataset, as_path(folder, "data set", home=True))
         yield from (make_problem(raw, overrides, where=str(pairs)) for raw in raws)
     elif path.suffix == ".csv":
         yield from _table(path, overrides)

@@ -286,10 +286,9 @@ def dump_problem(problem: Problem, all_keys: bool = True) -> str:
 
 
 def _write(model: Section, pad: str, prefix: str, all_keys: bool) -> Iterator[str]:
-    docs = model.help()
     for key, field in type(model).model_fields.items():
         value = getattr(model, key)
-        comment = f"  # {docs[key]}" if key in docs else ""
+        comment = f"  # {' '.join((field.description or '').split())}"
         if isinstance(value, Section):
             lines = list(_write(value, pad + "  ", f"{prefix}{key}.", all_keys))
             yield from [f"{pad}{key}:{comment}", *lines] if lines else []

@@ -202,9 +202,3 @@ class Section(BaseModel, metaclass=_Checked):
     def replace(self, **changes: Any) -> Self:
         """A copy with some values changed, checked again."""
         return type(self)(**{**dict(self), **changes})
-
-    @classmethod
-    def help(cls) -> dict[str, str]:
-        """Description of every field, one line each."""
-        fields = cls.model_fields.items()
-        return {name: " ".join((field.description or "").split()) for name, field in fields}

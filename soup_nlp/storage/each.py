@@ -30,11 +30,6 @@ from soup_nlp.storage.versions import code_version
 Row = dict[str, Any]
 Work = Callable[[], Row]
 Say = Callable[[int, int, Row], None]
-Job = tuple[Mapping[str, Any], Work]
-"""Entries of a row that identify it together with the code version, and what measures the row.
-
-All jobs have entries of the same names.
-"""
 
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
@@ -268,7 +263,7 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
 
 
 def measure_all(
-    jobs: Sequence[Job],
+    jobs: Sequence[tuple[Mapping[str, Any], Work]],
     path: Path,
     workers: int = 1,
     *,
@@ -278,7 +273,8 @@ def measure_all(
 ) -> list[Row]:
     """The row of every job, from the JSON-lines file or else measured by `each` with its options.
 
-    A stored row is used for a job of the same name and code version unless the row failed. Every
+    A job has entries of its row, which have the same names in all jobs, and what measures the row.
+    A stored row is used for a job of the same entries and code version unless the row failed. Every
     new row is appended as soon as it is measured, so that an interrupted run can be continued.
     `say` is called with (done, total, row) after every new row, and `after` with all rows so far,
     in the order of the jobs, after every new row and at the end.
