@@ -77,8 +77,8 @@ def called(node: ast.expr) -> str:
     return getattr(node, "attr", getattr(node, "id", ""))
 
 
-def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[str, bool]]:
-    """Absolute names that a module imports, also inside functions and by `import_module`.
+def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:
+    """Names that a module imports, also inside functions and by `import_module`.
 
     With each name comes whether it is imported for types alone, under `if TYPE_CHECKING:`.
     """
@@ -94,12 +94,8 @@ def imports(tree: ast.AST, module: str, is_package: bool) -> Iterator[tuple[str,
         elif isinstance(node, ast.Import):
             yield from ((a.name, typed) for a in node.names)
         elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                home = f"soup_nlp.{module}".rstrip(".").split(".")
-                keep = len(home) - node.level + is_package
-                base = ".".join([*home[:keep], *([base] if base else [])])
-            yield from ((f"{base}.{a.name}", typed) for a in node.names)
+            assert not node.level, "a relative import: write the whole name"
+            yield from ((f"{node.module}.{a.name}", typed) for a in node.names)
 
 
 def own(name: str) -> str | None:
@@ -120,7 +116,7 @@ OUTSIDE: dict[str, set[str]] = {module: set() for module in MODULES}
 """Foreign libraries that every module imports, those for types alone left out."""
 for importer, file in MODULES.items():
     parsed = ast.parse(file.read_text(encoding="utf-8"))
-    for name, for_types in imports(parsed, importer, file.name == "__init__.py"):
+    for name, for_types in imports(parsed):
         target = own(name)
         if target is None:
             if not for_types:
@@ -149,7 +145,7 @@ def test_benchmarks_enter_few_rooms_and_the_package_does_not_know_them():
     folder = PACKAGE.parent / "benchmarks"
     for path in folder.rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        names = [own(name) for name, _ in imports(tree, "", False)]
+        names = [own(name) for name, _ in imports(tree)]
         entered["family" in path.parts] |= {room(n) for n in names if n} - COMMON
     assert entered[False] == BENCHMARKS
     assert entered[True] <= BENCHMARKS | FAMILY
