@@ -90,8 +90,7 @@ def accuracy(
     for each, items in {each: list_suite(each, data, wanted, say) for each in suite}.items():
         cells = [Cell(item, tuple(overrides or ())) for item in items]
         page = out / f"{name or each}.md"
-        rows = page.with_suffix(".jsonl")
-        frame = measure(cells, measure_pair, rows, workers, cluster=cluster)
+        frame = measure(cells, measure_pair, page, workers, cluster=cluster)
         text = suite_page(page, frame, f"Suite `{each}`: {SUITES[each].text}.")
         codes.append(finish(page, frame, text))
     return max(codes)
@@ -130,7 +129,7 @@ def paper(
     """The paper's tables by `preset: paper` and the defaults; a run that was stopped goes on."""
     plan = papers.make_plan(data, superpixels, analysis, limit, tuple(overrides or ()))
     page, cells = out / "README.md", list(plan.drop_duplicates("key")["cell"])
-    frame = measure(cells, measure_pair, page.with_suffix(".jsonl"), workers)
+    frame = measure(cells, measure_pair, page, workers)
     note = f"Superpixels wanted: {superpixels} in the comparison, {analysis} elsewhere."
     return finish(page, frame, papers.paper_page(frame, plan, note))
 
@@ -153,7 +152,7 @@ def speed(
     pairs = listed(scenes), numbers(seeds), numbers(widths)
     sizes = numbers(superpixels), numbers(neighbours)
     cells, page = speeds.speed_cells(*pairs, *sizes, overrides or []), out / f"{name}.md"
-    frame = measure(cells, speeds.measure_speed, page.with_suffix(".jsonl"), fresh=True)
+    frame = measure(cells, speeds.measure_speed, page, fresh=True)
     return finish(page, frame, speeds.speed_page(frame))
 
 
@@ -167,7 +166,7 @@ def chain(
     """What one scale costs on rendered sequences, and on kitti_tracking in the --data folder."""
     chosen = [i for i in chains.sequences(data) if not only or any(w in i.name for w in only)]
     cells, page = [Cell(item, tuple(overrides or ())) for item in chosen], out / "chain.md"
-    frame = measure(cells, chains.measure_chain, page.with_suffix(".jsonl"))
+    frame = measure(cells, chains.measure_chain, page)
     return finish(page, frame, chains.chain_page(frame))
 
 

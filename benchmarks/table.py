@@ -94,13 +94,14 @@ def _hash(section: Any, exclude: set[str]) -> str:
 
 
 def measure(
-    cells: Iterable[Cell], work: Callable[[Cell], Row], rows: Path, workers: int = 1, **options: Any
+    cells: Iterable[Cell], work: Callable[[Cell], Row], page: Path, workers: int = 1, **options: Any
 ) -> pd.DataFrame:
-    """The frame of the rows of cells, which a JSON-lines file holds or which are measured.
+    """The frame of the rows of cells, which a file beside the page holds or which are measured.
 
     `workers` and `options` are those of `soup_nlp.storage.each.each`.
     """
     jobs = [(cell.identity(), partial(work, cell)) for cell in cells]
+    rows = page.with_suffix(".jsonl")
     return frame_of(measure_all(jobs, rows, workers, say=say_row, **options))
 
 

@@ -103,8 +103,7 @@ def _entry(
     solved = dict(published()["solved"].get(instance.problem, {}))
     runs = solved.pop("runs", {}).get(instance.start, {})
     return {
-        **{"name": instance.name, "file": file.path.name, "scene": instance.scene},
-        **{"formulation": instance.formulation, "size": instance.size, "start": instance.start},
+        **{"name": instance.name, "file": file.path.name, **vars(instance)},
         "superpixels": superpixels,
         **nlp.sizes(),
         "bounded_variables": int((np.isfinite(nlp.lbx) | np.isfinite(nlp.ubx)).sum()),
