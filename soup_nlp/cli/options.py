@@ -49,7 +49,6 @@ def out_option(default: str) -> Any:
 
 
 Text = str | None
-Words = list[str] | None
 CAMERA = "fx,fy,cx,cy in pixels, or a file; default K.txt of a sequence, EXIF, a guess."
 Intrinsics = Annotated[str | None, in_input(CAMERA)]
 Fov = Annotated[
@@ -61,7 +60,7 @@ Neighbours = Annotated[int | None, in_size("K of the K-NN graph; default 15.")]
 MaxSize = Annotated[
     float | None, in_size("Megapixels to which larger images are reduced; default 1.5.")
 ]
-Set = Annotated[Words, in_method("Set any key, e.g. solver.max_iter=200.", "--set")]
+Set = Annotated[list[str] | None, in_method("Set any key, e.g. solver.max_iter=200.", "--set")]
 PresetName = Annotated[
     str | None,
     in_method(

@@ -21,15 +21,7 @@ from soup_nlp.errors import ConfigError, expect, printable
 from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.refine.records import RefineOptions
-from soup_nlp.schema.section import (
-    Keys,
-    Positive,
-    Section,
-    Seed,
-    Whole,
-    explain,
-    nearest,
-)
+from soup_nlp.schema.section import Keys, Positive, Section, Seed, Whole, explain, nearest
 from soup_nlp.solve.solver_options import SolverOptions, refuse_libraries
 from soup_nlp.start.views import StartOptions
 from soup_nlp.storage.files import as_path, is_file, is_folder, read_text

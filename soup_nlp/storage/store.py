@@ -107,8 +107,7 @@ def _write_group(group: h5py.Group, tree: Tree, rows: Mapping[str, Row]) -> None
             continue
         array = _write_array(group, name, np.asarray(item))
         row = row_of(rows, array.name.removeprefix("/")) or Row()
-        described = {"units": row.unit, "description": row.text, "shape_letters": row.axes}
-        array.attrs.update(described)
+        array.attrs.update(units=row.unit, description=row.text, shape_letters=row.axes)
 
 
 def _write_array(group: h5py.Group, name: str, data: NDArray[Any]) -> h5py.Dataset:

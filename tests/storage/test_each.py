@@ -13,14 +13,7 @@ import numpy as np
 import pytest
 
 from soup_nlp.errors import ConfigError, DataError, optional
-from soup_nlp.storage.each import (
-    ONE_THREAD,
-    append_row,
-    attempt,
-    each,
-    measure_all,
-    read_rows,
-)
+from soup_nlp.storage.each import ONE_THREAD, append_row, attempt, each, measure_all, read_rows
 from soup_nlp.storage.versions import code_version
 
 
