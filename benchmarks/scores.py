@@ -178,8 +178,8 @@ def _share(what: Mask, among: Mask) -> float | None:
 def seen(result: Run) -> Mask:
     """(H, W) True where the superpixel of a pixel has usable flow, see `SEEN`."""
     labels, flow = result.segmentation.labels, result.pair.flow
-    if flow is None:
-        return np.zeros(labels.shape, bool)
+    # a run has a flow
+    assert flow is not None
     flat = labels.ravel()
     mean = np.bincount(flat, flow.confidence.ravel()) / np.maximum(np.bincount(flat), 1)
     return np.asarray(mean[labels] > SEEN)
