@@ -10,9 +10,9 @@ import sys
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from helpers_files import sets, write_pair
 
 import soup_nlp
 from soup_nlp.batches.run import _claimed, batch, interval, page, table
@@ -28,14 +28,13 @@ TINY = [
     # refining the start takes less time than Ipopt
     *("refine.from_start=true", "refine.rounds=1", "refine.particles=4", "output.page=false"),
 ]
-TINY_SET = [word for key in TINY for word in ("--set", key)]
+TINY_SET = sets(" ".join(TINY))
 
 
 def write_folder(folder: Path, scene: str, seed: int = 0) -> None:
     pair = render_scene(scene, seed, 96, 64)
     folder.mkdir(parents=True)
-    for name, image in (("frame_0", pair.image_ref), ("frame_1", pair.image_next)):
-        cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
+    write_pair(folder, pair, ("frame_0", "frame_1"))
     np.savetxt(folder / "K.txt", pair.K_ref)
     np.save(folder / "depth.npy", pair.truth.depth_ref)
 

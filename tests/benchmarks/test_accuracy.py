@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers_files import sets
 
 from benchmarks.__main__ import main
 from benchmarks.accuracy import comparison, read_pages, suite_page
@@ -175,7 +176,7 @@ def test_two_pages_are_compared_by_family_and_half(tmp_path):
 def test_a_suite_is_measured_once_with_every_number(tmp_path, capsys):
     words = ["accuracy", "--suite", "rendered", "--only", "orbit", "--flow", "truth"]
     words += ["--width", "128", "--out", str(tmp_path)]
-    words += [w for o in QUICK for w in ("--set", o)]
+    words += sets(" ".join(QUICK))
     assert main(words) == 0
     out = capsys.readouterr()
     listed, measured = out.err.splitlines()
