@@ -158,6 +158,5 @@ def convert(
     overwrite: options.Overwrite = False,
 ) -> None:
     """Write a result for other programs."""
-    target = folder if out is None else out
     for name in folders.convert(folder, options.listed(to), out, overwrite):
-        print(target / name)
+        print((out or folder) / name)
