@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import about, placed
-from soup_nlp.data.scenes.raycast import Body, Frame, Part, Scene, render
-from soup_nlp.data.scenes.surfaces import Box, Plane, Texture
+from soup_nlp.data.scenes.raycast import Body, Part, Scene, render
+from soup_nlp.data.scenes.surfaces import Plane, Texture
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup, reconstruct
-from soup_nlp.geometry.superpixels import segment, split_components
+from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
@@ -221,48 +221,6 @@ def plane_soup(pose: Float, move: Float, count: int) -> Soup:
         np.tile(move[:3, :3], (count, 1, 1)),
         move[:3, 3] / lam[:, None],
     )
-
-
-def corner_scene(move: Float, component: Float | None = None, turn: float = 0.0) -> Scene:
-    """Floor and two walls that meet in a corner; with `component`, also a moving wedge of two
-    planes.
-
-    Args:
-        move: (4, 4) next_from_ref of the room (the camera's motion).
-        component: (4, 4) motion of the wedge in camera coordinates before the camera moves.
-        turn: Turns the wedge about its edge, degrees.
-    """
-    room = (
-        Part(Plane(), placed(0, 0, 6.0, yaw=35), GREY),
-        Part(Plane(), placed(0, 0, 6.0, yaw=-45), GREY),
-        Part(Plane(), placed(0, 0, 0.0, pitch=-90) @ placed(0, 0, -1.2), GREY),
-    )
-    components = [Body(room)]
-    if component is not None:
-        half = Box((0.7, 0.8, 1e-6))
-        wedge = []
-        for side in (-1.0, 1.0):
-            yaw = turn + side * 40.0
-            pose = placed(0, 0, 3.0, yaw=yaw) @ placed(side * 0.7, 0, 0)
-            wedge.append(Part(half, pose, GREY))
-        components.append(Body(tuple(wedge), component))
-    return Scene(tuple(components), np.eye(4), move)
-
-
-def cut_by_part(
-    scene: Scene, pair: Pair, count: int
-) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Grid superpixels cut along the parts' outlines; and which of them lie on one part only."""
-    height, width = pair.size
-    uv = camera.pixel_grid(height, width).reshape(-1, 2)
-    view = Frame(scene, pair.K_ref, 0)
-    part = view.trace(uv)[1].reshape(height, width)
-    cells = segment(pair.image_ref, count, "grid")
-    labels = split_components(cells * len(view.parts) + part.astype(np.int32), 40)
-    low, high = np.full(labels.max() + 1, 99), np.full(labels.max() + 1, -1)
-    np.minimum.at(low, labels.ravel(), part.ravel())
-    np.maximum.at(high, labels.ravel(), part.ravel())
-    return labels, low == high
 
 
 EDGE_FIELDS = ("edges", "edge_weight", "edge_unit", "rotation_scale")

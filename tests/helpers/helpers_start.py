@@ -3,21 +3,22 @@
 from typing import Any
 
 import numpy as np
-from helpers_model import corner_scene, cut_by_part, motion, with_true_flow
+from helpers_model import GREY, motion, with_true_flow
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Pair
-from soup_nlp.data.scenes.catalogue import render_scene
-from soup_nlp.data.scenes.raycast import render
+from soup_nlp.data.scenes.catalogue import placed, render_scene
+from soup_nlp.data.scenes.raycast import Body, Frame, Part, Scene, render
+from soup_nlp.data.scenes.surfaces import Box, Plane
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.geometry.superpixels import segment
+from soup_nlp.geometry.superpixels import segment, split_components
 from soup_nlp.start.views import FlowFit, SeededStart, Views
 
 Float = NDArray[np.float64]
-
 
 CORNER_K = camera.intrinsics(180.0, 180.0, 95.5, 71.5)
 CAMERA, WEDGE = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1)), motion((0, 3, 0), (-0.15, 0.02, 0.1))
@@ -27,16 +28,33 @@ CAMERA, WEDGE = motion((0.5, -1.5, 0.3), (0.35, 0.05, 0.1)), motion((0, 3, 0), (
 def corner(
     camera_motion: Float = CAMERA, wedge: Float | None = None, count: int = 48
 ) -> tuple[Pair, Segmentation, NDArray[np.bool_]]:
-    """A corner of a room, with a wedge that moves, at 192 x 144 pixels.
+    """Floor and two walls that meet in a corner, at 192 x 144 pixels.
+
+    Args:
+        camera_motion: (4, 4) next_from_ref of the room.
+        wedge: Motion of a wedge of two planes, if there is one, before the camera moves.
+        count: About how many superpixels, before they are cut along the outlines of planes.
 
     Returns:
-        The pair with its exact flow, superpixels cut along the outlines of planes, and which of
-        them lie on one plane.
+        The pair with its exact flow, the superpixels, and which of them lie on one plane.
     """
-    scene = corner_scene(camera_motion, wedge, turn=10)
+    walls = [placed(0, 0, 6.0, yaw=35), placed(0, 0, 6.0, yaw=-45)]
+    walls.append(placed(0, 0, 0.0, pitch=-90) @ placed(0, 0, -1.2))
+    bodies = [Body(tuple(Part(Plane(), pose, GREY) for pose in walls))]
+    if wedge is not None:
+        half = Box((0.7, 0.8, 1e-6))
+        poses = [placed(0, 0, 3.0, yaw=10 + 40 * s) @ placed(0.7 * s, 0, 0) for s in (-1, 1)]
+        bodies.append(Body(tuple(Part(half, pose, GREY) for pose in poses), wedge))
+    scene = Scene(tuple(bodies), np.eye(4), camera_motion)
     pair = with_true_flow(render(scene, CORNER_K, 144, 192))
-    labels, pure = cut_by_part(scene, pair, count)
-    return pair, build_segmentation(labels, pair.image_ref, neighbours=10), pure
+    view = Frame(scene, CORNER_K, 0)
+    part = view.trace(camera.pixel_grid(144, 192).reshape(-1, 2))[1].reshape(144, 192)
+    cells = segment(pair.image_ref, count, "grid")
+    labels = split_components(cells * len(view.parts) + part.astype(np.int32), 40)
+    spread = ndimage.labeled_comprehension(
+        part, labels, np.arange(labels.max() + 1), np.ptp, int, 0
+    )
+    return pair, build_segmentation(labels, pair.image_ref, neighbours=10), spread == 0
 
 
 def squares(rows: int, columns: int, side: int = 8, neighbours: int = 4) -> Segmentation:
