@@ -166,16 +166,6 @@ def test_a_variable_at_its_bound_takes_the_whole_gradient():
     np.testing.assert_allclose(lam, [2.0, -3.0, 1.0], rtol=1e-15)
 
 
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_residuals_are_within_a_few_times_the_tolerance(place):
-    limits = verify.Limits()
-    bounds = np.array([limits.feasibility, limits.tol, limits.tol])
-    for factor, good in ((0.5, True), (2.0, False)):
-        found = np.zeros(3)
-        found[place] = factor * verify.SLACK * bounds[place]
-        assert verify.Residuals(*found.tolist(), "", found, found).within(limits) is good
-
-
 @pytest.mark.parametrize(
     ("message", "read"),
     [("two\n\nlines", "two\nlines"), ("one\n Options\ntwo", 'one\n"Options"\ntwo')],
