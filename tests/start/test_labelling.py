@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_start import WEDGE, corner, fitted, squares
+from helpers_start import WEDGE, corner, fitted, flow_of, squares
 from helpers_truth import majority
 
 from soup_nlp.data.pair import Flow
-from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry import rotation
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start import labelling
 from soup_nlp.start.epipolar import SIDEWAYS, Motion
@@ -21,7 +21,6 @@ from soup_nlp.start.labelling import (
 )
 from soup_nlp.start.propose import propose
 from soup_nlp.start.regions import belonging, connected_labels, continued, harmonic, likeness
-from soup_nlp.start.views import FlowFit
 
 
 @pytest.fixture(scope="module")
@@ -77,18 +76,9 @@ def test_a_motion_stays_if_it_saves_its_price(pays, saved):
     cost[own, 0] = saved * price_of_motion(100) / own.sum()
     cost[~own, 1] = MOST_COST
     cost[:, 2] = 0.5 * MOST_COST
-    still = fitted_like(seg)
-    used, label = labelling._paying(still._replace(jump=np.full(len(seg.pairs), 9.0)), cost)
+    used, label = labelling._paying(flow_of(seg, jump=9.0), cost)
     assert used == ([0, 1] if pays else [0])
     np.testing.assert_array_equal(label, own if pays else 0)
-
-
-def fitted_like(seg):
-    """A flow that does not move, of superpixels."""
-    height, width = seg.labels.shape
-    K = camera.intrinsics(50.0, 50.0, width / 2, height / 2)
-    none = Flow(np.zeros((height, width, 2), np.float32), np.ones((height, width)), "test")
-    return FlowFit.of(seg, none, K, K)
 
 
 def test_neighbours_agree_unless_the_flow_jumps(world):

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from helpers_start import facing, squares
 
-from soup_nlp.config.problem import make_problem
 from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.geometry.components import find_components
 from soup_nlp.geometry.rotation import RigidMotion, exp, fit_motion
-from soup_nlp.pipeline.case import prepare
 
 K = intrinsics(100.0, 100.0, 39.5, 29.5)
 CAMERA = RigidMotion(exp([0.0, 0.02, 0.0]), np.array([0.05, 0.0, -0.1]))
@@ -96,23 +94,3 @@ def test_a_component_behind_the_camera_takes_its_first_motion(seg):
     components = find_components(soup_of([*[CAMERA] * 11, back]), seg, group, K, K)
     np.testing.assert_allclose(components[1].motion.matrix, back.matrix)
     assert np.isnan(components[1].residual_px)
-
-
-@pytest.mark.slow
-def test_the_near_car_of_a_street_is_a_component():
-    scene = {"kind": "scene", "scene": "street", "seed": 0, "width": 384, "height": 164}
-    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 150}}
-    case = prepare(make_problem(raw))
-    pair, start = case.pair, case.start
-    components = find_components(
-        start.soup, case.segmentation, start.component, pair.K_ref, pair.K_next, start.interpolated
-    )
-    for label, true in ((0, 0), (1, 1)):
-        a, b = components.of_pixel == label, pair.truth.components == true
-        # superpixels of 420 pixels, the car has 5,000
-        assert (a & b).sum() / (a | b).sum() > 0.85
-        # the rotation has no scale
-        turn = RigidMotion(
-            components[label].motion.R.T @ pair.truth.motions[true][:3, :3], np.zeros(3)
-        )
-        assert turn.angle < 0.5

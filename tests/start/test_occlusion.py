@@ -44,12 +44,6 @@ def sliding(covers: bool) -> tuple[Pair, Segmentation]:
     return pair, squares(HEIGHT // CELL, WIDTH // CELL, CELL, neighbours=15)
 
 
-@cache
-def begun(covers: bool) -> Start:
-    """The start of `sliding` before its parts are ordered."""
-    return propose(fitted(*sliding(covers)))
-
-
 def ordered(seg: Segmentation, pair: Pair) -> Start:
     flow = fitted(pair, seg)
     return propose(flow, covering(pair, flow))
@@ -92,7 +86,8 @@ def test_a_vote_needs_several_strips_and_agreement():
 @pytest.mark.slow
 @pytest.mark.parametrize("covers", [True, False])
 def test_a_mover_before_a_resting_camera_is_placed_in_order(covers):
-    (pair, seg), before = sliding(covers), begun(covers)
+    pair, seg = sliding(covers)
+    before = propose(fitted(pair, seg))
     start = ordered(seg, pair)
     assert before.at_rest
     z = np.log(start.soup.depth_at(camera.rays(K, seg.anchors)))
@@ -142,21 +137,13 @@ def test_a_swinging_object_comes_before_the_wall(swing):
     assert not (start.origin[main] == ORIGINS.index("occlusion")).any()
 
 
-OPTIONS = ("segmentation.superpixels=48", "segmentation.neighbours=6", "refine.enabled=false")
-
-
-def made(covers: bool):
-    pair, _ = sliding(covers)
-    raw = {"name": "sliding", "input": {"kind": "scene", "scene": "swing"}}
-    problem = make_problem(raw, [*OPTIONS, "segmentation.method=grid"], where="test")
-    return problem, pair
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("covers", [True, False])
 def test_the_nlp_keeps_the_order_and_is_unsure_of_it(covers):
-    problem, pair = made(covers)
-    done = run(problem, pair=pair)
+    raw = {"name": "sliding", "input": {"kind": "scene", "scene": "swing"}}
+    options = "superpixels=48", "neighbours=6", "method=grid"
+    problem = make_problem(raw, [f"segmentation.{o}" for o in options] + ["refine.enabled=false"])
+    done = run(problem, pair=sliding(covers)[0])
     assert (done.start.origin == ORIGINS.index("occlusion")).any()
     ordered_pairs = done.start.order != 0
     z = done.soup.depth_across(done.segmentation.pairs, done.data.boundary_ray.mean(axis=1))
@@ -170,7 +157,7 @@ def test_the_nlp_keeps_the_order_and_is_unsure_of_it(covers):
 def test_what_moves_before_a_resting_camera_is_a_part_without_an_order_too():
     pair, seg = sliding(True)
     moves = (pair.flow.uv[..., 0] != 0).ravel()[np.unique(seg.labels, return_index=True)[1]]
-    start = begun(True)
+    start = propose(fitted(pair, seg))
     assert start.at_rest
     assert not start.component.any()
     np.testing.assert_array_equal(start.part > 0, moves)
