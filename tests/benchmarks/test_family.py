@@ -157,8 +157,7 @@ def test_the_index_says_what_problem_sets_say(folder):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["{}", "[]", '{"instances": 5}', '{"instances": [{"name": "x"}]}', '{"instances": [1]}'],
+    "text", ["{}", "[]", '{"instances": 5}', '{"instances": [{"name": "x"}]}', '{"instances": [1]}']
 )
 def test_a_damaged_index_is_refused(text, tmp_path, capsys):
     (tmp_path / "index.json").write_text(text)

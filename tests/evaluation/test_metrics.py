@@ -8,13 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from soup_nlp.errors import DataError
 from soup_nlp.evaluation import recompute
-from soup_nlp.evaluation.metrics import (
-    UNSCALED,
-    Convention,
-    depth_metrics,
-    sample_at_points,
-    skill,
-)
+from soup_nlp.evaluation.metrics import UNSCALED, Convention, depth_metrics, sample_at_points, skill
 
 depths = arrays(np.float64, 12, elements=st.floats(0.1, 100.0))
 quick = settings(max_examples=20)

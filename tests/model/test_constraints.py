@@ -298,8 +298,7 @@ def test_visibility_bounds_the_depth_over_a_superpixel(ratio):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "gauge"),
-    [("room", "unit-offset"), ("street", "unit-translation")],
+    ("scene", "gauge"), [("room", "unit-offset"), ("street", "unit-translation")]
 )
 def test_the_raw_answer_of_a_default_solve_keeps_every_constraint(scene, gauge):
     small = ["input.width=96", "input.height=72", "segmentation.superpixels=20"]

@@ -18,13 +18,7 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.refine.mppbp import objective, refine_soup
 from soup_nlp.refine.particles import Particles
-from soup_nlp.refine.photometric import (
-    BEHIND,
-    SAMPLES,
-    TAU,
-    Photometric,
-    photometric_term,
-)
+from soup_nlp.refine.photometric import BEHIND, SAMPLES, TAU, Photometric, photometric_term
 from soup_nlp.refine.records import RefineOptions
 
 HEIGHT, WIDTH = 60, 96

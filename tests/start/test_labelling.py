@@ -12,13 +12,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start import labelling
 from soup_nlp.start.epipolar import SIDEWAYS, Motion
-from soup_nlp.start.labelling import (
-    CHANGE_COST,
-    MOST_COST,
-    labelled,
-    price_of_motion,
-    smooth,
-)
+from soup_nlp.start.labelling import CHANGE_COST, MOST_COST, labelled, price_of_motion, smooth
 from soup_nlp.start.propose import propose
 from soup_nlp.start.regions import belonging, connected_labels, continued, harmonic, likeness
 

@@ -8,12 +8,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.start import bending, epipolar
 from soup_nlp.start.bending import constant_depth, displaced, fit_robustly, turned
-from soup_nlp.start.epipolar import (
-    Matches,
-    Motion,
-    fit_translation,
-    refine_near,
-)
+from soup_nlp.start.epipolar import Matches, Motion, fit_translation, refine_near
 from soup_nlp.start.views import Views, affine_flow
 
 FOCAL = 200.0
