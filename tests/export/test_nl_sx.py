@@ -11,15 +11,6 @@ from soup_nlp.errors import DataError, ExportError
 from soup_nlp.export.nl import NLFile
 
 
-def rosenbrock() -> dict:
-    x = ca.SX.sym("x", 2)
-    return {
-        "problem": {"x": x, "f": (1 - x[0]) ** 2 + 100 * (x[1] - x[0] ** 2) ** 2},
-        "x0": np.array([-1.2, 1.0]),
-        "x_names": ["x", "y"],
-    }
-
-
 def classes() -> dict:
     """A variable of every class, a row with every kind of bound, a constant in a linear row."""
     x = ca.SX.sym("x", 4)
@@ -56,12 +47,7 @@ def degenerate() -> dict:
 
 @pytest.mark.parametrize(
     ("make", "digest"),
-    [
-        (rosenbrock, "93c772cb"),
-        (classes, "758a9de2"),
-        (shared, "86b9e856"),
-        (degenerate, "fafad1b5"),
-    ],
+    [(classes, "758a9de2"), (shared, "86b9e856"), (degenerate, "fafad1b5")],
 )
 def test_textbook_problems_read_back_and_keep_their_bytes(make, digest, tmp_path):
     given = make()
@@ -69,13 +55,9 @@ def test_textbook_problems_read_back_and_keep_their_bytes(make, digest, tmp_path
     assert file.sha256.startswith(digest)
     same_as_sx(given["problem"], file, given["x0"] + 0.1)
     back = ReadBack(file.path)
-    for name in ("lbx", "ubx"):
-        if name in given:
-            assert np.array_equal(getattr(back, name), given[name][file.variables])
-    for name in ("lbg", "ubg"):
-        if name in given:
-            assert np.array_equal(getattr(back, name), given[name][file.rows])
-    assert np.array_equal(back.x0, given["x0"][file.variables])
+    for name in {"x0", "lbx", "ubx", "lbg", "ubg"} & given.keys():
+        order = file.rows if name.endswith("g") else file.variables
+        assert np.array_equal(getattr(back, name), given[name][order]), name
 
 
 def same_as_sx(problem: dict, file: NLFile, at: np.ndarray) -> None:
@@ -117,10 +99,8 @@ def test_pounce_reads_every_function(tmp_path):
     ("operation", "make"),
     [
         ("sign", lambda a, b, c: ca.sign(a) * b),
-        ("sign", lambda a, b, c: ca.sign(a)),
         ("floor", lambda a, b, c: ca.floor(a) * b),
         ("ceil", lambda a, b, c: b + 3 * ca.ceil(a)),
-        ("lt", lambda a, b, c: (a > 0.5) * b),
         ("not", lambda a, b, c: ca.logic_not(a) * b),
         ("fmod", lambda a, b, c: ca.fmod(a, b)),
         ("remainder", lambda a, b, c: ca.remainder(a, b)),

@@ -10,6 +10,7 @@ import pytest
 
 import soup_nlp
 from soup_nlp.errors import ModelError
+from soup_nlp.export.symbolic import SymbolicNLP
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.model import oracle
 from soup_nlp.solve.functions import Functions
@@ -44,9 +45,13 @@ def test_nlpsol_finds_the_minimum_of_solve():
     assert reached < 0.9 * own.energy_start["total"]
 
 
-def test_the_sensitivity_of_the_guide_is_that_of_a_second_solve():
-    nlp = soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL, presolve=True)
+@pytest.fixture(scope="module")
+def nlp() -> SymbolicNLP:
+    """At the presolve's answer."""
+    return soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL, presolve=True)
 
+
+def test_the_sensitivity_of_the_guide_is_that_of_a_second_solve(nlp):
     def solved(program, x0):
         functions = Functions(program)
         close = {"ipopt.mu_init": 1e-9, "ipopt.tol": 1e-10, "ipopt.bound_push": 1e-9}
@@ -77,8 +82,7 @@ def test_the_sensitivity_of_the_guide_is_that_of_a_second_solve():
     np.testing.assert_allclose(names["change"], change, atol=0.02 * largest)
 
 
-def test_the_symbols_are_the_program():
-    nlp = soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL)
+def test_the_symbols_are_the_program(nlp):
     n = len(nlp.case)
     assert nlp.x.numel() == nlp.record.nx == 16 * n
     f = ca.Function("f", [nlp.x, nlp.p], [nlp.f, nlp.g])
@@ -90,9 +94,7 @@ def test_the_symbols_are_the_program():
         nlp.parameters(width=0.1)
 
 
-@pytest.mark.slow
-def test_casadi_derives_the_constrained_nlp_by_itself():
-    nlp = soup_nlp.nlp("orbit", superpixels=9, overrides=SMALL, presolve=True)
+def test_casadi_derives_the_constrained_nlp_by_itself(nlp):
     careful = {"ipopt.mu_init": 1e-6, "ipopt.bound_push": 1e-8, "ipopt.nlp_scaling_method": "none"}
     solver = ca.nlpsol("s", "ipopt", nlp.problem, {**QUIET, **careful})
     answer = solver(**nlp.start)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_files import grey_texture
+from helpers_start import facing
 
 from soup_nlp.data.census import census, census_at
 from soup_nlp.data.pair import Flow, Pair
@@ -44,19 +45,16 @@ class TwoPlanes:
         self.pair = Pair(image, image_next, K, K)
         self.labels = segment(image, 40, "grid")
         self.seg = build_segmentation(self.labels, image, 6, boundary_samples=2)
-        n = len(self.seg)
+        self.count = len(self.seg)
         self.near = self.seg.anchors[:, 0] > 47.5
         depth = np.where(self.near, NEAR, FAR)
         self.truth = self.soup(depth)
         uv = np.zeros((HEIGHT, WIDTH, 2), np.float32)
         uv[..., 0] = np.where(self.near, 8.0, 4.0)[self.labels]
         self.flow = Flow(uv, np.ones((HEIGHT, WIDTH), np.float32), "truth")
-        self.count = n
 
     def soup(self, depth: np.ndarray) -> Soup:
-        n = len(depth)
-        normal, turn = np.tile([0.0, 0.0, -1.0], (n, 1)), np.tile(np.eye(3), (n, 1, 1))
-        return Soup(np.ones(n), normal, depth, turn, np.tile([SHIFT, 0.0, 0.0], (n, 1)))
+        return facing(depth, np.array([SHIFT, 0.0, 0.0]))
 
     def look(self, soup: Soup, **changes: float) -> Photometric:
         data, o = self.data(self.flow), OPTIONS.replace(**changes)
@@ -196,11 +194,7 @@ def test_one_round_is_enough_where_images_and_flow_agree(scene):
     data, w = scene.data(scene.flow), Weights()
     photo = scene.look(scene.truth)
     o = OPTIONS.replace(stagnation=0.0)
-    done = refine_soup(
-        scene.truth, data, w, o, photo=replace(photo, contradicted=np.zeros(40, bool))
-    )
-    assert (done.status, len(done.rounds), done.contradicted) == ("agreed", 1, 0)
-    done = refine_soup(
-        scene.truth, data, w, o, photo=replace(photo, contradicted=np.ones(40, bool))
-    )
-    assert (done.status, len(done.rounds), done.contradicted) == ("rounds", 3, 40)
+    for contradicted, end in ((False, ("agreed", 1, 0)), (True, ("rounds", 3, 40))):
+        own = replace(photo, contradicted=np.full(40, contradicted))
+        done = refine_soup(scene.truth, data, w, o, photo=own)
+        assert (done.status, len(done.rounds), done.contradicted) == end

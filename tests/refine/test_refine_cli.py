@@ -80,24 +80,12 @@ def test_the_depth_of_the_solution_has_detail(result, tmp_path):
     with h5py.File(damaged / "result.h5", "a") as file:
         file["depth/ref"][:] = planes.depth_ref
     assert "depth map solution" in {row.name for row in check_folder(damaged).rows if not row.ok}
-    code, _ = solve(tmp_path / "flat", "--set", "refine.detail=false")
+
+
+def test_without_the_nlp_the_start_is_refined(tmp_path):
+    folder = tmp_path / "start"
+    code, summary = solve(folder, "--no-nlp", "--set", "refine.detail=false")
     assert code == 0
-    flat = load(tmp_path / "flat").reconstruction
-    assert flat.detail is None
-    assert check_folder(tmp_path / "flat").ok
-
-
-@pytest.fixture(scope="module")
-def without_nlp(tmp_path_factory) -> tuple[Path, dict]:
-    """The folder of a refined start, and its summary."""
-    out = tmp_path_factory.mktemp("start")
-    code, summary = solve(out, "--no-nlp")
-    assert code == 0
-    return out, summary
-
-
-def test_without_the_nlp_the_start_is_refined(without_nlp):
-    folder, summary = without_nlp
     assert "Ipopt" not in (folder / "log.txt").read_text()
     assert summary["status"] == "Skipped"
     assert summary["delivered"] == "start"
@@ -105,6 +93,7 @@ def test_without_the_nlp_the_start_is_refined(without_nlp):
     r = summary["refinement"]
     assert r["end"]["total"] < r["begin"]["total"]
     assert "nlp" not in summary["metrics"]
+    assert load(folder).reconstruction.detail is None
     assert check_folder(folder).ok
     # the solve can be repeated from the folder alone, see test_cli
     again = load_problem(folder / "config.yaml")

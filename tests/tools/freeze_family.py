@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from benchmarks.family.frozen import STORED, Frozen
 from benchmarks.family.instances import case_of, rounded
@@ -81,14 +82,9 @@ def record_of(case: Case) -> Frozen:
 
 def encoded(soup: Soup) -> Float:
     """(N, 10) numbers of a soup with proper rotations."""
-    R = soup.R
-    trace = R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2]
-    # w > 0, since rotations between two frames are far from 180 degrees
-    w = np.sqrt(1 + trace) / 2
-    turn = np.stack(
-        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1
-    )
-    return np.column_stack([soup.distance, soup.n, turn / (4 * w[:, None]), soup.translation])
+    # of the quaternion with w > 0, rotations between two frames are far from 180 degrees
+    turn = Rotation.from_matrix(soup.R).as_quat(canonical=True)[:, :3]
+    return np.column_stack([soup.distance, soup.n, turn, soup.translation])
 
 
 def save_frozen(path: Path, record: Frozen) -> None:
