@@ -69,34 +69,21 @@ QUICK = (
 K = np.array([[100.0, 0, 32], [0, 100.0, 24], [0, 0, 1]])
 
 
-def item(scene: str = "orbit", flow: str = "truth", seed: int = 0) -> Item:
-    raw = {"kind": "scene", "scene": scene, "seed": seed, "width": 128, "height": 64}
-    return Item(scene, f"{scene}-{seed}", raw, flow=flow)
-
-
-def row_of(item: Item, overrides: tuple[str, ...] = QUICK) -> Row:
-    cell = Cell(item, overrides)
-    return {**cell.identity(), **attempt(lambda: measure_pair(cell)), "code": "c"}
-
-
-def text_of(*rows: Row) -> str:
-    return suite_page(Path("T.md"), frame_of(rows))
-
-
 def test_a_pair_that_cannot_be_measured_has_a_reason(tmp_path):
     with pytest.raises(ConfigError, match="superpixel"):
-        Cell(item(), ("segmentation.superpixel=3",)).identity()
+        Cell(Item("s", "p", {"kind": "motorcycle"}), ("segmentation.superpixel=3",)).identity()
     # a pair without a truth is not solved
     for k in (0, 1):
         cv2.imwrite(str(tmp_path / f"frame_{k}.png"), np.zeros((48, 64, 3), np.uint8))
     np.savetxt(tmp_path / "K.txt", K)
     raw = {"kind": "folder", "path": str(tmp_path)}
-    row = row_of(Item("s", "p", raw, suite="kinect_paper"))
+    cell = Cell(Item("s", "p", raw, suite="kinect_paper"), QUICK)
+    row = {**cell.identity(), **attempt(lambda: measure_pair(cell)), "code": "c"}
     assert not row["ok"]
     suite = SUITES["kinect_paper"]
     for words in ("pair has no true depth", suite.layout, suite.source):
         assert words in row["error"]
-    text = text_of(row)
+    text = suite_page(Path("T.md"), frame_of([row]))
     assert "0 of 1 pairs measured" in text
     assert "## Failed" in text
 
@@ -116,6 +103,8 @@ def test_sigma_is_scored_by_what_it_says():
     flat = sigma_scores(error, np.full(100, np.sqrt(np.mean(error**2))))
     assert flat["nll"] == pytest.approx(flat["flat"])
     assert sigma_scores(np.zeros(20), np.ones(20))["wrong_sure"] is None
+    within = sigma_scores(np.array([0.5, -1.5, 2.5, 1.0]), np.ones(4))
+    assert (within["within1"], within["within2"]) == (0.5, 0.75)
 
 
 ERROR = np.linspace(0.0, 1.0, 1001)
@@ -135,11 +124,6 @@ def test_equal_uncertainties_are_chance_in_whatever_order_they_come():
     forward, backward = (sparsification(ERROR[::k], half[::k]) for k in (1, -1))
     np.testing.assert_allclose(forward[0], backward[0])
     assert 0 < forward[1] < chance
-
-
-def test_what_lies_within_one_and_two_sigma_is_counted():
-    out = sigma_scores(np.array([0.5, -1.5, 2.5, 1.0]), np.ones(4))
-    assert (out["within1"], out["within2"]) == (0.5, 0.75)
 
 
 def solved(suite: str, pair: str = "p", family: str = "s", mre: float = 0.03) -> Row:

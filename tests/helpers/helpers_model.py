@@ -223,18 +223,6 @@ def plane_soup(pose: Float, move: Float, count: int) -> Soup:
     )
 
 
-EDGE_FIELDS = ("edges", "edge_weight", "edge_unit", "rotation_scale")
-EDGE_FIELDS += ("prior_weight", "prior_relief", "depth_weight", "depth_change")
-PAIR_FIELDS = ("pairs", "boundary_ray", "pair_weight", "pair_factor", "pair_unit")
-PAIR_FIELDS += ("orient_weight", "order_weight", "order_step")
-
-
-def with_graph(data: EnergyData, edges: list[int], pairs: list[int]) -> EnergyData:
-    """The data with some rows of the K-NN graph and of the neighbour graph."""
-    rows = {**dict.fromkeys(EDGE_FIELDS, edges), **dict.fromkeys(PAIR_FIELDS, pairs)}
-    return replace(data, **{k: getattr(data, k)[np.array(v, int)] for k, v in rows.items()})
-
-
 # --- the tiny problem and rendered planes in their units -----------------------------------------
 
 UNITS = ("paper", "pixels")

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers_model import (
-    GAUGES,
     K_NEXT,
     K_REF,
     PAPER,
@@ -30,7 +29,7 @@ from soup_nlp.model.elements import present
 from soup_nlp.model.energy_data import HINGE, EnergyData, build_energy_data, sample_pixels
 from soup_nlp.model.energy_options import BENDING, GAP, EnergyOptions, Weights
 from soup_nlp.model.programs import build_matrix_nlp
-from soup_nlp.model.reweighting import HELD, Known, in_pixels, weighted
+from soup_nlp.model.reweighting import HELD, Known, weighted
 from soup_nlp.pipeline.case import build_energy
 from soup_nlp.start.labelling import limited_noise
 
@@ -281,21 +280,6 @@ def test_order_weighs_by_the_noise_and_asks_for_steps_where_it_places():
     assert not found.order_step[~beside].any()
     off = options.replace(weights=options.weights.replace(order=0.0))
     assert not weighted(data, soup, of_scene(count, order=first), off).order_weight.any()
-
-
-def test_one_superpixel_is_a_valid_problem():
-    image = np.zeros((16, 16, 3), np.uint8)
-    seg = build_segmentation(np.zeros((16, 16), np.int32), image)
-    K = camera.intrinsics(20.0, 20.0, 7.5, 7.5)
-    flow = Flow(np.ones((16, 16, 2), np.float32), np.ones((16, 16), np.float32), "ones")
-    soup = random_soup(0, 1)
-    data = in_pixels(build_energy_data(seg, flow, K, K, 6), soup, seg)
-    for gauge in GAUGES:
-        nlp, _ = build_matrix_nlp(soup, data, PAPER, form(gauge=gauge))
-        e = oracle.energy(soup, data, PAPER)
-        assert e["arap"] == e["cont"] == e["orient"] == 0
-        assert nlp.value(nlp.x0) == pytest.approx(e["total"], rel=0.1)
-        assert nlp.constraints(nlp.x0)[: 6 + 1] == pytest.approx(0, abs=1e-12)
 
 
 def test_local_units_make_every_edge_blind_to_its_own_scale():

@@ -5,18 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_model import K_NEXT, K_REF, Tiny, random_soup, weights_for, with_graph
+from helpers_model import Tiny, random_soup, weights_for, world
 
-from soup_nlp.data.pair import Flow
-from soup_nlp.geometry import camera, rotation
+from soup_nlp.geometry import camera
 from soup_nlp.geometry.constraints import constraints
-from soup_nlp.geometry.graph import build_segmentation
-from soup_nlp.geometry.soup import Soup, reconstruct
-from soup_nlp.geometry.superpixels import segment
+from soup_nlp.geometry.soup import Soup
 from soup_nlp.model import oracle
-from soup_nlp.model.energy_data import EnergyData, build_energy_data
+from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.energy_options import Weights
-from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.refine import mppbp, particles
 from soup_nlp.refine.mppbp import length_slope, refine_soup
@@ -51,21 +47,13 @@ def chosen(p: Particles, labels: np.ndarray) -> Soup:
     return Soup(ones, picked.n[:, 0], picked.D[:, 0], picked.R[:, 0], picked.T[:, 0])
 
 
-def assembled(costs: PairCosts, p: Particles, labels: np.ndarray, unit: float = 1.0) -> float:
-    unary, _ = unary_costs(p, costs.data, costs.weights)
-    table = costs.tables(p, unit)
-    i, k = costs.edges.T
-    pairs = table[np.arange(len(i)), labels[i], labels[k]]
-    return float(unary[np.arange(len(labels)), labels].sum() + pairs.sum())
-
-
 @pytest.mark.parametrize("units", ["paper", "pixels"])
 @pytest.mark.parametrize("at_anchors", [False, True])
 @pytest.mark.parametrize("truncated", [False, True])
 def test_costs_of_chosen_labels_are_the_exact_energy(units, at_anchors, truncated):
     tiny = Tiny(units, at_anchors=at_anchors, samples=None)
-    weights = weights_for(units, truncated)
-    costs = PairCosts(tiny.data, weights)
+    own = _, weights = tiny.data, weights_for(units, truncated)
+    costs = PairCosts(*own)
     p = cloud(tiny, 6)
     exactly = costs.tables(p, 1.3)
     single = costs.tables(p, 1.3, np.float32)
@@ -77,7 +65,8 @@ def test_costs_of_chosen_labels_are_the_exact_energy(units, at_anchors, truncate
         soup = chosen(p, labels)
         unit = float(np.sum(tiny.data.share * soup.distance))
         exact = oracle.energy(soup, tiny.data, weights)["total"]
-        assert assembled(costs, p, labels, unit) == pytest.approx(exact, rel=1e-12)
+        found = mrf_energy(labels, unary_costs(p, *own)[0], costs.edges, costs.tables(p, unit))
+        assert found == pytest.approx(exact, rel=1e-12)
         # the delivered soup has the same energy, because E does not depend on the scale
         delivered = oracle.energy(p.soup(labels, tiny.data.share), tiny.data, weights)["total"]
         assert delivered == pytest.approx(exact, rel=1e-12)
@@ -144,36 +133,6 @@ def anchor_targets(p: Particles, data: EnergyData) -> np.ndarray:
     return camera.project(data.K_next, np.einsum("nlij,nlj->nli", p.R, X) + p.T)
 
 
-class Planar:
-    """Two planes under two motions in 30 grid superpixels, exact flow: the truth has known E."""
-
-    def __init__(self, broken: int = 0, seed: int = 0) -> None:
-        rng = np.random.default_rng(seed)
-        image = np.zeros((60, 80, 3), np.uint8)
-        labels = segment(image, 30, "grid")
-        seg = build_segmentation(labels, image, 6, boundary_samples=2)
-        n = len(seg)
-        self.left = left = seg.anchors[:, 0] < 40
-        normal = np.where(left[:, None], [0.2, 0.1, -1.0], [-0.3, 0.0, -1.0])
-        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        D = np.where(left, 1.0, 1.3)
-        R = rotation.exp(np.where(left[:, None], [0.0, 0.02, 0.0], [0.03, -0.02, 0.01]))
-        T = np.where(left[:, None], [0.08, 0.0, 0.02], [-0.05, 0.04, 0.0])
-        self.truth = Soup(np.ones(n), normal, D, R, T)
-        uv = reconstruct(self.truth, labels, K_REF, K_NEXT).flow
-        flow = Flow(uv.astype(np.float32), np.ones((60, 80), np.float32), "test")
-        data = build_energy_data(seg, flow, K_REF, K_NEXT, 8, seed)
-        self.data = in_pixels(data, self.truth, seg)
-        self.bad = rng.choice(n, broken, replace=False)
-        m = {k: getattr(self.truth, k).copy() for k in ("lam", "n", "d", "R", "t")}
-        random = random_soup(seed + 7, n)
-        for i in self.bad:
-            m["n"][i], m["R"][i] = random.n[i], random.R[i]
-            m["d"][i] *= np.exp(rng.normal(0, 0.3))
-            m["t"][i] = random.t[i] * random.lam[i]
-        self.soup = Soup(**m)
-
-
 @pytest.mark.parametrize("kind", [*WALKS, *NEIGHBOURS])
 def test_every_proposal_is_feasible_by_construction(kind):
     tiny = Tiny("pixels", samples=8)
@@ -205,15 +164,11 @@ def test_a_step_is_about_so_many_pixels(kind, monkeypatch):
 
 @pytest.mark.parametrize("kind", NEIGHBOURS)
 def test_neighbours_on_one_plane_propose_that_plane(kind):
-    scene = Planar()
-    truth = scene.truth
-    p = proposer(scene.data).propose(truth, kind, 3)
-    same = np.abs(p.n - truth.n[:, None]).max(axis=2) < 1e-9
-    same &= np.abs(p.D - truth.distance[:, None]) < 1e-9
-    same &= np.abs(p.T - truth.translation[:, None]).max(axis=2) < 1e-9
-    # all superpixels except those beside the other component propose their own plane
-    assert same.any(axis=1).mean() > 0.8
-    assert same.mean() > 0.5
+    truth, data = world("slanted", "pixels", False)
+    p = proposer(data).propose(truth, kind, 3)
+    for name, expected in vars(Particles.of(truth)).items():
+        every = np.broadcast_to(expected, getattr(p, name).shape)
+        np.testing.assert_allclose(getattr(p, name), every, atol=1e-9, err_msg=name)
 
 
 def test_planes_of_neighbours_keep_motion_or_anchor():
@@ -274,17 +229,16 @@ def test_the_same_seed_gives_the_same_soup_and_another_another():
 
 
 def test_broken_superpixels_are_repaired_by_their_neighbours():
-    scene = Planar(broken=6)
-    weights = Weights()
-    truth = oracle.energy(scene.truth, scene.data, weights)["total"]
-    begin = oracle.energy(scene.soup, scene.data, weights)["total"]
-    assert begin > 1.5 * truth
-    done = refine_soup(scene.soup, scene.data, weights, FEW.replace(particles=30), seed=0)
-    assert done.energy["total"] < truth + 0.05 * (begin - truth)
-    ratio = done.soup.depth_at(scene.data.anchor_ray) / scene.truth.depth_at(scene.data.anchor_ray)
-    # two views do not determine the ratio of the scales of the two components
-    for component in (scene.left, ~scene.left):
-        assert np.abs(ratio[component] / np.median(ratio[component]) - 1).max() < 1e-3
+    """Of a plane, whose truth has no energy."""
+    truth, data = world("slanted", "pixels", False)
+    good, random = Particles.of(truth), Particles.of(random_soup(7, 12, 0.5).normalised())
+    broken = np.isin(np.arange(12), (1, 6, 7))
+    begin = good.joined(random).soup(broken.astype(int), data.share)
+    own = Weights(prior=0.0), FEW.replace(particles=30)
+    done = refine_soup(begin, data, *own, seed=0)
+    assert done.energy["total"] < 1e-9 * done.energy_begin["total"]
+    ratio = done.soup.depth_at(data.anchor_ray) / truth.depth_at(data.anchor_ray)
+    assert np.abs(ratio / np.median(ratio) - 1).max() < 1e-9
 
 
 def test_interruption_and_time_limit_keep_the_best():
@@ -304,14 +258,11 @@ def test_interruption_and_time_limit_keep_the_best():
 
 
 @pytest.mark.parametrize("particles", [2, 3, 9])
-def test_few_particles_and_isolated_superpixels_work(particles):
-    tiny = Tiny("pixels", samples=6)
-    o = FEW.replace(particles=particles)
-    done = refine_soup(tiny.soup, tiny.data, weights_for("pixels"), o)
-    assert done.energy["total"] <= done.energy_begin["total"]
-    alone = with_graph(tiny.data, [], [])
-    done = refine_soup(tiny.soup, alone, weights_for("pixels"), o)
-    assert done.energy["total"] <= done.energy_begin["total"]
+def test_few_particles_and_a_lone_superpixel_work(particles):
+    for tiny in (Tiny("pixels", samples=6), Tiny("pixels", samples=6, superpixels=1)):
+        own = weights_for("pixels"), FEW.replace(particles=particles)
+        done = refine_soup(tiny.soup, tiny.data, *own)
+        assert done.energy["total"] <= done.energy_begin["total"]
 
 
 @pytest.mark.parametrize("chosen", [[0], [3, 7], range(6), range(12)])

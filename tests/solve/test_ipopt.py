@@ -52,7 +52,7 @@ def hs071() -> NLP:
 HS071 = np.array([1.0, 4.742999643, 3.821149978, 1.379408294]), 17.0140172892
 
 
-def rosenbrock(n: int, ubx: float = np.inf) -> NLP:
+def rosenbrock(n: int) -> NLP:
     """Chained Rosenbrock: one kernel over n - 1 overlapping pairs.
 
     The later variable comes first in the kernel: tables need not be sorted.
@@ -63,7 +63,7 @@ def rosenbrock(n: int, ubx: float = np.inf) -> NLP:
     )
     index = np.stack([np.arange(1, n), np.arange(n - 1)], axis=1)
     group = Group(kernel, index, np.full((n - 1, 1), 100.0), np.zeros((n - 1, 0), int))
-    return textbook([group], [0.8] * n, ubx=ubx)
+    return textbook([group], [0.8] * n)
 
 
 def solve(nlp: NLP, **options) -> Stage:
@@ -256,12 +256,3 @@ def test_an_event_stops_and_keeps_the_best_iterate():
     assert len(seen) == 4
     assert stage.objective == min(seen)
     assert nlp.value(stage.x) == pytest.approx(stage.objective)
-
-
-def test_a_bound_beyond_the_optimum_is_active():
-    nlp = rosenbrock(2, ubx=0.5)
-    stage = solve(nlp)
-    # on x1 = 0.5 the best x2 is 0.25
-    np.testing.assert_allclose(stage.x, [0.5, 0.25], atol=1e-4)
-    assert stage.lam_x[0] == pytest.approx(1.0, rel=1e-3)
-    assert (stage.x <= 0.5 + 1e-8).all()

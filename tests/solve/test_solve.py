@@ -259,14 +259,16 @@ def test_the_constrained_nlp_is_solved_from_the_start_without_tangent_stages(roo
     assert solution.energy["total"] == pytest.approx(tangent, rel=5e-3)
 
 
-def test_one_superpixel_is_solved():
+@pytest.mark.parametrize("gauge", GAUGES)
+def test_one_superpixel_is_solved(gauge):
     pose, move = placed(0, 0, 2.0, yaw=20), motion((0, 1, 0), (0.2, 0, 0))
     pair = plane_world(pose, move, 64, 48)
     seg = build_segmentation(np.zeros((48, 64), np.int32), pair.image_ref)
     truth = plane_soup(pose, move, 1)
     data = in_pixels(build_energy_data(seg, pair.flow, pair.K_ref, pair.K_next, 30, 0), truth, seg)
-    solution = solve_soup(disturbed(truth, 0.05), data, WEIGHTS, form(), OPTIONS)
+    solution = solve_soup(disturbed(truth, 0.05), data, WEIGHTS, form(gauge=gauge), OPTIONS)
     assert_constraints(solution, data)
+    assert not any(solution.energy[term] for term in ("arap", "cont", "orient"))
     assert solution.energy["total"] < 0.05 * solution.energy_start["total"]
 
 

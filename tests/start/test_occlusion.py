@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from helpers_start import fitted, rendered, squares
 
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow, Pair
-from soup_nlp.evaluation.confidence import MOST_SIGMA
 from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import reconstruct
-from soup_nlp.pipeline.run import run
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.regions import LEAST_ORDER, ORIGINS, covering, vote
 from soup_nlp.start.scales import LEAST_STEP_IN_FRONT
@@ -135,22 +132,6 @@ def test_a_swinging_object_comes_before_the_wall(swing):
     ratio = start.soup.distance[main] / before.soup.distance[main]
     np.testing.assert_allclose(ratio, ratio[0])
     assert not (start.origin[main] == ORIGINS.index("occlusion")).any()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("covers", [True, False])
-def test_the_nlp_keeps_the_order_and_is_unsure_of_it(covers):
-    raw = {"name": "sliding", "input": {"kind": "scene", "scene": "swing"}}
-    options = "superpixels=48", "neighbours=6", "method=grid"
-    problem = make_problem(raw, [f"segmentation.{o}" for o in options] + ["refine.enabled=false"])
-    done = run(problem, pair=sliding(covers)[0])
-    assert (done.start.origin == ORIGINS.index("occlusion")).any()
-    ordered_pairs = done.start.order != 0
-    z = done.soup.depth_across(done.segmentation.pairs, done.data.boundary_ray.mean(axis=1))
-    step = (np.log(z[0] / z[1]) * np.sign(done.start.order))[ordered_pairs]
-    assert np.median(step) > 0.2
-    assert done.energy["order"] >= 0
-    assert (done.reconstruction.sigma_ref > MOST_SIGMA).all()
 
 
 @pytest.mark.slow
