@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_model import directional
+from helpers_start import scene_problem
 from scipy import sparse
 
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Flow
 from soup_nlp.evaluation import information as information_module
@@ -216,9 +216,7 @@ def test_sigma_is_the_root_of_the_squares_of_its_terms(small_room, sure):
 
 @pytest.mark.slow
 def test_a_guessed_or_wrong_focal_length_makes_depth_unsure():
-    scene = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
-    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 100}}
-    problem = make_problem(raw)
+    problem = scene_problem("orbit", 320, 136, 100)
     right = problem.load_pair()
     longer = np.diag([1.25, 1.25, 1.0])
     K = right.K_ref.copy()
@@ -243,18 +241,15 @@ def test_flow_that_the_answer_contradicts_makes_it_less_sure(small_room):
     K = small_room.pair.K_ref, small_room.pair.K_next
     rec = reconstruct(small_room.soup, small_room.segmentation.labels, *K)
     inside = small_room.segmentation.labels == 25
-    flow = small_room.pair.flow
-    assert flow_misfit(rec, Flow(rec.flow.astype(np.float32), flow.confidence)).max() < 1e-4
-    moved = np.where(inside[..., None], rec.flow + np.array([2.0, 0.0]), rec.flow).astype(
-        np.float32
-    )
-    misfit = flow_misfit(rec, Flow(moved, flow.confidence))
+    moved = np.where(inside[..., None], np.add(rec.flow, [2.0, 0.0]), rec.flow)
+    same, other = (Flow(uv, small_room.pair.flow.confidence) for uv in (rec.flow, moved))
+    assert flow_misfit(rec, same).max() < 1e-4
+    misfit = flow_misfit(rec, other)
     assert misfit[25] == pytest.approx(2.0, abs=1e-4)
     assert np.delete(misfit, 25).max() < 1e-4
     # the geometric mean of noise and misfit counts
     quiet, loud = (
-        replace(small_room, pair=small_room.pair.with_flow(Flow(f, flow.confidence)))
-        for f in (rec.flow.astype(np.float32), moved)
+        replace(small_room, pair=small_room.pair.with_flow(flow)) for flow in (same, other)
     )
     before, after = (sure_of(case).terms["flow"][inside] for case in (quiet, loud))
     np.testing.assert_allclose(after / before, np.sqrt(MISFIT * 2.0 / small_room.start.noise))

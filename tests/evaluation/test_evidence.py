@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_start import facing, scene_problem
 
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Pair
@@ -26,22 +27,15 @@ from soup_nlp.start.camera_error import (
 from soup_nlp.start.epipolar import Matches, Motion, estimate, triangulate
 
 
-def scene(case, depth: float, t: tuple[float, float, float], turn: float = 0.02, far: float = 1):
+def scene(case, depth: float, t: tuple[float, float, float], turn: float = 0.02):
     """A soup of planes that face the camera, and the data with exactly its flow.
 
-    `depth` is the standard deviation of log depth; every other plane is `far` times as far.
+    `depth` is the standard deviation of log depth.
     """
     n = len(case.data)
-    lam = np.exp(depth * np.random.default_rng(0).standard_normal(n))
-    lam[::2] *= far
+    z = np.exp(depth * np.random.default_rng(0).standard_normal(n))
     R = rotation.exp(np.array([0.3 * turn, turn, 0.1 * turn]))
-    soup = Soup(
-        lam,
-        np.tile([0.0, 0.0, -1.0], (n, 1)),
-        np.ones(n),
-        np.tile(R, (n, 1, 1)),
-        np.array(t) / lam[:, None],
-    )
+    soup = replace(facing(z, np.array(t)), R=np.tile(R, (n, 1, 1)))
     target = project(case.data.K_next, soup.moved(soup.points(case.data.pixel_ray)))
     weight = np.full_like(case.data.pixel_weight, 1 / case.data.pixel_weight.shape[1])
     return soup, replace(case.data, pixel_target=target, pixel_weight=weight)
@@ -184,12 +178,9 @@ def test_too_few_matches_show_no_error():
     assert likeliest(camera_errors(matches().at(slice(7)))) is None
 
 
-ORBIT = {"kind": "scene", "scene": "orbit", "width": 320, "height": 136}
-
-
 def started(pair: Pair):
     """The start of a pair as a run, and what is said of it."""
-    raw = {"input": ORBIT, "segmentation": {"superpixels": 50}, "refine": {"enabled": False}}
+    raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": 50}}
     case = prepare(make_problem(raw), pair=pair)
     done = make_run(case, skipped(case))
     return done, "; ".join(hints(done))
@@ -197,7 +188,7 @@ def started(pair: Pair):
 
 @pytest.mark.slow
 def test_a_wrong_principal_point_makes_depth_unsure():
-    orbit = make_problem({"input": ORBIT, "flow": {"source": "truth"}}).load_pair()
+    orbit = scene_problem("orbit", 320, 136, 50).load_pair()
     K = orbit.K_ref.copy()
     K[0, 2] += 32
     exact, told = started(replace(orbit, flow=None))
@@ -215,9 +206,7 @@ def test_a_wrong_principal_point_makes_depth_unsure():
 
 @pytest.mark.slow
 def test_two_scenes_are_drawn():
-    one, other = (
-        make_problem({"input": {**ORBIT, "scene": name}}).load_pair() for name in ("room", "street")
-    )
+    one, other = (scene_problem(name, 320, 136, 50).load_pair() for name in ("room", "street"))
     done, told = started(replace(one, flow=None, image_next=other.image_next))
     assert not done.good
     assert "same scene" in told

@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 import pytest
+from helpers_start import scene_problem
 
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, run, skipped
@@ -25,14 +25,9 @@ pytestmark = pytest.mark.slow
     ],
 )
 def test_the_verdict_warns_where_depth_is_drawn(scene, seed, width, least, most, tmp_path):
-    height = width * 109 // 256
-    raw = {
-        "input": {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height},
-        "flow": {"source": "truth"},
-        "segmentation": {"superpixels": 60, "neighbours": 6},
-    }
+    size = width, width * 109 // 256, 60
     # the start decides it
-    case = prepare(make_problem(raw))
+    case = prepare(scene_problem(scene, *size, "segmentation.neighbours=6", seed=seed))
     done = make_run(case, skipped(case))
     assert done.good == (most <= 50)
     share = re.search(r"(\d+)% of the image is drawn", verdict(done, tmp_path, []))
@@ -46,10 +41,7 @@ SIZE = 320, 136
 
 @pytest.fixture(scope="module")
 def problem():
-    width, height = SIZE
-    scene = {"kind": "scene", "scene": "orbit", "seed": 0, "width": width, "height": height}
-    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 60}}
-    return make_problem(raw | {"refine": {"enabled": False}})
+    return scene_problem("orbit", *SIZE, 60, "refine.enabled=false")
 
 
 @pytest.fixture(scope="module")

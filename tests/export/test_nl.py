@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from helpers_model import GAUGES, PAPER, TRUNCATED, tiny, wiggle
 from helpers_nl import ReadBack, close, defined_variables
+from helpers_start import scene_problem
 
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ExportError
 from soup_nlp.export.nl import NLFile, write_nl
@@ -259,16 +259,10 @@ def test_scip_reads_it(written):
 def swinging(tmp_path_factory) -> Case:
     """A box that swings before a room: occlusion shows its order, and its true depth is given."""
     folder = tmp_path_factory.mktemp("swing")
-    scene = {"kind": "scene", "scene": "swing", "width": 160, "height": 120}
     np.save(folder / "depth.npy", render_scene("swing", 0, 160, 120).truth.depth_ref)
-    raw = {
-        "input": scene,
-        "flow": {"source": "truth"},
-        "segmentation": {"superpixels": 32, "neighbours": 2, "boundary_samples": 1},
-        "energy": {"pixel_samples": 1},
-        "depth_prior": {"source": str(folder / "depth.npy")},
-    }
-    return prepare(make_problem(raw))
+    few = "segmentation.neighbours=2", "segmentation.boundary_samples=1", "energy.pixel_samples=1"
+    prior = f"depth_prior.source={folder / 'depth.npy'}"
+    return prepare(scene_problem("swing", 160, 120, 32, *few, prior))
 
 
 @pytest.mark.slow

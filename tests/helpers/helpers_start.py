@@ -7,6 +7,7 @@ from helpers_model import GREY, motion, with_true_flow
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from soup_nlp.config.problem import Problem, make_problem
 from soup_nlp.data.flow.sources import flow_from_truth
 from soup_nlp.data.pair import Pair
 from soup_nlp.data.scenes.catalogue import placed, render_scene
@@ -78,6 +79,15 @@ def rendered(
     pair = render_scene(scene, seed, width, height)
     labels = segment(pair.image_ref, count)
     return pair.with_flow(flow_from_truth(pair)), build_segmentation(labels, pair.image_ref)
+
+
+def scene_problem(
+    scene: str, width: int, height: int, superpixels: int, *overrides: str, seed: int = 0
+) -> Problem:
+    """A rendered scene with its true flow."""
+    source = {"kind": "scene", "scene": scene, "seed": seed, "width": width, "height": height}
+    parts = {"flow": {"source": "truth"}, "segmentation": {"superpixels": superpixels}}
+    return make_problem({"input": source, **parts}, overrides)
 
 
 def fitted(pair: Pair, seg: Segmentation, **options: Any) -> FlowFit:

@@ -17,6 +17,7 @@ from helpers_model import (
     weights_for,
     world,
 )
+from helpers_start import facing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -71,10 +72,7 @@ def test_two_superpixels_by_hand():
     flow = Flow(np.zeros((4, 8, 2), np.float32), np.ones((4, 8), np.float32), "zero")
     data = build_energy_data(seg, flow, K, K, None)
     D, T = np.array([1.0, 3.0]), np.array([[0.1, 0, 0], [0.3, 0, 0]])
-    lam = np.array([0.5, 0.5])
-    soup = Soup(
-        lam, np.tile([0, 0, -1.0], (2, 1)), D / lam, np.tile(np.eye(3), (2, 1, 1)), T / lam[:, None]
-    )
+    soup = facing(D, T)
     w = PAPER.replace(arap=1, proj=1, cont=1, orient=1, sigma_cont=0.2, sigma_orient=0.5)
     e = oracle.energy(soup, data, w)
     mean = 2.0  # of the plane distances: the length unit

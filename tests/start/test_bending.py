@@ -8,12 +8,12 @@ import h5py
 import numpy as np
 import pytest
 from helpers_files import sets
-from helpers_start import fitted, flow_of, squares
+from helpers_start import fitted, flow_of, scene_problem, squares
 from helpers_truth import majority
 
 from soup_nlp.arrays import Mask
 from soup_nlp.cli.main import main
-from soup_nlp.config.problem import Problem, load_problem, make_problem
+from soup_nlp.config.problem import Problem, load_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluation.metrics import UNSCALED, depth_metrics
 from soup_nlp.geometry import rotation
@@ -41,18 +41,13 @@ pytestmark = pytest.mark.slow
 UNORDERED = "energy.weights.order=0"  # leaves out the order that occlusion shows
 
 
-def size(scene: str) -> dict[str, int]:
+def size(scene: str) -> tuple[int, int]:
     """Columns and rows; in a smaller banner the flow jumps too little along its outline."""
-    return {"width": 512, "height": 218} if scene == "banner" else {"width": 320, "height": 136}
+    return (512, 218) if scene == "banner" else (320, 136)
 
 
 def problem(scene: str, *overrides: str) -> Problem:
-    raw = {
-        "input": {"kind": "scene", "scene": scene, "seed": 0, **size(scene)},
-        "flow": {"source": "truth"},
-        "segmentation": {"superpixels": 150},
-    }
-    return make_problem(raw, overrides)
+    return scene_problem(scene, *size(scene), 150, *overrides)
 
 
 @cache
@@ -233,8 +228,9 @@ def test_bending_regions_are_reconstructed_and_every_claim_holds(
     tmp_path, capsys, scene, count, words, most
 ):
     """Both kinds of regions are in one image; `most` limits the MRE of each component."""
-    sized = " ".join(f"input.{key}={value}" for key, value in size(scene).items())
-    sized += f" segmentation.superpixels={count} flow.source=truth expected.mre_at_most=null"
+    width, height = size(scene)
+    sized = f"input.width={width} input.height={height} segmentation.superpixels={count}"
+    sized += " flow.source=truth expected.mre_at_most=null"
     main(["solve", scene, "--out", str(tmp_path), "--no-refine", *sets(sized)])
     assert words in (tmp_path / "log.txt").read_text()
     assert main(["check", str(tmp_path)]) == 0, capsys.readouterr().out
@@ -330,9 +326,7 @@ def test_noise_where_surfaces_bend_is_that_of_affine_flows():
     quiet = case("sheet", "segmentation.superpixels=100").start
     assert quiet.noise == LEAST_NOISE
     assert np.median(quiet.error) > LEAST_NOISE
-    raw = {"kind": "scene", "scene": "sheet", "seed": 0, "width": 768, "height": 327}
-    raw = {"input": raw, "flow": {"source": "truth+noise:0.11"}}
-    noisy = prepare(make_problem(raw, ["segmentation.superpixels=150"])).start
+    noisy = prepare(scene_problem("sheet", 768, 327, 150, "flow.source=truth+noise:0.11")).start
     assert noisy.bending
     assert 2 * LEAST_NOISE < noisy.noise < 0.5
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers_start import scene_problem
 
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.formats.cameras import GUESS_SIGMA
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
@@ -115,9 +115,7 @@ def test_a_shift_without_a_turn_keeps_the_focal_length():
 
 @pytest.mark.slow
 def test_only_a_guess_is_corrected():
-    scene = {"kind": "scene", "scene": "orbit", "width": 480, "height": 204}
-    raw = {"input": scene, "flow": {"source": "truth"}, "segmentation": {"superpixels": 60}}
-    problem = make_problem(raw)
+    problem = scene_problem("orbit", 480, 204, 60)
     right = problem.load_pair()
     wrong = right.with_focal(1.3, 0.0)
 

@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_start import facing, squares
+from helpers_start import facing, scene_problem, squares
 
-from soup_nlp.config.problem import make_problem
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera
 from soup_nlp.model import oracle
@@ -66,14 +65,10 @@ def test_depths_across_pairs_are_those_of_both_planes(world):
     [0, pytest.param(2, marks=pytest.mark.xfail(strict=True, reason="0.31 held, 0.29 free"))],
 )
 def test_the_nlp_keeps_a_swinging_box_off_the_wall(seed):
-    what = {"kind": "scene", "scene": "swing", "seed": seed, "width": 256, "height": 192}
-    raw = {"input": what, "flow": {"source": "truth"}, "segmentation": {"superpixels": 60}}
-
-    def result(order):
-        options = f"energy.weights.order={order}", "refine.enabled=false"
-        return run(make_problem(raw, options))
-
-    held, free = result(10.0), result(0.0)
+    held, free = (
+        run(scene_problem("swing", 256, 192, 60, order, "refine.enabled=false", seed=seed))
+        for order in ("energy.weights.order=10", "energy.weights.order=0")
+    )
     placed = np.isin(held.start.origin, [ORIGINS.index("occlusion"), ORIGINS.index("too fast")])
     assert placed.any()
     # 0.6 of the 0.369 that a start which disliked slow components had without the order
