@@ -189,11 +189,12 @@ def test_a_smoothing_wider_than_all_errors_divides_the_information(term, small_r
     assert sizes[0] == pytest.approx(2 * sizes[1], rel=1e-3)
 
 
-def sure_of(case, data=None, weights=None):
+def sure_of(case, data=None, weights=None, **changed):
+    """The uncertainty of the start of a case, some of whose fields are changed."""
     K = case.pair.K_ref, case.pair.K_next
     rec = reconstruct(case.soup, case.segmentation.labels, *K)
     energy = data or case.data, weights or case.weights, FORM
-    return confidence(rec, case.pair, case.start, *energy)
+    return confidence(rec, case.pair, replace(case.start, **changed), *energy)
 
 
 @pytest.fixture(scope="module")
@@ -270,7 +271,7 @@ def test_other_components_are_less_sure_than_the_scene(small_room, sure):
 def test_depth_is_less_sure_where_the_starts_disagree(small_room, sure):
     labels = small_room.segmentation.labels
     scatter = np.where(np.arange(len(small_room)) % 2, 0.5, small_room.start.scatter)
-    other = sure_of(replace(small_room, start=replace(small_room.start, scatter=scatter)))
+    other = sure_of(small_room, scatter=scatter)
     odd = labels % 2 == 1
     np.testing.assert_allclose(other.terms["starts"][odd], 0.5)
     assert other.sigma[odd].min() > 1 / np.hypot(1 / 0.5, 1 / PRIOR) - 1e-9
@@ -280,24 +281,22 @@ def test_depth_is_less_sure_where_the_starts_disagree(small_room, sure):
 @pytest.mark.slow
 def test_relief_is_as_unsure_as_the_motion_of_its_superpixel(small_room, sure):
     start, labels = small_room.start, small_room.segmentation.labels
-    wide = sure_of(replace(small_room, start=replace(start, covariance=4 * start.covariance)))
+    wide = sure_of(small_room, covariance=4 * start.covariance)
     np.testing.assert_allclose(wide.terms["relief"], 2 * sure.terms["relief"], rtol=1e-9)
     assert sure.terms["relief"].max() > 0
     odd = np.arange(len(small_room)) % 2 == 1
-    own = replace(start, motion=np.where(odd, -1, start.motion))
-    relief = sure_of(replace(small_room, start=own)).terms["relief"]
+    relief = sure_of(small_room, motion=np.where(odd, -1, start.motion)).terms["relief"]
     assert (relief[odd[labels]] == 0).all()
     assert (relief[~odd[labels]] > 0).any()
-    none = replace(start, motion=np.full_like(start.motion, -1))
-    assert not sure_of(replace(small_room, start=none)).terms["relief"].any()
+    none = np.full_like(start.motion, -1)
+    assert not sure_of(small_room, motion=none).terms["relief"].any()
 
 
 @pytest.mark.slow
 def test_drawn_depth_has_the_sigma_of_what_is_drawn(small_room):
     """As before a camera at rest, see test_certainty."""
     start, part = small_room.start, np.arange(len(small_room.soup)) < 5
-    fixed = replace(start, origin=np.where(part, FIXED, start.origin))
-    drawn = sure_of(replace(small_room, start=fixed)).sigma
+    drawn = sure_of(small_room, origin=np.where(part, FIXED, start.origin)).sigma
     inside = part[small_room.segmentation.labels]
     assert (drawn[inside] == FACTORS["drawn"]).all()
     assert (drawn[~inside] != FACTORS["drawn"]).any()
@@ -305,9 +304,8 @@ def test_drawn_depth_has_the_sigma_of_what_is_drawn(small_room):
 
 @pytest.mark.slow
 def test_where_surfaces_bend_nothing_is_surer_than_relief_without_parallax(small_room):
-    all_bend = np.ones(len(small_room.soup), bool)
-    bends = replace(small_room, start=replace(small_room.start, bends=all_bend))
-    assert sure_of(bends).sigma.min() >= with_prior(FACTORS["bends"]) * (1 - 1e-9)
+    bends = np.ones(len(small_room.soup), bool)
+    assert sure_of(small_room, bends=bends).sigma.min() >= with_prior(FACTORS["bends"]) * (1 - 1e-9)
 
 
 def test_all_depths_growing_alike_costs_nothing(info):

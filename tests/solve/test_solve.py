@@ -1,37 +1,27 @@
 """Soups solved: constraints, gauges, limits, interruption, a world whose truth is the optimum."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers_model import (
-    GAUGES,
-    PAPER,
-    disturbed,
-    motion,
-    plane_soup,
-    plane_world,
-    with_true_flow,
-    world,
-)
+from helpers_model import GAUGES, PAPER, disturbed, motion, plane_soup, plane_world, world
+from helpers_start import scene_problem
 
-from soup_nlp.data.scenes.catalogue import placed, render_scene
+from soup_nlp.data.scenes.catalogue import placed
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.graph import build_segmentation
-from soup_nlp.geometry.superpixels import segment
 from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import EnergyData, build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.programs import build_matrix_nlp
 from soup_nlp.model.reweighting import in_pixels
+from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.ipopt import run_ipopt
 from soup_nlp.solve.kkt import optimality
 from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import Solution, _near, solve_soup
-from soup_nlp.start.propose import propose
-from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow
 
@@ -56,31 +46,20 @@ def form(**options) -> Formulation:
 # --- soups ---------------------------------------------------------------------------------------
 
 
-class Problem:
-    """A rendered scene, cut into about 20 superpixels, with true flow and a start."""
-
-    def __init__(self, name: str) -> None:
-        pair = with_true_flow(render_scene(name, 0, 160, 120))
-        labels = segment(pair.image_ref, 20)
-        seg = build_segmentation(labels, pair.image_ref, neighbours=6, boundary_samples=2)
-        noise = np.random.default_rng(5).normal(0, 0.2, pair.flow.uv.shape)
-        flow = replace(pair.flow, uv=pair.flow.uv + noise)
-        self.start = propose(FlowFit.of(seg, flow, pair.K_ref, pair.K_next)).soup
-        data = build_energy_data(seg, flow, pair.K_ref, pair.K_next, 8, 0)
-        self.data: EnergyData = in_pixels(data, self.start, seg)
-
-    def solve(self, options: Stages = OPTIONS, f: Formulation | None = None, **more):
-        return solve_soup(self.start, self.data, WEIGHTS, f or form(), options, **more)
-
-
 @pytest.fixture(scope="module")
-def room() -> Problem:
-    return Problem("room")
+def room() -> Case:
+    """A rendered scene with some noise in its flow, cut into about 20 superpixels."""
+    few = "segmentation.neighbours=6", "segmentation.boundary_samples=2", "energy.pixel_samples=8"
+    return prepare(scene_problem("room", 160, 120, 20, *few, "flow.source=truth+noise:0.2"))
+
+
+def solve(case: Case, options: Stages = OPTIONS, f: Formulation | None = None) -> Solution:
+    return solve_soup(case.soup, case.data, WEIGHTS, f or form(), options)
 
 
 @pytest.fixture(scope="module")
 def solved(room) -> dict[str, Solution]:
-    return {gauge: room.solve(f=form(gauge=gauge)) for gauge in GAUGES}
+    return {gauge: solve(room, f=form(gauge=gauge)) for gauge in GAUGES}
 
 
 COLD = OPTIONS.replace(
@@ -96,7 +75,7 @@ COLD = OPTIONS.replace(
 @pytest.fixture(scope="module")
 def cold(room) -> Solution:
     """By Ipopt alone, at one smoothing."""
-    return room.solve(COLD, form(hessian="exact"))
+    return solve(room, COLD, form(hessian="exact"))
 
 
 def assert_constraints(solution: Solution, data: EnergyData, tolerance: float = 1e-8) -> None:
@@ -119,7 +98,7 @@ def test_every_gauge_converges_and_keeps_every_constraint(room, solved, gauge):
     assert solution.residuals["dual_infeasibility"] <= 1e-2
     assert solution.residuals["complementarity"] <= 1e-3
     assert solution.energy["total"] < solution.energy_start["total"]
-    for which, soup in (("energy", solution.soup), ("energy_start", room.start)):
+    for which, soup in (("energy", solution.soup), ("energy_start", room.soup)):
         assert getattr(solution, which) == oracle.energy(soup, room.data, WEIGHTS)
 
 
@@ -133,7 +112,7 @@ def test_both_gauges_find_the_same_world(room, solved):
 
 def test_the_claimed_multipliers_balance_the_gradient(room, solved):
     """Dual infeasibility from the NLP's own functions at the packed solution."""
-    nlp, layout = build_matrix_nlp(room.start, room.data, WEIGHTS, form(eps=0.03, eps_pixel=0.03))
+    nlp, layout = build_matrix_nlp(room.soup, room.data, WEIGHTS, form(eps=0.03, eps_pixel=0.03))
     stage = run_ipopt(nlp, x0=nlp.x0, max_iter=0)
     far = optimality(nlp, stage.x, stage.lam_x, stage.lam_g)["dual_infeasibility"]
     solution = solved["unit-offset"]
@@ -150,7 +129,7 @@ def test_the_presolve_narrows_the_smoothing(room, cold):
     assert cold.converged, cold.status
     assert_constraints(cold, room.data)
     options = COLD.replace(presolve_iterations=60, presolve_eps=(1.0, 0.3), stagnation=3e-3)
-    solution = room.solve(options, form(hessian="exact"))
+    solution = solve(room, options, form(hessian="exact"))
     first, second, *_, exact, last = solution.stages
     assert exact.converged
     # the multipliers go with the point: it is the constrained NLP's KKT point as well
@@ -167,7 +146,7 @@ def test_the_presolve_narrows_the_smoothing(room, cold):
 
 def test_the_second_strategy_keeps_the_lower_energy(room):
     options = OPTIONS.replace(max_iter=1, exact_iterations=0)
-    one, two = (room.solve(options.replace(untruncated=both)) for both in (False, True))
+    one, two = (solve(room, options.replace(untruncated=both)) for both in (False, True))
     names = [s.name for s in two.stages]
     assert [s.name for s in one.stages] == [n for n in names if "truncated" not in n]
     assert names[3:-1] == [
@@ -182,14 +161,14 @@ def test_the_second_strategy_keeps_the_lower_energy(room):
     # there is no second one where E_arap is not truncated anyway
     free = WEIGHTS.replace(sigma_arap=np.inf)
     quick = options.replace(untruncated=True, presolve_iterations=1)
-    never = solve_soup(room.start, room.data, free, form(), quick)
+    never = solve_soup(room.soup, room.data, free, form(), quick)
     assert [s.name for s in never.stages] == [s.name for s in one.stages]
 
 
 # --- limits and interruption of a soup -----------------------------------------------------------
 
 
-def assert_whole(solution: Solution, problem: Problem) -> None:
+def assert_whole(solution: Solution, problem: Case) -> None:
     """A Solution that can be written and looked at, no worse than the start."""
     assert_constraints(solution, problem.data, 2e-5)
     assert np.isfinite(list(solution.energy.values())).all()
@@ -206,7 +185,7 @@ ONE_ITERATION = {"max_iter": 1, "presolve_iterations": 1, "exact_iterations": 1,
     [(ONE_ITERATION, "Maximum_Iterations_Exceeded"), ({"max_seconds": 1e-3}, "Time_Limit")],
 )
 def test_a_limit_gives_a_whole_solution(room, limit, status):
-    solution = room.solve(OPTIONS.replace(**limit))
+    solution = solve(room, OPTIONS.replace(**limit))
     assert not solution.converged
     assert solution.status == solution.stages[0].status == status
     assert_whole(solution, room)
@@ -234,7 +213,7 @@ def test_a_rigid_plane_is_recovered_from_a_disturbed_start(gauge):
 def test_the_constrained_nlp_starts_at_the_presolves_kkt_point(room, solved):
     """The presolve's multipliers, brought over, leave Ipopt next to nothing to do."""
     # planes that would slant more than they may: their rows of visibility have forces
-    narrow = room.solve(f=form(depth_ratio=1.05))
+    narrow = solve(room, f=form(depth_ratio=1.05))
     assert np.abs(narrow.multipliers["lam_g_visible"]).max() > 1e-2
     assert solved["unit-offset"].residuals["dual_infeasibility"] < 1e-5
     for done in (solved["unit-offset"], narrow):
@@ -249,7 +228,7 @@ def test_an_ipopt_without_iterations_is_not_near():
 
 
 def test_the_constrained_nlp_is_solved_from_the_start_without_tangent_stages(room, solved):
-    solution = room.solve(OPTIONS.replace(coordinates="matrix"))
+    solution = solve(room, OPTIONS.replace(coordinates="matrix"))
     assert solution.converged, solution.status
     assert all(stage.x.size == 16 * len(room.data) for stage in solution.stages)
     # each stage begins where the last one ended, with its multipliers

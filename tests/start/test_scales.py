@@ -61,14 +61,6 @@ def test_the_minimum_is_one():
             assert cost(other, r) >= cost(x, r) - 1e-9
 
 
-def test_a_row_is_a_weighted_quantile():
-    value = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    one, origin = np.ones(5, int), ORIGINS.index("outline")
-    for share, expected in ((0.1, 1.0), (0.5, 3.0), (0.7, 4.0)):
-        x, _ = minimum(2, [Rows(one, 0, value, 1 - share, share, origin)], np.array([0]))
-        np.testing.assert_allclose(x[1], expected, atol=1e-9)
-
-
 def test_what_is_too_fast_covers_all_that_it_touches():
     label = np.ravel(CUT_OFF)
     flow = flow_of(squares(4, 5), K=K)
