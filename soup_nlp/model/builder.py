@@ -1,10 +1,8 @@
 """Kernels and tables of an NLP, collected with its constraint rows."""
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -24,29 +22,6 @@ _SYMBOLS = ca.SX.sym("theta", len(THETA))
 """One for all kernels, so that they serve every NLP."""
 
 
-class Block(NamedTuple):
-    """Consecutive constraint rows of one kind: its label, the bounds of each row, and (M, a) the
-    superpixels in its name; a = 0 where that is the label alone."""
-
-    label: str
-    lower: float
-    upper: float
-    superpixels: Int
-
-
-def _names(blocks: list[Block]) -> list[str]:
-    """`label[i]` or `label[i,k]`; `label[i,3]` for the third of several of a superpixel."""
-    out = []
-    for block in blocks:
-        places = [",".join(map(str, row)) for row in block.superpixels.tolist()]
-        several, seen = len(set(places)) < len(places), Counter[str]()
-        for place in places:
-            seen[place] += 1
-            inside = f"{place},{seen[place]}" if several else place
-            out.append(f"{block.label}[{inside}]" if inside else block.label)
-    return out
-
-
 @dataclass
 class Builder:
     """Collects groups and constraint rows.
@@ -57,6 +32,9 @@ class Builder:
         view: Makes a View of a superpixel's variables, the data row, its position in the element
             and the option.
         option: Gauge or chart.
+        groups: Kernels and tables.
+        lbg, ubg: Bounds of the constraint rows.
+        kinds: Of constraints: label, superpixels (0 where they share a row), rows of each.
     """
 
     form: Formulation
@@ -64,7 +42,9 @@ class Builder:
     view: Callable[..., View]
     option: str
     groups: list[Group] = field(default_factory=list)
-    rows: list[Block] = field(default_factory=list)
+    lbg: list[float] = field(default_factory=list)
+    ubg: list[float] = field(default_factory=list)
+    kinds: list[tuple[str, int, int]] = field(default_factory=list)
 
     def add_norms(self, name: str, element: Element) -> None:
         """Add an energy term: kernel of its norms in solver form, and its table."""
@@ -100,10 +80,12 @@ class Builder:
             total: Whether the superpixels add up to one row (r = 1).
         """
         size, count = len(index), body.numel()
-        own = np.zeros((1, 0), int) if total else np.repeat(np.arange(size), count)[:, None]
-        numbers = sum(len(known.superpixels) for known in self.rows) + np.arange(len(own))
+        added = 1 if total else size * count
+        numbers = len(self.lbg) + np.arange(added)
         rows = np.broadcast_to(numbers.reshape(-1, count), (size, count))
-        self.rows.append(Block(name.removeprefix("t_"), lower, upper, own))
+        self.lbg += [lower] * added
+        self.ubg += [upper] * added
+        self.kinds.append((name.removeprefix("t_"), 0 if total else size, count))
         symbols = ca.SX.sym("none", 0) if row is None else row
         kernel = Kernel(name, x, symbols, _SYMBOLS, constraints=body)
         data = np.zeros((size, 0)) if data is None else data
@@ -124,7 +106,6 @@ class Builder:
         from 1: the rows of R'R = I in the order 11 12 22 13 23 33, or rim rays (in matrix
         coordinates 1 is the anchor).
         """
-        count = [len(row.superpixels) for row in self.rows]
         f = self.form
         return NLP(
             name,
@@ -132,13 +113,21 @@ class Builder:
             x0=np.clip(x0, lbx, ubx),
             lbx=lbx,
             ubx=ubx,
-            lbg=np.repeat([row.lower for row in self.rows], count),
-            ubg=np.repeat([row.upper for row in self.rows], count),
+            lbg=np.array(self.lbg),
+            ubg=np.array(self.ubg),
             theta=dict(zip(THETA, (f.eps, f.eps_pixel, f.theta, f.ridge))),
             hessian_kind=f.hessian,
             x_names=self.layout.names,
-            g_names=lambda: _names(self.rows),
+            g_names=self._g_names,
         )
+
+    def _g_names(self) -> list[str]:
+        """`label`, `label[i]`, or `label[i,3]` for the third of several of a superpixel."""
+        out = []
+        for label, size, count in self.kinds:
+            numbers = [f",{k + 1}" for k in range(count)] if count > 1 else [""]
+            out += [f"{label}[{i}{k}]" for i in range(size) for k in numbers] or [label]
+        return out
 
 
 @lru_cache(maxsize=200)
