@@ -1,6 +1,6 @@
 """Kernels and tables of an NLP, collected with its constraint rows."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -8,12 +8,12 @@ import casadi as ca
 import numpy as np
 
 from soup_nlp.arrays import Float, Int
-from soup_nlp.model.elements import Element, Norms
+from soup_nlp.model.elements import Element
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.kernel import Group, Kernel
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.nlp import NLP
-from soup_nlp.model.norms import solver_form
+from soup_nlp.model.norms import Norm, solver_form
 from soup_nlp.model.superpixel import View
 
 THETA = ("eps", "eps_pixel", "theta", "ridge")
@@ -52,10 +52,11 @@ class Builder:
         if not size:
             return
         fields, layout = tuple(element.fields.items()), self.layout
-        term = name, element.norms, fields, arity, self.view, self.option, layout.stride
+        view = arity, self.view, self.option, layout.stride
+        kernel = _kernel(name, element.norms, element.given, fields, *view)
         index = np.concatenate([layout.of(i) for i in element.superpixels.T], axis=1)
         data = np.column_stack([c.reshape(size, -1) for c in element.columns.values()])
-        self.groups.append(Group(_kernel(*term), index, data, np.zeros((size, 0), np.int64)))
+        self.groups.append(Group(kernel, index, data, np.zeros((size, 0), np.int64)))
 
     def add_constraint(
         self,
@@ -133,7 +134,8 @@ class Builder:
 @lru_cache(maxsize=200)
 def _kernel(
     name: str,
-    norms: Norms,
+    norms: Callable[..., list[Norm]],
+    given: tuple[Hashable, ...],
     fields: tuple[tuple[str, int], ...],
     arity: int,
     view: Callable[..., View],
@@ -144,7 +146,7 @@ def _kernel(
     x = ca.SX.sym("x", stride * arity)
     row = {k: ca.SX.sym(k, c) for k, c in fields}
     views = [view(v, row, a, option) for a, v in enumerate(ca.vertsplit(x, stride))]
-    made = norms(views, row, _SYMBOLS[0], _SYMBOLS[1])
+    made = norms(*views, {**row, "eps": _SYMBOLS[0], "eps_pixel": _SYMBOLS[1]}, *given)
     objective, curvature = (
         sum(parts, ca.SX(0)) for parts in zip(*(solver_form(n, x, _SYMBOLS[2]) for n in made))
     )

@@ -1,10 +1,8 @@
 """The terms of the energy: one object each, by which program, oracle and refinement find it."""
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from soup_nlp.arrays import AnyFloat, Float, Int
@@ -14,34 +12,17 @@ from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulas import Ends, GraphName
 from soup_nlp.model.layout import Layout
 from soup_nlp.model.norms import Norm
-from soup_nlp.model.superpixel import View
-
-
-class Norms(NamedTuple):
-    """How the norms of an element are made: by a function of `terms`, of views, row, smoothing and
-    further arguments `given`; `in_pixels` of the next frame, these have a smoothing of their own.
-
-    Equal records share one kernel.
-    """
-
-    term: Callable[..., list[Norm]]
-    given: tuple[Hashable, ...] = ()
-    in_pixels: bool = False
-
-    def __call__(
-        self, views: Sequence[View], row: Mapping[str, ca.SX], eps: ca.SX, eps_pixel: ca.SX
-    ) -> list[Norm]:
-        """The norms of these views."""
-        return self.term(*views, row, eps_pixel if self.in_pixels else eps, *self.given)
 
 
 @dataclass(frozen=True)
 class Element:
-    """One kind of element: its superpixels (E, a), data (E, ...) by column, and norms."""
+    """One kind of element: its superpixels (E, a), data (E, ...) by column, and the function of
+    `terms` that makes its norms from their views, its row and further arguments `given`."""
 
     superpixels: Int
     columns: dict[str, Float]
-    norms: Norms
+    norms: Callable[..., list[Norm]]
+    given: tuple[Hashable, ...] = ()
 
     @property
     def fields(self) -> dict[str, int]:
@@ -118,7 +99,7 @@ def _arap(data: EnergyData, w: Weights) -> Element:
         **_rays(data, e),
         **_pixel(data, data.edge_unit),
     }
-    return Element(e, columns, Norms(terms.arap, (data.arap_at_anchors,)))
+    return Element(e, columns, terms.arap, (data.arap_at_anchors,))
 
 
 def _proj(data: EnergyData, w: Weights) -> Element:
@@ -135,7 +116,7 @@ def _proj(data: EnergyData, w: Weights) -> Element:
         "K": np.tile(K[nonzero], (count, 1)),
     }
     places = tuple(zip(*(index.tolist() for index in nonzero)))
-    return Element(owner, columns, Norms(terms.reprojection, (places,), in_pixels=True))
+    return Element(owner, columns, terms.reprojection, (places,))
 
 
 def _cont(data: EnergyData, w: Weights) -> Element:
@@ -148,7 +129,7 @@ def _cont(data: EnergyData, w: Weights) -> Element:
         "rays": data.boundary_ray.reshape(len(pairs), 3 * data.boundary_ray.shape[1]),
         **_pixel(data, data.pair_unit),
     }
-    return Element(pairs, columns, Norms(terms.continuity))
+    return Element(pairs, columns, terms.continuity)
 
 
 def _prior(data: EnergyData, w: Weights) -> Element:
@@ -160,7 +141,7 @@ def _prior(data: EnergyData, w: Weights) -> Element:
     }
     if data.prior_relief.any():
         columns["relief"] = data.prior_relief
-    return Element(data.edges, columns, Norms(terms.prior))
+    return Element(data.edges, columns, terms.prior)
 
 
 def _depth(data: EnergyData, w: Weights) -> Element:
@@ -171,7 +152,7 @@ def _depth(data: EnergyData, w: Weights) -> Element:
         "change": data.depth_change[used],
         **_rays(data, edges),
     }
-    return Element(edges, columns, Norms(terms.depth))
+    return Element(edges, columns, terms.depth)
 
 
 def _order(data: EnergyData, w: Weights) -> Element:
@@ -185,7 +166,7 @@ def _order(data: EnergyData, w: Weights) -> Element:
         "ray": data.boundary_ray[used].mean(axis=1),
         **_rays(data, pairs),
     }
-    return Element(pairs, columns, Norms(terms.order))
+    return Element(pairs, columns, terms.order)
 
 
 def _orient(data: EnergyData, w: Weights) -> Element:
@@ -195,7 +176,7 @@ def _orient(data: EnergyData, w: Weights) -> Element:
     }
     if data.orient_turn.any():
         columns["turn"] = data.orient_turn
-    return Element(data.pairs, columns, Norms(terms.orientation))
+    return Element(data.pairs, columns, terms.orientation)
 
 
 PROJ = Term("proj", _proj, "pixel_weight", optional=False)

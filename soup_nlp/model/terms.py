@@ -5,9 +5,10 @@
 
 Each function is one element: an edge (a, b) of the K-NN graph, a sampled pixel, a pair (a, b) of
 neighbours, or a superpixel a. A term takes the views of its superpixels and its row of data, and
-returns norms; E is the sum of `weight * ((1 - leak) min(|vector|, sigma) + leak |vector|)` over
-all of them. A row without "sigma" has no truncation; with "pixel", the size of a pixel, lengths are
-in the paper's unit instead of pixels. `elements` has the rows, `oracle` the same energy in numpy.
+returns norms; "eps" and, of pixels of the next frame, "eps_pixel" in the row are their smoothing
+widths. E is the sum of `weight * ((1 - leak) min(|vector|, sigma) + leak |vector|)` over all of
+them. A row without "sigma" has no truncation; with "pixel", the size of a pixel, lengths are in
+the paper's unit instead of pixels. `elements` has the rows, `oracle` the same energy in numpy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,12 +24,12 @@ Row = Mapping[str, ca.SX]
 # --- the energy, equation 7 ----------------------------------------------------------------------
 
 
-def arap(a: View, b: View, row: Row, eps: ca.SX, at_anchors: bool) -> list[Norm]:
+def arap(a: View, b: View, row: Row, at_anchors: bool) -> list[Norm]:
     """E_arap of an edge, Eq. 1: rotation, translation and distance of the anchors."""
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
-    unit, length_eps, angle_eps = row["unit"], eps, eps
+    unit, length_eps, angle_eps = row["unit"], row["eps"], row["eps"]
     if "pixel" in row:
-        length_eps, angle_eps = eps * row["pixel"], eps * row["angle"]
+        length_eps, angle_eps = row["eps"] * row["pixel"], row["eps"] * row["angle"]
     else:
         unit = unit / _nearness(Xa, Xb)
     rotation = row["turn"] * ca.vec(a.turn_from(b))
@@ -43,7 +44,7 @@ def arap(a: View, b: View, row: Row, eps: ca.SX, at_anchors: bool) -> list[Norm]
     ]
 
 
-def reprojection(a: View, row: Row, eps: ca.SX, places: Sequence[tuple[int, int]]) -> list[Norm]:
+def reprojection(a: View, row: Row, places: Sequence[tuple[int, int]]) -> list[Norm]:
     """E_proj of one pixel, Eq. 3: distance of homography and flow target, pixels.
 
     `places` is where the first two rows of the next frame's intrinsics are not 0, column by column;
@@ -52,15 +53,15 @@ def reprojection(a: View, row: Row, eps: ca.SX, places: Sequence[tuple[int, int]
     y = a.transfer(row["ray"])
     K = ca.SX(ca.Sparsity.triplet(2, 3, *map(list, zip(*places))), row["K"])
     error = K @ (y / y[2]) - row["target"]
-    return [Norm(row["weight"], error, eps, row.get("sigma"))]
+    return [Norm(row["weight"], error, row["eps_pixel"], row.get("sigma"))]
 
 
-def continuity(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+def continuity(a: View, b: View, row: Row) -> list[Norm]:
     """E_cont of a neighbour pair, Eq. 4: boundary gaps in both frames."""
     points = [(a.point(ray), b.point(ray)) for ray in ca.vertsplit(row["rays"], 3)]
     before = ca.vertcat(*(Xa - Xb for Xa, Xb in points))
     after = ca.vertcat(*(a.next_gap(Xa, b, Xb) for Xa, Xb in points))
-    f = row["factor"]
+    f, eps = row["factor"], row["eps"]
     if "pixel" in row:
         eps = eps * row["pixel"]
     else:
@@ -71,17 +72,17 @@ def continuity(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     ]
 
 
-def orientation(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+def orientation(a: View, b: View, row: Row) -> list[Norm]:
     """E_orient of a neighbour pair, Eq. 6.
 
     `1 - n_i . n_k = |n_i - n_k|^2 / 2` on the unit sphere; the square is convex off it too. A given
     difference `row["turn"]` costs nothing.
     """
     turn = a.n - b.n - row["turn"] if "turn" in row else a.n - b.n
-    return [Norm(row["weight"], turn, eps, row.get("sigma"), kind="half_square")]
+    return [Norm(row["weight"], turn, row["eps"], row.get("sigma"), kind="half_square")]
 
 
-def prior(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+def prior(a: View, b: View, row: Row) -> list[Norm]:
     """E_prior of an edge: slope of the inverse depth between two anchors, relative to it.
 
     A given difference `row["relief"]` costs nothing.
@@ -89,16 +90,16 @@ def prior(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     Xa, Xb = a.anchor(row["ray_i"]), b.anchor(row["ray_k"])
     change = (1 / Xa[2] - 1 / Xb[2]) / _nearness(Xa, Xb)
     change = change - row["relief"] if "relief" in row else change
-    return [Norm(row["weight"], change / row["reach"], eps)]
+    return [Norm(row["weight"], change / row["reach"], row["eps"])]
 
 
-def depth(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+def depth(a: View, b: View, row: Row) -> list[Norm]:
     """E_depth of an edge: difference of the anchors' log depths from that of a depth prior."""
     Za, Zb = a.anchor(row["ray_i"])[2], b.anchor(row["ray_k"])[2]
-    return [Norm(row["weight"], ca.log(Za / Zb) - row["change"], eps)]
+    return [Norm(row["weight"], ca.log(Za / Zb) - row["change"], row["eps"])]
 
 
-def order(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
+def order(a: View, b: View, row: Row) -> list[Norm]:
     """E_order of a neighbour pair whose second superpixel, b, covers the first, a.
 
     It is a smooth hinge on the amount by which the inverse depth of b on their boundary is below
@@ -107,7 +108,7 @@ def order(a: View, b: View, row: Row, eps: ca.SX) -> list[Norm]:
     near = _nearness(a.anchor(row["ray_i"]), b.anchor(row["ray_k"]))
     behind, front = 1 / a.point(row["ray"])[2], 1 / b.point(row["ray"])[2]
     lack = ((1 + row["step"]) * behind - front) / near
-    return [Norm(row["weight"], (lack + ca.sqrt(lack**2 + HINGE**2)) / 2, eps)]
+    return [Norm(row["weight"], (lack + ca.sqrt(lack**2 + HINGE**2)) / 2, row["eps"])]
 
 
 def _nearness(Xa: ca.SX, Xb: ca.SX) -> ca.SX:

@@ -171,7 +171,8 @@ def exact_terms(x: Float, data: EnergyData, weights: Weights, layout: Layout) ->
         parts = ca.vertsplit(variables, layout.stride)
         views = [view(part, row, a, option) for a, part in enumerate(parts)]
         total = ca.SX(0)
-        for n in element.norms(views, row, ca.SX(0), ca.SX(0)):
+        exact = {"eps": ca.SX(0), "eps_pixel": ca.SX(0)}
+        for n in element.norms(*views, {**row, **exact}, *element.given):
             square = ca.dot(n.vector, n.vector)
             y = square / 2 if n.kind == "half_square" else ca.sqrt(square)
             cut = y if n.sigma is None else ca.fmin(y, n.sigma)

@@ -8,7 +8,7 @@ from helpers_nl import ReadBack
 
 from soup_nlp.export.nl import write_nl
 from soup_nlp.model import oracle
-from soup_nlp.model.elements import TERMS, Element, Norms, Term, _rays
+from soup_nlp.model.elements import TERMS, Element, Term, _rays
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.model.norms import Norm
@@ -24,10 +24,10 @@ class WiderWeights(Weights):
     """Factor of E_level."""
 
 
-def symbols(a, b, row, eps):
+def symbols(a, b, row):
     """Step 3: the ratio of the depths of two neighbours, in symbols."""
     ratio = a.anchor(row["ray_i"])[2] / b.anchor(row["ray_k"])[2]
-    return [Norm(row["weight"], ca.log(ratio), eps)]
+    return [Norm(row["weight"], ca.log(ratio), row["eps"])]
 
 
 def numbers(e, weights):
@@ -39,7 +39,7 @@ def numbers(e, weights):
 def table(data, w):
     """Step 5: its elements."""
     columns = {"weight": w.level * data.pair_weight, **_rays(data, data.pairs)}
-    return Element(data.pairs, columns, Norms(symbols))
+    return Element(data.pairs, columns, symbols)
 
 
 def test_a_new_term_is_one_object(monkeypatch, tmp_path):
