@@ -41,7 +41,7 @@ class TRWSResult:
         energy: Its energy by :func:`mrf_energy`, in float64.
         lower_bound: Largest bound so far, at most ``energy``; -inf if no iteration ended.
         iterations: Number of iterations, each one forward and one backward pass.
-        status: ``"gap"``, ``"stagnation"``, ``"iterations"`` or ``"interrupted"``.
+        status: ``"gap"``, ``"iterations"`` or ``"interrupted"``.
     """
 
     labels: np.ndarray
@@ -58,8 +58,6 @@ def solve_trws(
     *,
     max_iter: int = 100,
     gap: float = 1e-6,
-    stagnation: float = 1e-7,
-    patience: int = 10,
     init_labels: np.ndarray | None = None,
     callback: Callback | None = None,
 ) -> TRWSResult:
@@ -73,9 +71,6 @@ def solve_trws(
             Floats are read in place and must not change during the call.
         max_iter: Most iterations.
         gap: Stop once best energy - bound <= ``gap * max(1, |best energy|)``; negative: never.
-        stagnation: Stop once, over ``patience`` iterations, the best energy did not fall and the
-            bound rose by at most ``stagnation * max(1, |bound|)``; negative: never.
-        patience: See ``stagnation``.
         init_labels: (N,) labels whose energy the result does not exceed; they guide no message.
         callback: Called after every iteration as ``callback(iteration, bound, energy, best
             energy)``, numbers of the working type; a true return value, or a KeyboardInterrupt at
@@ -90,32 +85,25 @@ def solve_trws(
     solver = _Passes(costs, plan_levels(colours(len(costs), edges), edges), table)
     first = math.inf if begin is None else mrf_energy(begin, unary, edges, pairwise)
     best = (first, costs.argmin(axis=1) if begin is None else begin)
-    rows: list[tuple[float, float, float]] = []
-    status = "iterations"
+    iterations, highest, status = 0, -math.inf, "iterations"
     try:
-        for k in range(max_iter):
+        while iterations < max_iter and status == "iterations":
             bound = solver.sweep()
             energy, labels = solver.decode()
             if energy < best[0]:
                 best = (energy, labels)
-            rows.append((bound, energy, best[0]))
-            if callback is not None and callback(k + 1, bound, energy, best[0]):
+            iterations, highest = iterations + 1, max(highest, bound)
+            if callback is not None and callback(iterations, bound, energy, best[0]):
                 status = "interrupted"
             elif best[0] - bound <= gap * max(1.0, abs(best[0])):
                 status = "gap"
-            elif k >= patience and best[0] >= rows[k - patience][2]:
-                rise = bound - rows[k - patience][0]
-                status = "stagnation" if rise <= stagnation * max(1.0, abs(bound)) else status
-            if status != "iterations":
-                break
     except KeyboardInterrupt:
         status = "interrupted"
     labels = best[1]
     energy = mrf_energy(labels, unary, edges, pairwise)
     if begin is not None and first < energy:
         energy, labels = first, begin  # float32 ranked a worse labelling as better
-    bound = min(max((row[0] for row in rows), default=-math.inf), energy)
-    return TRWSResult(labels, energy, bound, len(rows), status)
+    return TRWSResult(labels, energy, min(highest, energy), iterations, status)
 
 
 def mrf_energy(

@@ -13,7 +13,7 @@ from soup_nlp.mrf.levels import colours
 from soup_nlp.mrf.trws import mrf_energy, solve_trws
 
 NO_EDGES, NO_TABLES = np.zeros((0, 2), int), np.zeros((0, 3, 3))
-FOREVER = {"gap": -1.0, "stagnation": -1.0}
+FOREVER = {"gap": -1.0}
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -179,7 +179,7 @@ def test_bound_brute_force_and_energy_in_this_order(shape, seed):
     assert (np.diff(result.bound_history) >= -slack).all()
     if shape == "tree":
         # exact, however long it takes
-        result = followed(*arrays, max_iter=3000, gap=1e-9, stagnation=1e-13, patience=50)
+        result = followed(*arrays, max_iter=300, gap=1e-9)
         assert result.energy == pytest.approx(least, abs=1e-8)
         assert result.lower_bound == pytest.approx(least, abs=1e-6)
 
@@ -267,11 +267,6 @@ def test_stops():
     assert len(few.bound_history) == len(few.energy_history) == len(few.best_history) == 3
     loose = followed(unary, edges, tables, gap=10.0)
     assert (loose.status, loose.iterations) == ("gap", 1)
-    stuck = followed(unary, edges, tables, gap=-1.0, max_iter=5000, patience=4)
-    assert stuck.status == "stagnation"
-    rise = stuck.bound_history[-1] - stuck.bound_history[-5]
-    assert rise <= 1e-7 * max(1.0, abs(stuck.bound_history[-1]))
-    assert stuck.best_history[-1] == stuck.best_history[-5]
 
 
 @pytest.mark.parametrize("how", ["interrupt", "answer"])
@@ -342,4 +337,4 @@ def test_binary_bound_reaches_the_relaxation_of_a_frustrated_cycle():
     # all labels with half a weight each: the linear program costs nothing
     assert result.lower_bound == pytest.approx(0.0)
     assert result.energy == pytest.approx(1.0)
-    assert result.status == "stagnation"
+    assert (result.status, result.iterations) == ("iterations", 50)
