@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import ExportError
@@ -165,18 +164,17 @@ def _defined(graph: _Graph, group: Group) -> set[int]:
 
 def _common(graph: _Graph, nodes: list[int], group: Group) -> set[int]:
     """Nodes with equal instances (same variables and numbers) in many elements."""
-    mixed: dict[int, NDArray[np.uint64]] = {}
+    columns: dict[int, Int] = {}
     support: dict[int, frozenset[int]] = {}
 
     def leaf(node: int) -> frozenset[int]:
         """The node itself, if its value depends on the element."""
         if node in graph.variable:
-            column = group.index[:, graph.variable[node]].astype(np.int64)
+            columns[node] = group.index[:, graph.variable[node]].astype(np.int64)
         elif np.ndim(graph.number[node]):
-            column = np.ascontiguousarray(graph.number[node]).view(np.int64)
+            columns[node] = np.ascontiguousarray(graph.number[node]).view(np.int64)
         else:
             return frozenset()
-        mixed[node] = _mix(column, len(mixed))
         return frozenset({node})
 
     distinct: dict[frozenset[int], int] = {}
@@ -188,18 +186,11 @@ def _common(graph: _Graph, nodes: list[int], group: Group) -> set[int]:
         leaves = frozenset[int]().union(*(support[a] for a in graph.args[node]))
         support[node] = leaves
         if leaves not in distinct:
-            distinct[leaves] = len(np.unique(np.sum([mixed[a] for a in leaves], axis=0)))
+            instances = np.stack([columns[a] for a in leaves], axis=1)
+            distinct[leaves] = len(set(map(bytes, instances)))
         if distinct[leaves] <= SHARED_BELOW * len(group):
             common.add(node)
     return common
-
-
-def _mix(column: Int, position: int) -> NDArray[np.uint64]:
-    """(E,) SplitMix64 hash of a column; hashes of several columns are added."""
-    h = column.view(np.uint64) + np.uint64(0x9E3779B97F4A7C15 * (position + 1) % 2**64)
-    h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return h ^ (h >> np.uint64(31))
 
 
 def _emit(graph: _Graph, top: int, names: set[int], root: bool = False) -> Text:
