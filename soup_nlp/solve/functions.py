@@ -5,7 +5,6 @@ which it copies at every call, and takes seconds to build at real sizes. Only th
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -13,12 +12,8 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.model.nlp import NLP
 
-
-class Output(NamedTuple):
-    """An output of a `Buffered` function: its nonzeros, and their values from its inputs."""
-
-    sparsity: ca.Sparsity
-    evaluate: Callable[..., Float | float]
+Output = tuple[ca.Sparsity, Callable[..., Float | float]]
+"""Nonzeros of an output of a `Buffered` function, and what computes them from its inputs."""
 
 
 class Buffered(ca.Callback):
@@ -55,7 +50,7 @@ class Buffered(ca.Callback):
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
         """Nonzeros of output i."""
-        return self._outputs[i][1].sparsity
+        return self._outputs[i][1][0]
 
     def has_eval_buffer(self) -> bool:
         """Numbers are passed as buffers."""
@@ -66,9 +61,9 @@ class Buffered(ca.Callback):
     ) -> int:
         """Write the nonzeros of the outputs that are asked for."""
         given = [_array(a) for a in arg]
-        for buffer, (_, output) in zip(res, self._outputs):
+        for buffer, (_, (_, evaluate)) in zip(res, self._outputs):
             if buffer is not None:
-                _array(buffer)[:] = output.evaluate(*given)
+                _array(buffer)[:] = evaluate(*given)
         return 0
 
 
@@ -89,11 +84,11 @@ class Functions:
     def __init__(self, nlp: NLP) -> None:
         """Find the patterns; kernels are translated by the first call."""
         at = {"x": nlp.nx, "p": len(nlp.theta)}
-        f = Output(ca.Sparsity.dense(1, 1), nlp.value)
-        g = Output(ca.Sparsity.dense(nlp.ng, 1), nlp.constraints)
-        gradient = Output(ca.Sparsity.dense(nlp.nx, 1), nlp.gradient)
-        jacobian = Output(nlp.jacobian_pattern.sparsity, nlp.jacobian_nonzeros)
-        hessian = Output(
+        f = ca.Sparsity.dense(1, 1), nlp.value
+        g = ca.Sparsity.dense(nlp.ng, 1), nlp.constraints
+        gradient = ca.Sparsity.dense(nlp.nx, 1), nlp.gradient
+        jacobian = nlp.jacobian_pattern.sparsity, nlp.jacobian_nonzeros
+        hessian = (
             nlp.hessian_pattern.sparsity,
             lambda x, p, lam_f, lam_g: nlp.hessian_nonzeros(x, lam_g, float(lam_f[0]), p),
         )

@@ -14,7 +14,7 @@ import numpy as np
 from soup_nlp.arrays import Float
 from soup_nlp.errors import SolverError
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.functions import Buffered, Functions, Output
+from soup_nlp.solve.functions import Buffered, Functions
 from soup_nlp.storage.progress import Progress, Watch, interruptible, raising
 
 # few bounds are active, so mu starts near its end (docs/solving.md)
@@ -86,13 +86,12 @@ class _Iterations:
         self.begin = time.perf_counter()
         self.deadline = time.process_time() + seconds
         self.count = 0
-        self.best = self.best_f = np.inf
-        self.x0 = self.best_x = x0
-        self.best_lam: tuple[Float, Float] | None = None
+        self.x0, self.least = x0, np.inf
+        self.best: tuple[Float, float, Float, Float] | None = None
         self.reason = ""
         sizes = {"x": nlp.nx, "f": 1, "g": nlp.ng}
         sizes |= {"lam_x": nlp.nx, "lam_g": nlp.ng, "lam_p": len(nlp.theta)}
-        answer = {"ret": Output(ca.Sparsity.dense(1, 1), self.stop)}
+        answer = {"ret": (ca.Sparsity.dense(1, 1), self.stop)}
         self.callback = Buffered(f"watch_{nlp.name}", sizes, answer)
 
     def stop(self, *outputs: Float) -> float:
@@ -112,9 +111,9 @@ class _Iterations:
         infeasible = float(max(outside.max(initial=0.0), 0.0))
         # an exact penalty: retraction repairs a small violation, not a large one
         rank = f + 10.0 * infeasible * max(1.0, abs(f))
-        if np.isfinite(f) and rank < self.best:
-            self.best, self.best_x, self.best_f = rank, x.copy(), f
-            self.best_lam = multipliers[0].copy(), multipliers[1].copy()
+        if np.isfinite(f) and rank < self.least:
+            self.least = rank
+            self.best = x.copy(), f, multipliers[0].copy(), multipliers[1].copy()
         now = time.perf_counter()
         if self.watch.listener:
             self.watch.listener(Progress(self.stage, self.count, f, infeasible, now - self.begin))
@@ -136,9 +135,8 @@ class _Iterations:
         history = {k: np.asarray(v, float) for k, v in stats.get("iterations", {}).items()}
         # Ipopt does not count the iteration that begins its restoration; the history has it
         count = len(history["obj"]) - 1 if len(history.get("obj", ())) else self.count
-        x, f, lam_x, lam_g = out["x"], float(out["f"][0]), out["lam_x"], out["lam_g"]
-        if not converged and self.best_lam is not None:
-            x, f, (lam_x, lam_g) = self.best_x, self.best_f, self.best_lam
+        last = out["x"], float(out["f"][0]), out["lam_x"], out["lam_g"]
+        x, f, lam_x, lam_g = last if converged or self.best is None else self.best
         if not np.isfinite(x).all():
             x, f = self.x0, np.nan
         return Stage(
