@@ -1,7 +1,7 @@
 """Positions of the soup's variables in the solver's vector: packing, unpacking, names."""
 
 from dataclasses import dataclass
-from typing import Literal, Self, get_args
+from typing import ClassVar, Literal, Self, get_args
 
 import numpy as np
 
@@ -123,6 +123,8 @@ class TangentLayout:
     R0: Float
     t0: Float
     chart: Chart = "depth"
+    stride: ClassVar[int] = 9
+    """Variables per superpixel."""
 
     @classmethod
     def about(cls, soup: Soup, data: EnergyData, chart: Chart = "depth") -> Self:
@@ -136,16 +138,6 @@ class TangentLayout:
     def count(self) -> int:
         """Superpixels."""
         return len(self.radius)
-
-    @property
-    def stride(self) -> int:
-        """Variables per superpixel."""
-        return 9
-
-    @property
-    def size(self) -> int:
-        """Length of a vector."""
-        return self.stride * self.count
 
     def of(self, superpixel: Int) -> Int:
         """(E, 9) variable indices of superpixels (E,)."""

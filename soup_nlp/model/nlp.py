@@ -1,7 +1,7 @@
 """The NLP record: kernels, tables, bounds; its functions are made when first asked for."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Self
 
@@ -43,6 +43,7 @@ class NLP:
     hessian_kind: Hessian
     x_names: Callable[[], list[str]]
     g_names: Callable[[], list[str]]
+    _known: dict[str, Terms] = field(default_factory=dict, init=False)
 
     # --- numbers: what Ipopt and all reports are computed with ---
 
@@ -100,10 +101,6 @@ class NLP:
             at = end
         # the last one is of what fills the last blocks
         return np.asarray(np.bincount(target, entries, size + 1)[:size], float)
-
-    @cached_property
-    def _known(self) -> dict[str, Terms]:
-        return {}
 
     def _terms(self, key: str) -> Terms:
         """Terms of "f", "grad", "con", "jac" or "hess", made when first asked for: a start at a KKT
