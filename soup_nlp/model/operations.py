@@ -26,37 +26,35 @@ class Operation(NamedTuple):
         nl: Its prefix text in AMPL's format, with {0} and {1} for the operands; "" where an
             expression with the operation cannot be written. "o11" and "o12" (min, max) are
             followed by their argument count.
-        operands: One or two.
     """
 
     numpy: Callable[..., Any]
     nl: str = ""
-    operands: int = 1
 
 
 _ONE = np.array(1.0)
 OPERATIONS: Mapping[int, Operation] = {
-    ca.OP_ADD: Operation(np.add, "o0 {0} {1}", 2),
-    ca.OP_SUB: Operation(np.subtract, "o1 {0} {1}", 2),
-    ca.OP_MUL: Operation(np.multiply, "o2 {0} {1}", 2),
-    ca.OP_DIV: Operation(np.divide, "o3 {0} {1}", 2),
+    ca.OP_ADD: Operation(np.add, "o0 {0} {1}"),
+    ca.OP_SUB: Operation(np.subtract, "o1 {0} {1}"),
+    ca.OP_MUL: Operation(np.multiply, "o2 {0} {1}"),
+    ca.OP_DIV: Operation(np.divide, "o3 {0} {1}"),
     ca.OP_NEG: Operation(np.negative, "o16 {0}"),
     ca.OP_SQ: Operation(np.square, "o5 {0} n2"),
     ca.OP_TWICE: Operation(lambda a, out=None: np.add(a, a, out), "o2 n2 {0}"),
     ca.OP_INV: Operation(lambda a, out=None: np.divide(_ONE, a, out), "o3 n1 {0}"),
     ca.OP_FABS: Operation(np.abs, "o15 {0}"),
     # an output as third argument is deprecated in these two
-    ca.OP_FMAX: Operation(lambda a, b, out=None: np.maximum(a, b, out=out), "o12 2 {0} {1}", 2),
-    ca.OP_FMIN: Operation(lambda a, b, out=None: np.minimum(a, b, out=out), "o11 2 {0} {1}", 2),
-    ca.OP_LT: Operation(np.less, operands=2),
-    ca.OP_LE: Operation(np.less_equal, operands=2),
+    ca.OP_FMAX: Operation(lambda a, b, out=None: np.maximum(a, b, out=out), "o12 2 {0} {1}"),
+    ca.OP_FMIN: Operation(lambda a, b, out=None: np.minimum(a, b, out=out), "o11 2 {0} {1}"),
+    ca.OP_LT: Operation(np.less),
+    ca.OP_LE: Operation(np.less_equal),
     ca.OP_NOT: Operation(lambda a, out=None: np.equal(a, 0.0, out)),
     # not a product: what is left out may be infinite
-    ca.OP_IF_ELSE_ZERO: Operation(lambda a, b, out: np.copyto(out, np.where(a, b, 0.0)), "", 2),
+    ca.OP_IF_ELSE_ZERO: Operation(lambda a, b, out: np.copyto(out, np.where(a, b, 0.0))),
     ca.OP_SQRT: Operation(np.sqrt, "o39 {0}"),
-    ca.OP_POW: Operation(np.power, "o5 {0} {1}", 2),
-    ca.OP_CONSTPOW: Operation(np.power, "o5 {0} {1}", 2),
-    ca.OP_ATAN2: Operation(np.arctan2, "o48 {0} {1}", 2),
+    ca.OP_POW: Operation(np.power, "o5 {0} {1}"),
+    ca.OP_CONSTPOW: Operation(np.power, "o5 {0} {1}"),
+    ca.OP_ATAN2: Operation(np.arctan2, "o48 {0} {1}"),
     ca.OP_EXP: Operation(np.exp, "o44 {0}"),
     ca.OP_LOG: Operation(np.log, "o43 {0}"),
     ca.OP_SIN: Operation(np.sin, "o41 {0}"),
@@ -158,10 +156,9 @@ class Vectors:
             elif op not in OPERATIONS:
                 raise ModelError("unknown operation", where="a kernel", found=NAMES[op])
             else:
-                known = OPERATIONS[op]
-                given = [registers[i] for i in source[: known.operands]]
+                given = [registers[i] for i in source]
                 registers[to[0]] = work[to[0]]
-                calls.append((known.numpy, (*given, work[to[0]])))
+                calls.append((OPERATIONS[op].numpy, (*given, work[to[0]])))
         return calls
 
     def evaluate(
