@@ -70,20 +70,14 @@ class Particles:
         arrays = zip(*(vars(p).values() for p in (self, *others)))
         return Particles(*(np.concatenate(a, axis=1) for a in arrays))
 
-    def take(self, which: Int) -> Particles:
-        """The particles with the numbers `which` (N, C)."""
-        rows = np.arange(len(self.D))[:, None]
-        return Particles(*(a[rows, which] for a in vars(self).values()))
-
     def subset(self, which: Int | slice) -> Particles:
         """The particles of the superpixels `which`."""
         return Particles(*(a[which] for a in vars(self).values()))
 
     def soup(self, labels: Int, share: Float) -> Soup:
         """The soup of labels (N,), with sum(lam) = 1 exactly restored (`Soup.normalised`)."""
-        p = self.take(labels[:, None])
-        ones = np.ones(len(labels))
-        return Soup(ones, p.n[:, 0], p.D[:, 0], p.R[:, 0], p.T[:, 0]).normalised(share)
+        chosen = (a[np.arange(len(labels)), labels] for a in vars(self).values())
+        return Soup(np.ones(len(labels)), *chosen).normalised(share)
 
 
 def from_anchor(Z: Float, g: Float, R: Float, T: Float, anchor_ray: Float) -> Particles:

@@ -42,9 +42,9 @@ def cloud(tiny: Tiny, labels: int, seed: int = 3, spread: float = 1.0) -> Partic
 
 def chosen(p: Particles, labels: np.ndarray) -> Soup:
     """The soup of labels, in the length unit of its particles."""
-    picked = p.take(labels[:, None])
-    ones = np.ones(len(labels))
-    return Soup(ones, picked.n[:, 0], picked.D[:, 0], picked.R[:, 0], picked.T[:, 0])
+    rows = np.arange(len(labels))
+    n, D, R, T = (a[rows, labels] for a in (p.n, p.D, p.R, p.T))
+    return Soup(np.ones(len(labels)), n, D, R, T)
 
 
 @pytest.mark.parametrize("units", ["paper", "pixels"])
