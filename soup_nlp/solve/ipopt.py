@@ -35,6 +35,12 @@ DEFAULTS: Mapping[str, Any] = {
 STILL = 2
 """Small changes of f in a row that are a stagnation."""
 GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+_PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
+
+
+def warm(push: float) -> dict[str, Any]:
+    """Options that leave a given start where it is, except within `push` of a bound."""
+    return {"warm_start_init_point": "yes", **{f"warm_start_{k}": push for k in _PUSHES}}
 
 
 @dataclass(frozen=True, eq=False)

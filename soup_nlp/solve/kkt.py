@@ -12,7 +12,7 @@ from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.model.nlp import NLP
-from soup_nlp.solve.ipopt import Stage
+from soup_nlp.solve.ipopt import Stage, warm
 
 UNMET = "Constraints_Violated"
 """Status of a solve whose answer violates its constraints, whatever status the solver reports."""
@@ -50,15 +50,7 @@ def residuals(
     }
 
 
-WARM: Mapping[str, Any] = {
-    "warm_start_init_point": "yes",
-    "mu_init": 1e-10,
-    "warm_start_bound_push": 1e-10,
-    "warm_start_bound_frac": 1e-10,
-    "warm_start_slack_bound_push": 1e-10,
-    "warm_start_slack_bound_frac": 1e-10,
-    "warm_start_mult_bound_push": 1e-10,
-}
+WARM: Mapping[str, Any] = {"mu_init": 1e-10, **warm(1e-10)}
 """Ipopt options that leave a given start where it is."""
 
 

@@ -27,22 +27,19 @@ from soup_nlp.model.kernel import Hessian
 from soup_nlp.model.layout import Chart, Layout, MatrixLayout
 from soup_nlp.model.nlp import NLP
 from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp, exact_chart, majorant
-from soup_nlp.solve.ipopt import Stage, run_ipopt
+from soup_nlp.solve.ipopt import Stage, run_ipopt, warm
 from soup_nlp.solve.solver_options import Stages
 from soup_nlp.storage.progress import Watch
 
-PUSH = 1e-8
-KEEP: Mapping[str, Any] = {
+_BOTH: Mapping[str, Any] = {
     # the approximate minimum fill ordering
     "mumps_pivot_order": 2,
     "mumps_mem_percent": 100,
+    **warm(1e-8),
+}
+KEEP: Mapping[str, Any] = {
+    **_BOTH,
     "mumps_scaling": 0,  # coordinates in units of their superpixel are scaled already
-    "warm_start_init_point": "yes",
-    "warm_start_bound_push": PUSH,
-    "warm_start_bound_frac": PUSH,
-    "warm_start_slack_bound_push": PUSH,
-    "warm_start_slack_bound_frac": PUSH,
-    "warm_start_mult_bound_push": PUSH,
     # a filter takes steps that raise f for a smaller violation of nearly linear rows; with these,
     # f has to fall in every step
     "delta": 1e-20,
@@ -51,7 +48,7 @@ KEEP: Mapping[str, Any] = {
 }
 """Ipopt options of all these stages: MUMPS, and the start from a point and its multipliers."""
 KEEP_IN_MATRICES: Mapping[str, Any] = {
-    **{k: v for k, v in KEEP.items() if k.startswith(("warm", "mumps_pivot", "mumps_mem"))},
+    **_BOTH,
     # R'R = I and |n| = 1 have no diagonal entries; delayed pivots would double the time
     "mumps_pivtol": 0.0,
     "mumps_pivtolmax": 0.0,
