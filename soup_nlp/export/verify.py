@@ -6,7 +6,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from soup_nlp.arrays import Float, Mask
+from soup_nlp.arrays import Float
 from soup_nlp.model.nlp import NLP
 from soup_nlp.solve.kkt import optimality
 
@@ -130,22 +130,16 @@ def bound_multipliers(nlp: NLP, x: Float, lam_g: Float) -> Float:
     return np.where(fixed, r, np.where(np.isfinite(gap), lam, 0.0))
 
 
-def active(nlp: NLP, x: Float) -> tuple[Mask, Mask, Mask]:
-    """Rows (ng,) at their lower and at their upper bounds, and variables (nx,) off their bounds."""
-    g = nlp.constraints(x)
-    at_lower = np.isfinite(nlp.lbg) & (g - nlp.lbg <= ACTIVE * (1 + np.abs(nlp.lbg)))
-    at_upper = np.isfinite(nlp.ubg) & (nlp.ubg - g <= ACTIVE * (1 + np.abs(nlp.ubg)))
-    return at_lower, at_upper, (x - nlp.lbx > ACTIVE) & (nlp.ubx - x > ACTIVE)
-
-
 def least_squares_multipliers(nlp: NLP, x: Float) -> Float:
     """(ng,) multipliers of least dual infeasibility; 0 for inactive rows.
 
     Minimises |grad f + J_A' lam_A| over the active rows A, in the variables that are not on their
     bounds. Multipliers with a wrong sign are set to 0 and the others are solved again.
     """
-    J, grad = nlp.jacobian(x), nlp.gradient(x)
-    at_lower, at_upper, inside = active(nlp, x)
+    g, J, grad = nlp.constraints(x), nlp.jacobian(x), nlp.gradient(x)
+    at_lower = np.isfinite(nlp.lbg) & (g - nlp.lbg <= ACTIVE * (1 + np.abs(nlp.lbg)))
+    at_upper = np.isfinite(nlp.ubg) & (nlp.ubg - g <= ACTIVE * (1 + np.abs(nlp.ubg)))
+    inside = (x - nlp.lbx > ACTIVE) & (nlp.ubx - x > ACTIVE)
     lam = np.zeros(nlp.ng)
     rows = np.flatnonzero(at_lower | at_upper)
     for _ in range(2):
