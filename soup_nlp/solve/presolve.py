@@ -68,8 +68,6 @@ UNTRUNCATED: Mapping[float, float] = {1.0: 0.3, 0.3: 1.0, 0.1: 1.0}
 """Stages of the second strategy with the exact Hessian: smoothing widths, and the share of
 `stagnation` that ends each. So smooth, the energy is nearly convex; relief, of which each
 reweighted step brings a little, follows the curvature of the residuals at once."""
-EXACT = "exact"
-"""Name of the last stage."""
 STOPPED = ("Interrupted", "Time_Limit")
 """Statuses of a stage after which no further stage begins."""
 
@@ -167,7 +165,7 @@ class Presolve:
         ]
         self._run(program, growing, options={"mu_init": 1e-6})
         if not self._stopped():
-            last, limit = [_Planned(EXACT, o.eps, 0.0)], o.exact_iterations
+            last, limit = [_Planned("exact", o.eps, 0.0)], o.exact_iterations
             self._run(program, last, hessian="exact", options=LAST, max_iter=limit)
             self.rim = _rim(program, self.soup, self.data)
 
