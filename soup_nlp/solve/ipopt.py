@@ -113,8 +113,7 @@ class _Iterations:
 
     def _step(self, x: Float, value: Float, g: Float, *multipliers: Float) -> None:
         nlp, f = self.nlp, float(value[0])
-        outside = np.maximum(nlp.lbg - g, g - nlp.ubg)
-        infeasible = float(max(outside.max(initial=0.0), 0.0))
+        infeasible = float(np.maximum(nlp.lbg - g, g - nlp.ubg).max(initial=0.0))
         # an exact penalty: retraction repairs a small violation, not a large one
         rank = f + 10.0 * infeasible * max(1.0, abs(f))
         if np.isfinite(f) and rank < self.least:

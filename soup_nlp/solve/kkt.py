@@ -45,7 +45,7 @@ def residuals(
     outside = np.maximum(nlp.lbg - g, g - nlp.ubg).max(initial=0.0)
     return {
         **constraints(soup, data.rim_ray, min_facing).largest,
-        "nlp_infeasibility": float(max(outside, 0.0)),
+        "nlp_infeasibility": float(outside),
         **optimality(nlp, stage.x, stage.lam_x, stage.lam_g),
     }
 
