@@ -13,7 +13,6 @@ from soup_nlp.mrf.levels import colours
 from soup_nlp.mrf.trws import mrf_energy, solve_trws
 
 NO_EDGES, NO_TABLES = np.zeros((0, 2), int), np.zeros((0, 3, 3))
-FOREVER = {"gap": -1.0}
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -142,7 +141,7 @@ def test_equals_plain_loops(seed, monkeypatch):
     order = np.argsort(colours(n, edges), kind="stable")
     bounds, energies, labellings = textbook(unary, edges, tables, order, 8)
     for k in (1, 8):
-        result = followed(*padded(unary, edges, tables), max_iter=k, **FOREVER)
+        result = followed(*padded(unary, edges, tables), max_iter=k, gap=-1.0)
         np.testing.assert_allclose(result.bound_history, bounds[:k], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(result.energy_history, energies[:k], rtol=1e-12, atol=1e-12)
         best = int(np.argmin(energies[:k]))
@@ -211,8 +210,8 @@ def test_an_infinite_unary_cost_forbids_a_label():
     allowed[np.arange(7), rng.integers(0, 4, 7)] = True
     short = [u[keep] for u, keep in zip(unary, allowed)]
     cut = [t[np.ix_(allowed[a], allowed[b])] for (a, b), t in zip(edges, tables)]
-    plain = followed(*padded(short, edges, cut), max_iter=6, **FOREVER)
-    forbidding = followed(np.where(allowed, unary, np.inf), edges, tables, max_iter=6, **FOREVER)
+    plain = followed(*padded(short, edges, cut), max_iter=6, gap=-1.0)
+    forbidding = followed(np.where(allowed, unary, np.inf), edges, tables, max_iter=6, gap=-1.0)
     np.testing.assert_allclose(forbidding.bound_history, plain.bound_history, rtol=1e-12)
     assert forbidding.energy == pytest.approx(plain.energy)
     assert allowed[np.arange(7), forbidding.labels].all()
@@ -241,7 +240,7 @@ def test_never_worse_than_the_initial_labels():
     best = min(grid, key=lambda x: mrf_energy(np.array(x), unary, edges, tables))
     for dtype in (np.float64, np.float32):
         single = tables.astype(dtype)
-        result = followed(unary, edges, single, init_labels=np.array(best), max_iter=1, **FOREVER)
+        result = followed(unary, edges, single, init_labels=np.array(best), max_iter=1, gap=-1.0)
         assert result.energy == mrf_energy(np.array(best), unary, edges, single)
         assert result.labels.tolist() == list(best)
         assert result.best_history[0] <= result.energy_history[0]
@@ -262,7 +261,7 @@ def test_initial_labels_return_where_rounding_misled():
 def test_stops():
     rng = np.random.default_rng(14)
     unary, edges, tables = dense(rng, 12, 50, 4)
-    few = followed(unary, edges, tables, max_iter=3, **FOREVER)
+    few = followed(unary, edges, tables, max_iter=3, gap=-1.0)
     assert (few.status, few.iterations) == ("iterations", 3)
     assert len(few.bound_history) == len(few.energy_history) == len(few.best_history) == 3
     loose = followed(unary, edges, tables, gap=10.0)
@@ -283,7 +282,7 @@ def test_interruption_keeps_the_best(how):
             return True
         return None
 
-    result = solve_trws(unary, edges, tables, callback=callback, **FOREVER)
+    result = solve_trws(unary, edges, tables, callback=callback, gap=-1.0)
     assert (result.status, result.iterations) == ("interrupted", 3)
     bounds, energies, least = np.array(rows).T
     assert result.lower_bound == max(bounds)
