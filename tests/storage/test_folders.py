@@ -17,7 +17,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kill_table import full_disks, table
 
-from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.report.folder import write_failure
 from soup_nlp.storage.folders import (
@@ -240,13 +239,12 @@ def test_a_list_owns_nothing_outside_its_folder(tmp_path):
     ],
 )
 def test_files_of_the_user_are_refused_before_anything_is_computed(
-    command, name, tmp_path, monkeypatch, capsys
+    command, name, tmp_path, monkeypatch, refused
 ):
     for begin in ("data.pair.Pair.__init__", "storage.each.each"):
         monkeypatch.setattr(f"soup_nlp.{begin}", None)
     (tmp_path / name).write_text("mine")
-    assert main([*command.split(), "-o", str(tmp_path)]) == 2
-    error = " ".join(capsys.readouterr().err.split())
+    error = " ".join(refused(*command.split(), "-o", tmp_path).split())
     assert "that this program did not make" in error
     assert f"found: {name}" in error
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
@@ -255,31 +253,24 @@ def test_files_of_the_user_are_refused_before_anything_is_computed(
 # --- kills, signals, several processes and full disks ---------------------------------------------
 
 
-@pytest.mark.parametrize("late", [False, True])
-def test_a_file_that_cannot_be_written_ends_in_an_error(late, tmp_path, monkeypatch):
-    """A disk is full at a file, or says so only when all are written."""
-    target = tmp_path / "out"
-    write(target, a="1")
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    where = target if late else target / "r.h5"
-    words = rf"cannot be written\n  where: {where}\n  found: No space left"
-    monkeypatch.setattr(*((os, "fsync") if late else (Path, "write_bytes")), full)
-    with pytest.raises(DataError, match=words), staged(target, True) as new:
-        write_h5(new / "r.h5", {"x": 1.0}, {})
-    assert content(target) == {"a": "1"}
-    assert os.listdir(tmp_path) == ["out"]
-
-
-def test_a_limit_of_the_size_of_files_ends_in_an_error(tmp_path):
+@pytest.mark.parametrize("full", ["file", "late", "limit"])
+def test_a_file_that_cannot_be_written_ends_in_an_error(full, tmp_path, monkeypatch):
+    """A disk is full at a file, or says so only when all are written; a limit of sizes."""
     target, (soft, hard) = tmp_path / "out", resource.getrlimit(resource.RLIMIT_FSIZE)
     write(target, a="1")
-    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, hard))
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    where = target if full == "late" else target / "r.h5"
+    found = "File too large" if full == "limit" else "No space left"
+    words = rf"cannot be written\n  where: {where}\n  found: {found}"
+    if full == "limit":
+        resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, hard))
+    else:
+        monkeypatch.setattr(*((os, "fsync") if full == "late" else (Path, "write_bytes")), refuse)
     try:
-        where = rf"cannot be written\n  where: {target / 'r.h5'}\n"
-        with pytest.raises(DataError, match=where), staged(target, True) as new:
+        with pytest.raises(DataError, match=words), staged(target, True) as new:
             write_h5(new / "r.h5", {"x": np.random.default_rng(0).random(20_000)}, {})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
