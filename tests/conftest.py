@@ -13,6 +13,7 @@ import pytest
 from hypothesis import settings
 
 import benchmarks.everyday  # noqa: F401, makes its scenes known
+from soup_nlp.cli.main import main
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data import inputs
 from soup_nlp.data.flow import sources
@@ -108,6 +109,18 @@ def small_room() -> Case:
 def small_run(small_room: Case) -> Run:
     """The start of that room as a run: every record is there, nothing was solved."""
     return make_run(small_room, skipped(small_room))
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run a command line, which must end with code 2; returns its message."""
+
+    def run(*words: object) -> str:
+        capsys.readouterr()
+        assert main([*map(str, words)]) == 2
+        return capsys.readouterr().err
+
+    return run
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,5 @@
 """Problem files and their errors; help that is quick, problems by name, version, completion."""
 
-import os
 import re
 import subprocess
 import sys
@@ -209,7 +208,6 @@ def test_problems_are_found_by_name_anywhere(tmp_path, monkeypatch, capsys):
     assert load_problem("street").input.kind == "motorcycle"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "word"),
     [
@@ -219,11 +217,13 @@ def test_problems_are_found_by_name_anywhere(tmp_path, monkeypatch, capsys):
         ("show street --preset pa", "paper"),
     ],
 )
-def test_completion_knows_commands_problems_and_formats(line, word):
-    code = "import sys; sys.argv = ['soup-nlp']; from soup_nlp.cli.main import main; main()"
+def test_completion_knows_commands_problems_and_formats(line, word, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["soup-nlp"])
+    # a program of its own, not `python -m pytest`
+    monkeypatch.setattr("__main__.__package__", None)
     words = {"COMP_WORDS": f"soup-nlp {line}", "COMP_CWORD": str(len(line.split()))}
-    surroundings = os.environ | words | {"_SOUP_NLP_COMPLETE": "complete_bash"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=surroundings, capture_output=True, text=True
-    )
-    assert done.stdout.split() == [word]
+    for name, value in (words | {"_SOUP_NLP_COMPLETE": "complete_bash"}).items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit):
+        main()
+    assert capsys.readouterr().out.split() == [word]

@@ -95,7 +95,7 @@ def test_without_the_nlp_the_start_is_refined(tmp_path):
     assert "nlp" not in summary["metrics"]
     assert load(folder).reconstruction.detail is None
     assert check_folder(folder).ok
-    # the solve can be repeated from the folder alone, see test_cli
+    # the solve can be repeated from the folder alone
     again = load_problem(folder / "config.yaml")
     assert again.digest() == summary["problem_hash"]
     assert again.refine.from_start

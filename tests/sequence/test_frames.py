@@ -6,9 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from helpers_files import photo
+from helpers_odd_world import png
+from PIL import Image
 
-from soup_nlp.cli.main import main
 from soup_nlp.errors import DataError
 from soup_nlp.report.figures import write_png
 from soup_nlp.sequence import solve as solving
@@ -27,21 +28,17 @@ pytestmark = pytest.mark.slow
 IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
 
 
-def test_pictures_of_no_sequence_are_refused(tmp_path, capsys):
+def test_pictures_of_no_sequence_are_refused(tmp_path, refused):
     rng = np.random.default_rng(1)
     for k, size in enumerate(((48, 64), (48, 64), (40, 64))):
         write_png(tmp_path / f"{k}.png", rng.integers(0, 256, (*size, 3)).astype(np.uint8))
-    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
-    assert "differ in size: are they one sequence?" in capsys.readouterr().err
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    Image.fromarray(IMAGE).save(tmp_path / "2.jpg", exif=exif)
+    out = "-o", tmp_path / "out"
+    assert "differ in size: are they one sequence?" in refused("chain", tmp_path, *out)
+    photo(tmp_path / "2.jpg", IMAGE, turned=6)
     # files that are named, too; the size is that of the picture as it is shown
     for name, size in (("2.png", "64x40"), ("2.jpg", "48x64")):
-        images = [str(tmp_path / x) for x in ("0.png", "1.png", name)]
-        assert main(["chain", *images, "-o", str(tmp_path / "out")]) == 2
-        assert f"found: 0.png 64x48, {name} {size}" in capsys.readouterr().err
-        (tmp_path / name).unlink()
+        images = [tmp_path / x for x in ("0.png", "1.png", name)]
+        assert f"found: 0.png 64x48, {name} {size}" in refused("chain", *images, *out)
     assert not (tmp_path / "out").exists()
 
 
@@ -141,44 +138,31 @@ def test_files_of_a_folder_that_are_frames(names, ordered, tmp_path):
         assert [p.name for p in find_images(source)] == ordered
 
 
-@pytest.mark.parametrize("kind", ["damaged", "heic", "turned"])
-def test_an_unreadable_frame_is_found_before_the_first_solve(kind, tmp_path, capsys, monkeypatch):
-    def solve(*args):
-        raise AssertionError("a pair was solved")
-
-    monkeypatch.setattr(solving.stored, "solve_into", solve)
+@pytest.mark.parametrize(
+    ("name", "make", "said"),
+    [
+        ("3.png", lambda path: path.write_bytes(png(64, 48)), "truncated"),
+        ("3.heic", lambda path: path.write_bytes(b"\0\0\0\x18ftypheic" + bytes(100)), "convert it"),
+        ("3.png", lambda path: photo(path, IMAGE, turned=6), "turned"),
+        # its hash would wait for a writer for ever
+        ("K.txt", os.mkfifo, "a pipe, socket or device"),
+    ],
+)
+def test_an_unreadable_file_is_found_before_the_first_solve(
+    name, make, said, tmp_path, refused, monkeypatch
+):
+    monkeypatch.setattr(solving.stored, "solve_into", None)
     for k in range(3):
         write_png(tmp_path / f"{k}.png", IMAGE)
-    last = tmp_path / "3.png"
-    write_png(last, IMAGE)
-    if kind == "damaged":
-        last.write_bytes(last.read_bytes()[:500])
-    elif kind == "heic":
-        last.unlink()
-        last = tmp_path / "3.heic"
-        last.write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
-    else:
-        exif = Image.Exif()
-        exif[ExifTags.Base.Orientation] = 6
-        Image.fromarray(IMAGE).save(last, exif=exif)
-    camera = ["--intrinsics", "60,60,31.5,23.5"]
-    assert main(["chain", str(tmp_path), *camera, "-o", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert last.name in error
-    assert {"damaged": "truncated", "heic": "convert it", "turned": "turned"}[kind] in error
-
-
-def test_a_camera_that_is_a_pipe_is_refused(tmp_path, capsys):
-    """Its hash would wait for a writer for ever."""
-    for k in range(2):
-        write_png(tmp_path / f"{k}.png", IMAGE)
-    os.mkfifo(tmp_path / "K.txt")
-    assert main(["chain", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
-    assert "a pipe, socket or device" in capsys.readouterr().err
+    make(tmp_path / name)
+    camera = [] if name == "K.txt" else ["--intrinsics", "60,60,31.5,23.5"]
+    error = refused("chain", tmp_path, *camera, "-o", tmp_path / "out")
+    assert name in error
+    assert said in error
     assert not (tmp_path / "out").exists()
 
 
-def test_frames_of_another_sequence_are_left_alone(tmp_path, capsys):
+def test_frames_of_another_sequence_are_left_alone(tmp_path, refused):
     out = tmp_path / "out"
     with staged(out, subject="another sequence") as new:
         (new / "chain.json").write_text("{}")
@@ -186,8 +170,7 @@ def test_frames_of_another_sequence_are_left_alone(tmp_path, capsys):
         write_png(new / "0000.png", IMAGE)
     before = (out / "frames" / "0000.png").read_bytes()
     make_video(tmp_path / "clip.avi", 3)
-    assert main(["chain", str(tmp_path / "clip.avi"), "-o", str(out)]) == 2
-    assert "something else" in capsys.readouterr().err
+    assert "something else" in refused("chain", tmp_path / "clip.avi", "-o", out)
     assert (out / "frames" / "0000.png").read_bytes() == before
 
 
