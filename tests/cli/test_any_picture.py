@@ -114,7 +114,8 @@ def test_two_pictures_are_enough(orbit, tmp_path, capsys):
     pair = [str(orbit / "a.png"), str(orbit / "b.png")]
     flow = ["--flow", str(orbit / "forward.flo"), "--flow-confidence", str(orbit / "half.png")]
     small = ["--superpixels", "12", "--neighbours", "5", "--no-refine", "--json"]
-    small += sets("solver.presolve_iterations=5 solver.max_iter=2 output.page=false")
+    small += sets("solver.presolve_iterations=1 solver.presolve_eps=[0.3] solver.max_iter=1")
+    small += sets("output.page=false")
     assert main(["solve", *pair, *flow, *small, "-o", str(tmp_path / "out")]) in (0, 1)
     told = capsys.readouterr()
     summary = json.loads(told.out)

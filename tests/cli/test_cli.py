@@ -180,8 +180,8 @@ def test_frames_of_the_same_names_get_folders_of_their_own(tmp_path, monkeypatch
     for seed, clip in enumerate(("a/clip", "b/clip")):
         (tmp_path / clip).mkdir(parents=True)
         write_pair(tmp_path / clip, render_scene("orbit", seed, 64, 48), ("frame_0", "frame_1"))
-    small = ["--superpixels=6", "--neighbours=3", "--no-refine", "-q", "--fov=50"]
-    small += sets("output.page=false solver.presolve_iterations=0 solver.max_iter=1")
+    small = ["--superpixels=6", "--neighbours=3", "--no-nlp", "-q", "--fov=50"]
+    small += sets("output.page=false refine.rounds=1 refine.particles=4")
 
     def solve(clip: str) -> list[str]:
         return ["solve", *(f"{clip}/frame_{k}.png" for k in (0, 1)), *small]

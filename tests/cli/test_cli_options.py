@@ -22,8 +22,11 @@ from soup_nlp.storage.folders import SUMS, Sums, write_sums
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("solves_once")]
 
 SMALL = sets(
-    "input.width=112 input.height=84 refine.enabled=false segmentation.superpixels=16"
-    " segmentation.neighbours=5 solver.presolve_iterations=0 solver.max_iter=0 output.page=false"
+    "input.width=112 input.height=84 refine.from_start=true refine.rounds=1 refine.particles=4"
+    " segmentation.superpixels=16 segmentation.neighbours=5 output.page=false"
+)
+STOPPED = sets(
+    "refine.enabled=false refine.from_start=false solver.presolve_iterations=0 solver.max_iter=0"
 )
 
 
@@ -151,7 +154,8 @@ def test_images_may_differ_in_size(tmp_path, capsys):
     # the camera is a file here, as it may be in a problem file
     options += ["--intrinsics", str(tmp_path / "pair" / "K.txt")]
     options += ["--set", f"input.depth_next={tmp_path / 'cut.npy'}"]
-    assert main(["solve", "--out", str(tmp_path / "out"), *options, *SMALL[4:]]) == 1
+    options += [*SMALL[4:], *STOPPED]
+    assert main(["solve", "--out", str(tmp_path / "out"), *options]) == 1
     # only the next frame has a truth here
     assert "next frame" in capsys.readouterr().out
     assert main(["check", str(tmp_path / "out")]) == 0
