@@ -77,11 +77,12 @@ def called(node: ast.expr) -> str:
     return getattr(node, "attr", getattr(node, "id", ""))
 
 
-def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:
-    """Names that a module imports, also inside functions and by `import_module`.
+def imports(path: Path) -> Iterator[tuple[str, bool]]:
+    """Names that a file imports, also inside functions and by `import_module`.
 
     With each name comes whether it is imported for types alone, under `if TYPE_CHECKING:`.
     """
+    tree = ast.parse(path.read_text(encoding="utf-8"))
     left = [(tree, False)]
     while left:
         node, typed = left.pop()
@@ -94,7 +95,7 @@ def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:
         elif isinstance(node, ast.Import):
             yield from ((a.name, typed) for a in node.names)
         elif isinstance(node, ast.ImportFrom):
-            assert not node.level, "a relative import: write the whole name"
+            assert not node.level, f"{path} has a relative import"
             yield from ((f"{node.module}.{a.name}", typed) for a in node.names)
 
 
@@ -115,8 +116,7 @@ WITH_TYPES: dict[str, set[str]] = {module: set() for module in MODULES}
 OUTSIDE: dict[str, set[str]] = {module: set() for module in MODULES}
 """Foreign libraries that every module imports, those for types alone left out."""
 for importer, file in MODULES.items():
-    parsed = ast.parse(file.read_text(encoding="utf-8"))
-    for name, for_types in imports(parsed):
+    for name, for_types in imports(file):
         target = own(name)
         if target is None:
             if not for_types:
@@ -144,8 +144,7 @@ def test_benchmarks_enter_few_rooms_and_the_package_does_not_know_them():
     entered: dict[bool, set[str]] = {True: set(), False: set()}
     folder = PACKAGE.parent / "benchmarks"
     for path in folder.rglob("*.py"):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        names = [own(name) for name, _ in imports(tree)]
+        names = [own(name) for name, _ in imports(path)]
         entered["family" in path.parts] |= {room(n) for n in names if n} - COMMON
     assert entered[False] == BENCHMARKS
     assert entered[True] <= BENCHMARKS | FAMILY

@@ -17,7 +17,6 @@ from soup_nlp.model import oracle
 from soup_nlp.model.elements import elements
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.layout import TangentLayout
-from soup_nlp.model.programs import build_tangent_nlp
 from soup_nlp.model.reweighting import in_translations
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
@@ -197,17 +196,3 @@ def test_walks_are_the_only_proposals_of_the_paper(case, monkeypatch):
     )
     assert drawn == set(WALKS)
     assert done.energy["total"] <= done.energy_begin["total"]
-
-
-def test_slanted_planes_do_not_lengthen_the_unit(case):
-    """The presolve's row of the length unit adds up the distances of the slanted planes."""
-    nlp, layout = build_tangent_nlp(case.soup, case.data, case.weights, case.formulation())
-    row = next(g for g in nlp.groups if g.kernel.name == "t_simplex").rows[0, 0]
-    x = nlp.x0 + 1e-2 * np.random.default_rng(0).normal(size=nlp.nx)
-    lam, slope = x[::9], x.reshape(-1, 9)[:, 1:3]
-    across = layout.radius - np.sum(slope * layout.anchor[:, :2], axis=1)
-    m = np.linalg.norm(np.column_stack([slope, across]), axis=1)
-    unit = layout.share @ (layout.depth * lam * layout.radius / m)
-    assert nlp.constraints(x)[row] == pytest.approx(unit, rel=1e-9)
-    assert nlp.constraints(nlp.x0)[row] == pytest.approx(1.0, rel=1e-9)
-    assert abs(unit - 1) > 1e-4

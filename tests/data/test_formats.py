@@ -142,23 +142,6 @@ def test_flo_golden_bytes_and_unknown_flow(tmp_path: Path, mark: float) -> None:
         np.testing.assert_array_equal(read, [[[np.nan, np.nan], [1.5, -2]]])
 
 
-def test_kitti_flow_channel_order(tmp_path: Path) -> None:
-    rgb = np.array([[[2**15 + 96, 2**15 - 128, 1], [1, 2, 0]]], np.uint16)
-    flow = fmt.read_flow(stored(tmp_path / "a.png", rgb[:, :, ::-1]))
-    np.testing.assert_array_equal(flow, [[[1.5, -2.0], [np.nan, np.nan]]])
-
-
-def test_vkitti_flow(tmp_path: Path) -> None:
-    height, width = 5, 11
-    flow = np.full((height, width, 2), (3.0, -1.5))
-    code = np.rint((flow / [width - 1, height - 1] + 1) / 2 * 65535)
-    bgr = np.dstack([np.ones((height, width)), code[..., 1], code[..., 0]]).astype(np.uint16)
-    bgr[0, 0, 0] = 0
-    back = fmt.read_vkitti_flow(stored(tmp_path / "a.png", bgr))
-    assert np.isnan(back[0, 0]).all()
-    np.testing.assert_allclose(back[1:], flow[1:], atol=2 * (width - 1) / 65535)
-
-
 # --- depth --------------------------------------------------------------------------------------
 
 
@@ -208,14 +191,6 @@ def test_kitti_disparity_and_vkitti_depth(tmp_path: Path) -> None:
     disparity = fmt.read_depth_png16(path, fmt.KITTI_DISPARITY)
     np.testing.assert_array_equal(disparity, [[np.nan, 1.0, 65534 / 256, 65535 / 256]])
     np.testing.assert_array_equal(fmt.read_vkitti_depth(path), [[np.nan, 2.56, 655.34, np.nan]])
-
-
-# --- cameras ------------------------------------------------------------------------------------
-
-
-def test_zero_distortion_is_none(tmp_path: Path) -> None:
-    path = put(tmp_path / "K.txt", b"80 80 47.5 31.5 0 0 0 0 0")
-    assert camera_files.read_intrinsics(path)[0, 0] == 80
 
 
 # --- images -------------------------------------------------------------------------------------
