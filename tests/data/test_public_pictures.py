@@ -3,7 +3,6 @@
 import re
 import struct
 import warnings
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,13 +54,22 @@ def test_bytes_behind_a_picture_do_not_matter(kind: str, tmp_path: Path) -> None
 # --- metadata never ends a run -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("data", [b"\0\0\x11\0no TIFF", b"II*\0\xff\xff\xff\x7f", b""])
-def test_malformed_exif_is_a_warning(data: bytes, folder: Path) -> None:
-    png, checked = (folder / "a.png").read_bytes(), b"eXIf" + data
-    chunk = struct.pack(">I", len(data)) + checked + struct.pack(">I", zlib.crc32(checked))
-    (folder / "a.png").write_bytes(png[:33] + chunk + png[33:])
-    pair, text = said(folder)
-    assert "EXIF is malformed" in text or data != b"\0\0\x11\0no TIFF"
+TIFF = b"II*\0"
+EXIF = [
+    *(b"\0\0\x11\0no TIFF", b"", b"\xff\xfe" * 3000, bytes(range(256)) * 9),
+    # cut off, far away, a loop, many directories
+    *(TIFF, TIFF + b"\xff\xff\xff\x7f", TIFF + b"\x08\0\0\0" + struct.pack("<HI", 0, 8)),
+    TIFF + b"\x08\0\0\0\xff\xff" + b"\x69\x87\x04\0\x01\0\0\0\x08\0\0\0" * 9,
+]
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg"])
+@pytest.mark.parametrize("data", EXIF)
+def test_malformed_exif_is_a_warning(data: bytes, kind: str, folder: Path) -> None:
+    with Image.open(folder / "a.png") as image:
+        image.save(folder / f"x.{kind}", exif=b"Exif\0\0" + data)
+    pair, text = said(folder, f"x.{kind}")
+    assert "EXIF is malformed" in text or (data, kind) != (EXIF[0], "png")
     assert pair.K_ref[0, 0] == pytest.approx(1.2 * 96)
 
 

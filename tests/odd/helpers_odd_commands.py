@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from helpers_odd_run import ANY, Case, cases, changed, write, written
-from helpers_odd_world import CAMERA, NO_FOLDER, ODD, World
+from helpers_odd_world import NO_FOLDER, ODD, World
 
 # --- files ---------------------------------------------------------------------------------------
 
@@ -52,14 +52,6 @@ DATASETS = {
     "vkitti1": 'root: {}, scene: "0001", frame: 0',
     "vkitti2": "root: {}, scene: Scene01, frame: 0",
 }
-PARTS = {
-    **dict.fromkeys(("frame_0", "frame_1", "moving"), "png"),
-    **{"K": "txt", "K_next": "txt", "depth": "npy png dpt pfm", "depth_next": "npy"},
-    **{"flow": "flo npy png", "points": "npz"},
-}
-"""Suffixes by name of the files of an input folder."""
-MALFORMED = ("empty", "garbage", "line", "brackets", "digits", "braces")
-"""Kinds of odd files with contents."""
 WRITE = {
     "solve": "{solve} -o {odd}",
     "export": "export {p} -q -o {odd}",
@@ -88,29 +80,12 @@ def _dataset(name: str, text: str) -> Any:
     return make
 
 
-def _part(name: str) -> Any:
-    """A problem with an input folder in which one file is odd."""
-
-    def make(w: World, o: Path, kind: str) -> str:
-        for k, image in enumerate("ab"):
-            (o / f"frame_{k}.png").symlink_to(w.good(f"{image}.png"))
-        write(o / "K.txt", CAMERA.replace(",", " "))
-        _instead(o / name, kind)
-        write(o / "p.yaml", f"input: {{kind: folder, path: {json.dumps(str(o))}}}\n")
-        return str(o / "p.yaml")
-
-    return make
-
-
 def path_cases() -> Iterator[Case]:
     for door, line in READ.items():
         yield from cases(f"{door} {{}}", line, KINDS)
     for name, text in DATASETS.items():
         make = _dataset(name, text)
         yield from cases(f"dataset {name} {{}}", "solve {x} -o {out}", KINDS, make=make)
-    for name in (f"{stem}.{suffix}" for stem, kinds in PARTS.items() for suffix in kinds.split()):
-        line = "solve {x} -q -o {out}"
-        yield from cases(f"part {name} {{}}", line, MALFORMED, make=_part(name))
     for door, line in WRITE.items():
         yield from cases(f"{door} -o {{}}", line, NO_FOLDER)
     for name in ("depth_ref.png", "points_next.ply", "overview.png", "result.h5", "summary.json"):

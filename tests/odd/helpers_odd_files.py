@@ -2,13 +2,11 @@
 
 import struct
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import cv2
 import numpy as np
 from helpers_odd_run import ANY, Case, cases, written
-from helpers_odd_world import SIZE, World, encoded_noise, png
-from PIL import Image
+from helpers_odd_world import SIZE, encoded_noise, png
 
 # --- arrays --------------------------------------------------------------------------------------
 
@@ -98,23 +96,6 @@ IMAGES: dict[str, Callable[[], bytes]] = {
     "float64 tiff": lambda: encoded_noise(SIZE, ".tiff", np.float64),
 }
 
-EXIF = {
-    "text": b"\xff\xfe" * 3000,
-    "cut": b"Exif\0\0II*\0",
-    "empty": b"Exif\0\0",
-    "loop": b"Exif\0\0II*\0\x08\0\0\0" + struct.pack("<HI", 0, 8),
-    "far": b"Exif\0\0II*\0\xff\xff\xff\x7f",
-    "many": b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + b"\x69\x87\x04\0\x01\0\0\0\x08\0\0\0" * 9,
-    "noise": bytes(range(256)) * 9,
-}
-"""Bytes of the EXIF of a photo."""
-
-
-def _photos(w: World, o: Path, exif: bytes) -> None:
-    for word in "ab":
-        with Image.open(w.good(f"{word}.png")) as image:
-            image.save(o / f"{word}.jpg", exif=exif)
-
 
 def image_cases() -> Iterator[Case]:
     tiffs = dict.fromkeys(("float tiff", "float64 tiff"), ANY)
@@ -125,6 +106,3 @@ def image_cases() -> Iterator[Case]:
     }.items():
         title, make = f"image {{}} as {doors}", written("x.png")
         yield from cases(title, line, IMAGES, make=make, other=tiffs)
-    # the pictures are read first, then the missing flow ends the command
-    line = "solve {o}/a.jpg {o}/b.jpg --flow nothing.flo -q -o {out}"
-    yield from cases("exif {}", line, EXIF, make=_photos)

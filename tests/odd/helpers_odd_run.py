@@ -72,23 +72,18 @@ def words(line: str, w: World, o: Path, x: str = "") -> list[str]:
     the case; {a} {b} the images, {f} the flow, {d} the depth, {p} the problem file; {result},
     {exported} and {sol}; {tiny} settings of a quick solve; {solve} the solve of the pair.
     """
-    solve = ["solve", *w.pair, *SET, "-q", "-o", str(o / "out")]
-    single: dict[str, Callable[[], object]] = {
-        "x": lambda: x,
-        "o": lambda: o,
-        "out": lambda: o / "out",
-        **{k: lambda k=k: w.good(f"{k}.{FILES[k]}") for k in FILES},
-        "result": lambda: w.result,
-        "exported": lambda: w.exported,
-        "sol": lambda: w.exported / "soup.sol",
-        "camera": lambda: CAMERA,
-    }
+    several = {"{solve}": ["solve", *w.pair, *SET, "-q", "-o", str(o / "out")], "{tiny}": SET}
+    known = {"x": x, "o": o, "out": o / "out", "camera": CAMERA}
 
     def replaced(match: re.Match[str]) -> str:
         name, suffix = match.groups()
-        return w.odd(x, suffix or "") if name == "odd" else str(single[name]())
+        if name == "odd":
+            return w.odd(x, suffix or "")
+        if name in FILES:
+            return str(w.good(f"{name}.{FILES[name]}"))
+        # what a world makes when it is asked for
+        return str(known[name] if name in known else getattr(w, name))
 
-    several = {"{solve}": solve, "{tiny}": SET}
     out: list[str] = []
     for word in line.split():
         out += several[word] if word in several else [NAME.sub(replaced, word)]

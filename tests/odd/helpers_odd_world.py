@@ -99,6 +99,11 @@ class World:
         (out / "soup.sol").write_text("\n".join(map(str, lines)) + "\n")
         return out
 
+    @property
+    def sol(self) -> Path:
+        """That answer."""
+        return self.exported / "soup.sol"
+
     def odd(self, kind: str, suffix: str = "") -> str:
         """The name of an odd file."""
         folder = self.root / "odd"
