@@ -11,12 +11,7 @@ from helpers_files import grey_texture, write_flo
 from soup_nlp.config.problem import make_problem
 from soup_nlp.data.flow.dis import dis_flow
 from soup_nlp.data.flow.layers import without_still_layer
-from soup_nlp.data.flow.sources import (
-    FlowOptions,
-    flow_from_truth,
-    is_named,
-    resolve_flow,
-)
+from soup_nlp.data.flow.sources import FlowOptions, flow_from_truth, is_named, resolve_flow
 from soup_nlp.data.network import learned_flow
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
@@ -112,26 +107,21 @@ def test_onnx_network(onnx, tmp_path, stacked, size):
 
 def test_onnx_input_range_and_bad_networks(onnx, tmp_path, pair):
     first, second = (np.full((64, 64, 3), g, np.uint8) for g in (0, 51))
-    unit = tiny_network(onnx, tmp_path / "unit.onnx", word="unit", gain=10.0)
-    np.testing.assert_allclose(learned_flow(str(unit), first, second).uv[5, 5], 2.0, rtol=1e-4)
-    signed = tiny_network(onnx, tmp_path / "signed.onnx", word="signed", gain=10.0)
-    np.testing.assert_allclose(learned_flow(str(signed), first, second).uv[5, 5], 4.0, rtol=1e-4)
-    for name, options, match in [
-        ("word", {"word": "percent"}, "input range"),
-        ("flat", {"flat": True}, "gives no flow"),
-    ]:
-        path = tiny_network(onnx, tmp_path / f"{name}.onnx", **options)
+    path = tmp_path / "a.onnx"
+    for word, expected in (("unit", 2.0), ("signed", 4.0)):
+        tiny_network(onnx, path, word=word, gain=10.0)
+        np.testing.assert_allclose(learned_flow(str(path), first, second).uv[5, 5], expected, 1e-4)
+    with pytest.raises(DataError, match="two RGB images"):
+        learned_flow(str(path), first, second[:32])
+    for options, match in (({"word": "percent"}, "input range"), ({"flat": True}, "gives no flow")):
+        tiny_network(onnx, path, **options)
         with pytest.raises(DataError, match=match):
             learned_flow(str(path), first, second)
     (tmp_path / "no.onnx").write_bytes(b"not a network")
-    with pytest.raises(DataError, match="no network"):
-        resolve_flow(pair, str(tmp_path / "no.onnx"))
-    with pytest.raises(DataError, match="missing"):
-        resolve_flow(pair, str(tmp_path / "absent.onnx"))
-    with pytest.raises(DataError, match="two RGB images"):
-        learned_flow(str(unit), first, second[:32])
-    endless = tiny_network(onnx, tmp_path / "endless.onnx", gain=1e38)
-    unknown = learned_flow(str(endless), first, second)
+    for name, match in (("no.onnx", "no network"), ("absent.onnx", "missing")):
+        with pytest.raises(DataError, match=match):
+            resolve_flow(pair, str(tmp_path / name))
+    unknown = learned_flow(str(tiny_network(onnx, path, gain=1e38)), first, second)
     assert (unknown.uv == 0).all()
     assert (unknown.confidence == 0).all()
 

@@ -169,8 +169,7 @@ def test_a_large_pair_comes_back_at_its_size():
     }
     case = prepare(make_problem(settings), pair=pair)
     start = skipped(case)
-    refined = Refined(start.soup, {}, {}, {}, (), "rounds", 0.0)
-    done = make_run(case, start, refined)
+    done = make_run(case, start, Refined(start.soup, {}, {}, {}, (), "rounds", 0.0))
     assert done.pair.size[0] * done.pair.size[1] <= 12_500
     assert done.full.depth_ref.shape == (128, 256)
     covered = np.isfinite(done.full.depth_next)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers_model import K_NEXT, K_REF, motion, plane_soup, plane_world, random_soup
+from helpers_model import K_REF, motion, plane_soup, plane_world, random_soup
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -194,12 +194,6 @@ def test_pixels_that_a_plane_does_not_face_have_no_depth():
     np.testing.assert_array_equal(np.isnan(rec.depth_ref), facing <= 1e-6)
     assert 0 < np.isnan(rec.depth_ref).mean() < 1
     assert (rec.depth_ref[facing > 1e-6] > 0).all()
-
-
-def test_the_next_frame_may_have_another_size():
-    soup = random_soup(0, 1, spread=0.0)
-    rec = reconstruct(soup, np.zeros((12, 16), np.int32), K_REF, K_NEXT, size_next=(30, 20))
-    assert rec.depth_next.shape == (30, 20)
 
 
 def splat_depth(target, z, size):

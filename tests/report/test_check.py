@@ -13,7 +13,7 @@ import pytest
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import DataError
-from soup_nlp.geometry.camera import pixel_grid, project, rays
+from soup_nlp.geometry.camera import intrinsics, pixel_grid, project, rays
 from soup_nlp.pipeline.run import solve_pair
 from soup_nlp.report.check import WRITTEN, CheckReport, check_folder
 from soup_nlp.report.folder import prepare_folder, write_folder
@@ -169,15 +169,13 @@ def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
 
 def one_plane() -> Pair:
     """A plane and a motion with an exact flow, so that E is zero up to rounding."""
-    shot = render_scene("orbit", 0, 320, 160)
-    uv = pixel_grid(*shot.size)
-    ray = rays(shot.K_ref, uv)
+    K, uv = intrinsics(100, 100, 79.5, 39.5), pixel_grid(80, 160)
+    ray = rays(K, uv)
     points = (2.0 / (ray @ [-0.1, -0.2, 0.97]))[..., None] * ray
     turn = cv2.Rodrigues(np.array([0.01, 0.02, -0.005]))[0]
-    flow = project(shot.K_next, points @ turn.T + [0.2, 0.02, 0.1]) - uv
-    sure = np.ones(shot.size, np.float32)
-    grey = np.full_like(shot.image_ref, 128)
-    return Pair(grey, grey, shot.K_ref, shot.K_next, Flow(flow, sure, "exact"))
+    flow = project(K, points @ turn.T + [0.2, 0.02, 0.1]) - uv
+    grey = np.full((80, 160, 3), 128, np.uint8)
+    return Pair(grey, grey, K, K, Flow(flow, np.ones((80, 160), np.float32), "exact"))
 
 
 @pytest.mark.parametrize("place", ["metrics", "residuals", "energy nlp proj"])
@@ -201,7 +199,7 @@ def test_an_energy_of_rounding_size_passes_the_check(tmp_path):
     assert bad(check_folder(tmp_path)) == []
     path = tmp_path / "summary.json"
     claims = json.loads(path.read_text())
-    # 1e-7 is far below a pixel, but no rounding of coordinates up to 320
+    # 1e-7 is far below a pixel, but no rounding of coordinates up to 160
     for off, expected in ((1e-11, []), (1e-7, ["energy solution proj"])):
         claims["energy"]["solution"]["proj"] += off
         path.write_text(json.dumps(claims))

@@ -150,14 +150,8 @@ def test_errors_of_a_path_are_those_of_evo(tmp_path):
         read_path(tmp_path / "bad.txt")
 
 
-def test_similarities_are_found_exactly():
-    rng = np.random.default_rng(3)
-    points, R = rng.normal(size=(6, 3)), exp([0.3, -0.2, 0.5])
-    scale, turn, shift = similarity(points, 2.5 * points @ R.T + [1, 2, 3])
-    assert scale == pytest.approx(2.5)
-    np.testing.assert_allclose(turn, R, atol=1e-12)
-    np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-12)
-    # a mirror image is no rotation
+def test_a_mirror_image_is_no_rotation():
+    points = np.random.default_rng(3).normal(size=(6, 3))
     assert np.linalg.det(similarity(points * [1, 1, -1], points)[1]) == pytest.approx(1)
 
 

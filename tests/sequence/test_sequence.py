@@ -14,7 +14,7 @@ from soup_nlp.batches import run as batches
 from soup_nlp.cli.main import main
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError, SolverError, SoupError
-from soup_nlp.pipeline.case import prepare
+from soup_nlp.pipeline.case import observed_pair
 from soup_nlp.report.figures import write_png
 from soup_nlp.report.folder import head
 from soup_nlp.report.models import POINTS, fuse
@@ -277,14 +277,14 @@ def test_frames_without_a_camera_get_one_focal_length(tmp_path):
     assert focal == pytest.approx(pair.K_ref[0, 0], rel=0.1)  # the guess is 1.5 times as long
     assert 0.05 <= camera["focal_sigma"] < 0.2
     # the solve of a pair takes it as it is
-    found = prepare(replace(frames, camera=camera).problem(0)).pair
+    found = observed_pair(replace(frames, camera=camera).problem(0))
     assert found.K_ref[0, 0] == pytest.approx(focal)
     assert found.focal_sigma == camera["focal_sigma"]
     known = Frames(tuple(names), {"fov": 60})
     assert one_camera(known) is known
     # pairs without a flow say nothing
     for name in names:
-        write_png(name, np.full((216, 320, 3), 128, np.uint8))
+        write_png(name, np.full((72, 96, 3), 128, np.uint8))
     flat = Frames(tuple(names), overrides=("segmentation.superpixels=20",))
     assert one_camera(flat) is flat
 
@@ -294,13 +294,13 @@ def test_a_chain_takes_the_keys_of_a_pair_and_files_of_every_pair(tmp_path):
     for kind in ("clip", "flow", "depth"):
         (tmp_path / kind).mkdir()
     for k in range(3):
-        pair = render_scene("street", 0, 128, 86, k)
+        pair = render_scene("street", 0, 96, 64, k)
         write_png(tmp_path / "clip" / f"{k}.png", pair.image_ref)
         np.save(tmp_path / "depth" / f"{k}.npy", 7 * pair.truth.depth_ref)
         if k < 2:
             np.save(tmp_path / "flow" / f"{k}.npy", pair.truth.flow)
     keys = {
-        "segmentation": {"superpixels": 20, "neighbours": 5},
+        "segmentation": {"superpixels": 12, "neighbours": 4},
         "refine": {"enabled": False},
         "solver": {"presolve_iterations": 0, "max_iter": 1},
         "flow": {"source": f"{tmp_path}/flow/*.npy"},
@@ -317,7 +317,7 @@ def test_a_chain_takes_the_keys_of_a_pair_and_files_of_every_pair(tmp_path):
         true = np.load(tmp_path / "flow" / f"{k}.npy")
         known = pair.flow_confidence > 0
         np.testing.assert_allclose(pair.flow[known], true[known], atol=1e-5)
-        assert told["sizes"]["superpixels"] == pytest.approx(20, rel=0.3)
+        assert told["sizes"]["superpixels"] == pytest.approx(12, rel=0.3)
     assert (tmp_path / "out" / "pairs" / "000_001" / "log.txt").is_file()
     assert not (tmp_path / "out" / "pairs" / "000_001" / "report.html").exists()
     (tmp_path / "flow" / "1.npy").unlink()
