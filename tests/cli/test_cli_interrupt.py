@@ -61,8 +61,7 @@ def ctrl_c(times: int = 1, number: int = signal.SIGINT) -> None:
 
 
 @pytest.mark.parametrize(
-    ("owner", "stage"),
-    [(SceneInput, "load"), (FlowOptions, "load"), (cases, "build_segmentation")],
+    ("owner", "stage"), [(SceneInput, "load"), (FlowOptions, "load"), (cases, "build_segmentation")]
 )
 def test_before_a_start_it_ends_at_once(owner, stage, tmp_path, monkeypatch, capfd):
     """Also where a library turns the interrupt into another error."""

@@ -314,8 +314,7 @@ def test_real_pairs(shared_data: Path) -> None:
     pair = load("kitti2012", shared_data / "kitti2012", index="27")
     depth = pair.truth.depth_ref
     disparity = read_depth_png16(
-        shared_data / "kitti2012" / "training" / "disp_occ" / "000027_10.png",
-        KITTI_DISPARITY,
+        shared_data / "kitti2012" / "training" / "disp_occ" / "000027_10.png", KITTI_DISPARITY
     )
     finite = np.isfinite(disparity)
     np.testing.assert_array_equal(np.isfinite(depth), finite)

@@ -101,8 +101,7 @@ def test_a_plausible_focal_length_of_exif_is_taken(
 
 
 @pytest.mark.parametrize(
-    ("name", "tags"),
-    [("a.tif", {50706: 1}), ("a.NEF", {}), ("a.tiff", {254: 1}), ("a.hdr", {})],
+    ("name", "tags"), [("a.tif", {50706: 1}), ("a.NEF", {}), ("a.tiff", {254: 1}), ("a.hdr", {})]
 )
 def test_a_raw_photo_is_refused(name: str, tags: dict[int, int], tmp_path: Path) -> None:
     path = tmp_path / name

@@ -25,10 +25,7 @@ from soup_nlp.storage.versions import code_version, versions
 def tree():
     rng = np.random.default_rng(0)
     return {
-        "soup": {
-            "R": rng.normal(size=(5, 3, 3)),
-            "inner": {"ok": np.array([True, False])},
-        },
+        "soup": {"R": rng.normal(size=(5, 3, 3)), "inner": {"ok": np.array([True, False])}},
         "depth": rng.normal(size=(100, 200)).astype(np.float32),
         "labels": np.arange(4, dtype=np.int32),
         "energy": 1.5,
