@@ -24,21 +24,17 @@ from soup_nlp.storage.folders import SUMS, Sums, digest_of, files_in, write_sums
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def pair() -> Pair:
-    return render_scene("street", 0, 128, 96)
-
-
 SMALL = {"segmentation": {"superpixels": 25, "neighbours": 4}, "flow": {"source": "truth"}}
-SHORT = {"presolve_iterations": 0, "max_iter": 10}
 EXACT = {"segmentation": {"superpixels": 20, "neighbours": 8}, "refine": {"enabled": False}}
 
 
 @pytest.fixture(scope="module")
-def solved(pair, tmp_path_factory) -> Path:
+def solved(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("solved") / "out"
-    options = {"solver": {"presolve_eps": [0.3, 0.03]}, "refine": {"rounds": 1, "particles": 8}}
-    run = solve_pair(pair, **SMALL, **options)
+    # without the presolve there is no other answer than Ipopt's, which need not converge
+    short = {"presolve_iterations": 0, "max_iter": 10}
+    options = {"solver": short, "refine": {"rounds": 1, "particles": 8}}
+    run = solve_pair(render_scene("street", 0, 128, 96), **SMALL, **options)
     write_folder(prepare_folder(out), run, "a log\n", formats=["npy"])
     return out
 
@@ -155,12 +151,7 @@ def test_a_term_that_a_result_does_not_have_is_absent(folder):
     assert not {name for name in found if name.startswith("energy")}
 
 
-def test_the_delivered_answer_is_ipopt_s(pair, tmp_path):
-    # without the presolve there is no other answer, whatever the rounding; it need not converge
-    run = solve_pair(pair, **SMALL, refine={"enabled": False}, solver=SHORT)
-    folder = tmp_path / "out"
-    write_folder(prepare_folder(folder), run, "a log\n")
-    assert "nlp is Ipopt's answer" not in bad(check_folder(folder))
+def test_the_delivered_answer_is_ipopt_s(folder):
     with h5py.File(folder / "result.h5", "a") as file:
         assert file.attrs["name"] == b"pair"
         file["answer/n"][0] = file["answer/n"][1]
