@@ -1,5 +1,6 @@
 """Useless numbers, and odd values of every option."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,18 +14,14 @@ from soup_nlp.config.problem import Problem
 from soup_nlp.schema.section import Section
 
 
-def numeric_fields(model: type[Section], prefix: str = "") -> Iterator[tuple[str, bool]]:
-    """Names of options that are numbers, and whether they are whole."""
+def fields(model: type[Section], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Names of the keys of a problem file with their types; those of sections are empty."""
     for key, info in model.model_fields.items():
         kind = info.annotation
-        if prefix == "" and key == "input":
-            continue
-        if isinstance(kind, type) and issubclass(kind, Section):
-            yield from numeric_fields(kind, f"{prefix}{key}.")
-        elif "float" in str(kind):
-            yield f"{prefix}{key}", False
-        elif "int" in str(kind):
-            yield f"{prefix}{key}", True
+        section = isinstance(kind, type) and issubclass(kind, Section)
+        yield f"{prefix}{key}", "" if section else str(kind)
+        if section:
+            yield from fields(kind, f"{prefix}{key}.")
 
 
 WITH = {
@@ -42,7 +39,10 @@ NUMBERS = {
 
 
 def number_cases() -> Iterator[Case]:
-    for name, whole in numeric_fields(Problem):
+    for name, kind in fields(Problem):
+        if name == "input" or not re.search("float|int", kind):
+            continue
+        whole = "float" not in kind
         settings = next((text for begin, text in WITH.items() if name.startswith(begin)), "")
         values = (LARGE, "1000000000", "-1") if whole else ("1e300", "1e9", "1e-300", "-1", ".nan")
         form = {"solver.presolve_eps": "[{}]", "solver.ipopt": "{{tol: {}}}"}.get(name, "{}")
