@@ -17,10 +17,7 @@ DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [*DOCS, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 LINK = re.compile(r"!?\[([^\]]*)\]\(([^)\s]+)\)")
 NAME = re.compile(r"`([A-Za-z_][\w.]*)`")
-
-
-def ids(path: Path) -> str:
-    return path.name
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
 @cache
@@ -50,7 +47,7 @@ def definitions(path: Path) -> set[str]:
     return out
 
 
-@pytest.mark.parametrize("page", PAGES, ids=ids)
+@every_page
 def test_links_lead_to_files_headings_and_names(page):
     text = page.read_text(encoding="utf-8")
     for label, link in LINK.findall(text):
@@ -78,7 +75,7 @@ def test_the_keys_of_options_are_few():
 SECTIONS = "segmentation|flow|start|energy|formulation|solver|refine|expected|output"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=ids)
+@every_page
 def test_files_keys_and_commands_that_are_named_exist(page):
     text = page.read_text(encoding="utf-8")
     prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)

@@ -5,7 +5,6 @@ import struct
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -83,9 +82,7 @@ def test_malformed_exif_is_a_warning(data: bytes, kind: str, folder: Path) -> No
         ({"FocalLength": 5.0}, 1.2, "1.2 times the longer side.*--fov"),
     ],
 )
-def test_a_plausible_focal_length_of_exif_is_taken(
-    tags: dict[str, Any], focal: float, word: str, tmp_path: Path
-) -> None:
+def test_a_plausible_focal_length_of_exif_is_taken(tags, focal, word, tmp_path: Path) -> None:
     for name in "ab":
         photo(tmp_path / f"{name}.jpg", **tags)
     pair, text = said(tmp_path, "a.jpg", "b.jpg")
@@ -133,9 +130,7 @@ def test_the_first_of_several_pages_is_used(kind: str, tmp_path: Path) -> None:
         ("c.tif", {"compression": "jpeg"}),
     ],
 )
-def test_a_picture_damaged_inside_gives_a_warning(
-    name: str, options: dict[str, Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_picture_damaged_inside_gives_a_warning(name, options, tmp_path: Path, capfd) -> None:
     path = tmp_path / name
     Image.fromarray(texture(320, 240)).save(path, **options)
     read_image(path)  # gives no warning
@@ -242,7 +237,7 @@ def test_each_frame_has_its_own_camera(tmp_path: Path) -> None:
     ],
 )
 def test_implausible_intrinsics_name_their_cause(
-    camera: tuple[float, ...], outside: bool, cause: str, fits: str, folder: Path
+    camera, outside, cause, fits, folder: Path
 ) -> None:
     if outside:
         with pytest.raises(DataError, match="principal point is outside") as caught:

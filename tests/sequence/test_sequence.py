@@ -98,9 +98,9 @@ START_ALONE = sets("refine.enabled=false solver.presolve_iterations=0 solver.max
 def test_duplicate_frames_are_bridged(order, workers, tmp_path, capfd):
     """A recording that starts and pauses at rest, or rests all the time; one that warns."""
     for k, frame in enumerate(order):
-        deep = np.uint16(render_scene("orbit", 0, 128, 86, frame).image_ref) * 16
+        deep = np.uint16(render_scene("orbit", 0, 96, 64, frame).image_ref) * 16
         cv2.imwrite(str(tmp_path / f"{k}.png"), deep)
-    np.savetxt(tmp_path / "K.txt", render_scene("orbit", 0, 128, 86).K_ref)
+    np.savetxt(tmp_path / "K.txt", render_scene("orbit", 0, 96, 64).K_ref)
     call = ["chain", str(tmp_path), "-o", str(tmp_path / "out"), "-q", "--workers", str(workers)]
     code = main([*call, "--superpixels", "16", "--neighbours", "5", *START_ALONE])
     told = json.loads((tmp_path / "out" / "chain.json").read_text())

@@ -45,10 +45,7 @@ def test_h5_round_trip(tmp_path):
     back = read_h5(path)
     assert set(back) == set(source)
     for name in ("soup/R", "soup/inner/ok", "depth", "labels", "none"):
-        want = source
-        for key in name.split("/"):
-            want = want[key]
-        got = require(back, name)
+        want, got = require(source, name), require(back, name)
         np.testing.assert_array_equal(got, want)
         assert got.dtype == want.dtype
     assert float(require(back, "energy")) == 1.5
