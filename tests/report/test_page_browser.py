@@ -26,9 +26,13 @@ BACKGROUND = (0x20, 0x26, 0x2E)
 
 
 @pytest.fixture(scope="module")
-def opened(small_run, tmp_path_factory):
+def shown(small_run):
+    return result_of(small_run, {**summary(small_run), "verdict": ["verdict"]})
+
+
+@pytest.fixture(scope="module")
+def opened(shown, tmp_path_factory):
     """The page of a run, once it is ready."""
-    shown = result_of(small_run, {**summary(small_run), "verdict": ["verdict"]})
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(page(Chain.of(shown)), encoding="utf-8")
     assert CHROMIUM is not None
@@ -126,7 +130,7 @@ def test_every_mode_has_its_own_colours_and_legend(browser):
         assert apart(images[a], images[b]) > 0.01, (a, b)
 
 
-def test_a_click_tells_depth_sigma_and_component(browser, small_run):
+def test_a_click_tells_depth_sigma_and_component(browser, small_run, shown):
     width = small_run.pair.size[1]
     # the middle of the view is the principal point
     u, v = (round(x) for x in small_run.pair.K_ref[:2, 2])
@@ -138,7 +142,6 @@ def test_a_click_tells_depth_sigma_and_component(browser, small_run):
     assert abs(found // width - v) <= 2
     browser.value(f"soupView.tell({found})")
     said = browser.value("document.getElementById('picked').textContent")
-    shown = result_of(small_run, summary(small_run))
     z = shown.metre * small_run.reconstruction.depth_ref[found // width, found % width]
     assert f"depth {z:.4g}"[:9] in said
     assert "sigma" in said
@@ -148,20 +151,18 @@ def test_a_click_tells_depth_sigma_and_component(browser, small_run):
 
 
 @pytest.mark.parametrize("points", [False, True])
-def test_what_is_shown_is_saved_for_other_viewers(browser, small_run, tmp_path, points):
+def test_what_is_shown_is_saved_for_other_viewers(browser, small_run, shown, tmp_path, points):
     browser.value("soupView.setTime(1)")
-    if points:
-        browser.value("document.getElementById('points').click()")
+    turn = "document.getElementById('points').click()" if points else "null"
+    browser.value(turn)
     text = browser.value(
         "soupView.glb().arrayBuffer().then((b) => btoa([...new Uint8Array(b)]"
         ".map((c) => String.fromCharCode(c)).join('')))"
     )
-    if points:
-        browser.value("document.getElementById('points').click()")
+    browser.value(turn)
     (tmp_path / "a.glb").write_bytes(base64.b64decode(text))
     (found,) = trimesh.load(tmp_path / "a.glb").geometry.values()
     assert isinstance(found, trimesh.PointCloud if points else trimesh.Trimesh)
-    shown = result_of(small_run, summary(small_run))
     own = shown.metre * small_run.reconstruction.points_ref.reshape(-1, 3)
     assert len(found.vertices) > 0.5 * len(own)
     # the scene at time 1 in the reference camera's axes, y up
