@@ -115,22 +115,22 @@ def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
         return Labelling.of(flow, motions[:1], 0 * rows, LEAST_SHARED)
     groups: list[tuple[Mask, list[Motion]]]
     groups = [((surface == c) & seen, []) for c in _largest(surface[seen], PROPOSAL_SURFACES)]
-    noise = limited_noise(flow.residual[seen])
-    motions = motions + _proposed(flow, groups, motions[0], noise)
-    for left in reversed(range(PROPOSAL_ROUNDS + 1)):
+    main, noise = motions[0], limited_noise(flow.residual[seen])
+    for _ in range(PROPOSAL_ROUNDS + 1):
+        for mask, own in groups:
+            if mask.sum() >= PIECE_SIZE:
+                motions = motions + candidates(flow, np.flatnonzero(mask), main, own, noise)
         error = views.fit(motions).penalised() - flow.residual[:, None]
         excess = np.maximum(error, 0.0)
         shared = max(LEAST_SHARED, IN_NOISE * float(np.median(excess.min(axis=1)[seen])))
         cost = views.weight.mean(axis=1)[:, None] * _cost(excess, shared)
         used, label = _paying(flow, cost)
         motions, cost = [motions[c] for c in used], cost[:, used]
-        if left:
-            bad = seen & (cost[rows, label] > UNEXPLAINED)
-            piece = connected_pieces(bad, flow.seg)
-            groups = [((label == c) & seen, [m]) for c, m in enumerate(motions)]
-            groups += [(piece == c, []) for c in _largest(piece[bad], PROPOSAL_PIECES)]
-            main = motions[int(np.argmax(np.bincount(label[seen], minlength=len(motions))))]
-            motions = motions + _proposed(flow, groups, main, shared / IN_NOISE)
+        bad = seen & (cost[rows, label] > UNEXPLAINED)
+        piece = connected_pieces(bad, flow.seg)
+        groups = [((label == c) & seen, [m]) for c, m in enumerate(motions)]
+        groups += [(piece == c, []) for c in _largest(piece[bad], PROPOSAL_PIECES)]
+        main, noise = motions[np.argmax(np.bincount(label[seen]))], shared / IN_NOISE
     label = belonging(flow.seg, label, seen)
     cost = np.where(seen[:, None], cost, 0.0)
     first = int(np.argmax(np.bincount(label)))
@@ -157,14 +157,6 @@ def _cost(excess: Float, shared: float) -> Float:
 def dominant(flow: FlowFit) -> Motion:
     """The motion that most of the image shares."""
     return estimate(flow.views.matches().confident(4 * MOTION_PIXELS)) or SIDEWAYS
-
-
-def _proposed(
-    flow: FlowFit, groups: list[tuple[Mask, list[Motion]]], main: Motion, scale: float
-) -> list[Motion]:
-    """Candidates for groups (N,) of superpixels that are large enough, each with its motions."""
-    large = [(np.flatnonzero(mask), own) for mask, own in groups if mask.sum() >= PIECE_SIZE]
-    return [m for at, own in large for m in candidates(flow, at, main, own, scale)]
 
 
 def candidates(
