@@ -15,7 +15,7 @@ from soup_nlp.data.formats.images import warn
 from soup_nlp.data.pair import Flow, Pair
 from soup_nlp.errors import ModelError
 from soup_nlp.evaluation.evidence import Evidence, evidence
-from soup_nlp.evaluation.information import Marginals, information, marginals, spread_in_image
+from soup_nlp.evaluation.information import information, marginals, spread_in_image
 from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.geometry.surface import hidden
 from soup_nlp.model.energy_data import EnergyData
@@ -66,7 +66,7 @@ class Confidence:
     Attributes:
         sigma: (H, W) standard deviation of log depth, the global scale left out.
         spread: (H, W) standard deviation of log depth by the marginals, not calibrated.
-        marginals: Marginal variances of the planes and of the components' scales.
+        plane: (N, 3, 3) marginal covariance of relative inverse depth and slopes.
         component_sigma: (C,) standard deviation of the components' log scale.
         evidence: Evidence of the flow for the camera.
         terms: (H, W) terms of sigma by name, without their factors, see `terms`.
@@ -75,7 +75,7 @@ class Confidence:
 
     sigma: Float
     spread: Float
-    marginals: Marginals
+    plane: Float
     component_sigma: Float
     evidence: Evidence
     terms: Mapping[str, Float]
@@ -154,14 +154,8 @@ def terms(
     * drawn: 1 where nothing tells the depth: the camera rests or only turns, something stands still
       in the image, or a surface is taken to bend although its flow jumps (`Start.unexplained`).
 
-    Args:
-        rec: The answer.
-        flow: The flow of the solve.
-        start: Components and noise.
-        anchor_ray: (N, 3) rays through the anchors.
-        spread: (H, W) standard deviation of log depth by the marginals.
-        component: (C,) standard deviation of the components' mean log depth by the marginals.
-        sure: Evidence of the flow for the camera.
+    By the marginals are the standard deviations of log depth, `spread` (H, W), and of the mean log
+    depth of a `component` (C,). The anchors have rays (N, 3).
     """
     labels, noise, part = rec.labels, start.noise, start.component
     at = labels.ravel()
@@ -192,14 +186,8 @@ def kinds(rec: Reconstruction, flow: Flow, start: Start, drawn: Mask, given: Mas
 
     Measured: by parallax, in the static scene. Inferred: from a contact or an order (what moves by
     itself), from a surface that is continued where no flow can be used or nothing is seen of it in
-    the next frame, from how a surface bends, or from a given depth. Drawn: nothing tells it.
-
-    Args:
-        rec: The answer.
-        flow: The flow of the solve.
-        start: Components, and what bends or takes its depth from neighbours.
-        drawn: (H, W) True where nothing tells the depth.
-        given: (N,) True where a given depth decides.
+    the next frame, from how a surface bends, or from a given depth, which decides where `given`
+    (N,) is True. Drawn: nothing tells it, True in `drawn` (H, W).
     """
     by_others = (start.component != SCENE) | start.bends | start.interpolated | given
     inferred = by_others[rec.labels] | (flow.confidence <= 0) | hidden(rec)
@@ -215,37 +203,26 @@ def confidence(
     form: FormulationOptions,
     given_depth: GivenDepth | None = None,
 ) -> Confidence:
-    """The uncertainty of the depth of an answer.
+    """The uncertainty of the depth of an answer on a pair with the flow of its solve.
 
-    The information of a depth prior is added to that of `sigma_of`.
-
-    Args:
-        rec: The answer.
-        pair: Intrinsics, and the flow of the solve.
-        start: Rigid components and the flow's noise.
-        data: Pixels, graphs and weights of the pair.
-        weights: Constants of the energy.
-        form: Visibility.
-        given_depth: A depth prior, a measurement with its own error.
+    The information of a depth prior, a measurement with its own error, is added to that of
+    `sigma_of`.
     """
     assert pair.flow is not None
     labels = rec.labels
     found = weights.replace(prior=PRIOR_SHARE * weights.prior, depth=0.0, order=0.0)
     try:
         info = information(rec.soup, data, found, form)
-        variances = marginals(info, np.bincount(labels.ravel()), start.component)
-        spread = spread_in_image(info, variances.plane, labels, pair.K_ref)
+        plane, variance = marginals(info, np.bincount(labels.ravel()), start.component)
+        spread = spread_in_image(info, plane, labels, pair.K_ref)
     except (ModelError, ArithmeticError) as error:
         # a foreign solver may return an answer without finite information
         warn("sigma", f"no uncertainty can be computed, all depth counts as drawn: {error}")
-        variances = Marginals(
-            np.full((len(rec.soup), 3, 3), np.inf),
-            np.full(int(start.component.max()) + 1, np.inf),
-        )
-        spread = np.full(labels.shape, np.inf)
+        shapes = (len(rec.soup), 3, 3), int(start.component.max()) + 1, labels.shape
+        plane, variance, spread = (np.full(shape, np.inf) for shape in shapes)
     rigid = ~start.bends & (start.origin != FIXED) & (not start.at_rest)
     sure = evidence(rec.soup, data, start.component, pair.focal_sigma, rigid)
-    component = np.sqrt(variances.component)
+    component = np.sqrt(variance)
     known = terms(rec, pair.flow, start, data.anchor_ray, spread, component, sure)
     sigma = sigma_of(known)
     given = np.zeros(len(rec.soup), bool)
@@ -259,4 +236,4 @@ def confidence(
     # what is as uncertain as a drawing is one
     nothing = ((known["drawn"] > 0) & ~given[labels]) | (sigma >= FACTORS["drawn"])
     kind = kinds(rec, pair.flow, start, nothing, given)
-    return Confidence(sigma, spread, variances, with_prior(component), sure, known, kind)
+    return Confidence(sigma, spread, plane, with_prior(component), sure, known, kind)

@@ -50,19 +50,9 @@ class Information:
 
 
 def information(
-    soup: Soup,
-    data: EnergyData,
-    weights: Weights,
-    form: FormulationOptions,
+    soup: Soup, data: EnergyData, weights: Weights, form: FormulationOptions
 ) -> Information:
-    """The information of the energy at a soup.
-
-    Args:
-        soup: The answer.
-        data: Pixels, graphs and weights of the pair.
-        weights: Constants of the energy.
-        form: Visibility; constraints carry no information.
-    """
+    """The information of the energy at a soup; constraints carry none."""
     whole = majorant(Formulation(**dict(form)))
     nlp, layout = build_tangent_nlp(soup, data, weights, whole, "inverse-depth")
     x, theta = nlp.x0, nlp.thetas(eps=SMOOTHING, eps_pixel=SMOOTHING)
@@ -72,26 +62,14 @@ def information(
     return Information(matrix, growth.ravel(), plane, layout)
 
 
-@dataclass(frozen=True, eq=False)
-class Marginals:
-    """Marginal covariances of the planes, the global scale left out.
-
-    Attributes:
-        plane: (N, 3, 3) covariance of a superpixel's relative inverse depth and slopes.
-        component: (C,) variance of the mean log depth of every component.
-    """
-
-    plane: Float
-    component: Float
-
-
-def marginals(info: Information, sizes: Int, component: Int) -> Marginals:
+def marginals(info: Information, sizes: Int, component: Int) -> tuple[Float, Float]:
     """Marginal covariances with the mean log depth of all pixels fixed.
 
-    Args:
-        info: Information at the soup.
-        sizes: (N,) pixels of every superpixel.
-        component: (N,) rigid component of every superpixel, 0 to C - 1.
+    The superpixels have `sizes` (N,) in pixels, and belong to a `component` (N,) from 0 to C - 1.
+
+    Returns:
+        (N, 3, 3) covariance of a superpixel's relative inverse depth and slopes, and (C,) variance
+        of the mean log depth of every component.
 
     Raises:
         ArithmeticError: the information is no positive semidefinite matrix.
@@ -118,7 +96,7 @@ def marginals(info: Information, sizes: Int, component: Int) -> Marginals:
     solved = solver.solve(rows)
     along = g @ rows
     spread = np.einsum("xc,xc->c", rows, solved) - 2 * along * (h @ rows) + along**2 * (mean @ h)
-    return Marginals(plane, np.maximum(spread, 0.0))
+    return plane, np.maximum(spread, 0.0)
 
 
 def _mean_log_depth(info: Information, sizes: Int, component: Int) -> Float:
@@ -131,14 +109,8 @@ def _mean_log_depth(info: Information, sizes: Int, component: Int) -> Float:
 
 
 def spread_in_image(info: Information, plane: Float, labels: Labels, K_ref: Float) -> Float:
-    """(H, W) standard deviation of log depth of every pixel, by the marginals.
-
-    Args:
-        info: Information with the planes.
-        plane: (N, 3, 3) marginal covariances.
-        labels: (H, W) superpixel of every pixel.
-        K_ref: (3, 3) intrinsics of the reference frame.
-    """
+    """(H, W) standard deviation of log depth of every pixel, by marginal covariances of the planes
+    (N, 3, 3)."""
     ray = rays(K_ref, pixel_grid(*labels.shape))[..., :2]
     layout = info.layout
     off = (ray - layout.anchor[labels][..., :2]) / layout.radius[labels][..., None]
@@ -158,26 +130,25 @@ class BlockCholesky:
     """Factorisation of a sparse symmetric positive semidefinite matrix of equal blocks."""
 
     def __init__(self, matrix: sparse.csr_matrix, position: Float) -> None:
-        """Factorise.
-
-        Args:
-            matrix: (N B, N B), both triangles. A row with a zero on the diagonal is an error.
-            position: (N, 2) positions of the blocks, for the layers.
+        """Factorise a matrix (N B, N B) with both triangles; `layers` need positions (N, 2).
 
         Raises:
-            ArithmeticError: The matrix is not positive definite, even with `RIDGE`.
+            ArithmeticError: The matrix is not positive definite, even with `RIDGE`, or has a zero
+                on its diagonal.
         """
-        self.block = matrix.shape[0] // len(position)
+        self.block = size = matrix.shape[0] // len(position)
         diagonal = matrix.diagonal()
         if not (diagonal > 0).all():
             raise ArithmeticError("a diagonal entry is not positive")
         self._scale = 1.0 / np.sqrt(diagonal)
         scaling = sparse.diags(self._scale)
         scaled = (scaling @ matrix @ scaling + RIDGE * sparse.eye(len(diagonal))).tocsr()
+        blocks = matrix.tobsr((size, size))
+        ones = np.ones(len(blocks.indices), bool)
+        coupled = sparse.csr_matrix((ones, blocks.indices, blocks.indptr))
         # variables of every layer, its factor F, and F^-1 times its coupling to the next layer
         self._layers = [
-            (self.block * layer[:, None] + np.arange(self.block)).ravel()
-            for layer in layers(_coupled(matrix, self.block), position)
+            (size * layer[:, None] + np.arange(size)).ravel() for layer in layers(coupled, position)
         ]
         self._factors: list[tuple[Float, bool]] = []
         self._coupling: list[Float] = []
@@ -225,21 +196,11 @@ class BlockCholesky:
         return out
 
 
-def _coupled(matrix: sparse.csr_matrix, block: int) -> sparse.csr_matrix:
-    """(N, N) pattern of the blocks of a matrix."""
-    blocks = matrix.tobsr((block, block))
-    ones = np.ones(len(blocks.indices), bool)
-    return sparse.csr_matrix((ones, blocks.indices, blocks.indptr))
-
-
 def layers(coupled: sparse.csr_matrix, position: Float) -> list[Int]:
     """Sets of superpixels, each coupled to the set before it and the one after it alone.
 
-    They are the numbers of steps in the graph from the superpixels at one end of the image.
-
-    Args:
-        coupled: (N, N) symmetric pattern.
-        position: (N, 2) positions; layers run across the longer side.
+    They are the numbers of steps in the graph, a symmetric pattern (N, N), from the superpixels at
+    one end of the image; by their positions (N, 2), layers run across the longer side.
     """
     along = position[:, int(np.argmax(np.ptp(position, axis=0)))]
     # as many as stand in a column

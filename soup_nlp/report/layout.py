@@ -187,7 +187,7 @@ def result_tree(run: Run) -> ReadTree:
             "sigma_ref": rec.sigma_ref,
             "sigma_next": rec.sigma_next,
         },
-        "confidence": {**vars(sure), "plane": sure.marginals.plane},
+        "confidence": vars(sure),
         "components": {
             "of_superpixel": parts.of_superpixel,
             "motion": [c.motion.matrix for c in parts],
