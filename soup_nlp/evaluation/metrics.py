@@ -154,15 +154,14 @@ def depth_metrics(
     compared = true & np.isfinite(z) & (z > 0)
     coverage = np.count_nonzero(compared) / np.count_nonzero(true)
     z, gt = z[compared], gt[compared]
-    s, shift = _scale(z, gt, convention.scale) if z.size else float("nan"), 0.0
-    aligned = s * z
-    if convention.scale == "affine" and z.size:
-        s, shift = _affine(z, gt)
-        aligned = np.maximum(s * z + shift, gt.min())
+    s, shift = _scale_and_shift(z, gt, convention.scale) if z.size else (float("nan"), 0.0)
+    aligned = s * z + shift
+    if convention.scale == "affine":
+        aligned = np.maximum(aligned, gt.min(initial=np.inf))
     return DepthMetrics(
         **_errors(aligned, gt),
         scale_rule=convention.scale,
-        scale=float(s),
+        scale=s,
         cap=None if convention.cap is None else float(convention.cap),
         coverage=float(coverage),
         n_pixels=int(z.size),
@@ -188,28 +187,25 @@ def _errors(z: Float, gt: Float) -> dict[str, float]:
     }
 
 
-def _scale(z: Float, gt: Float, rule: Scale) -> float:
-    """Factor on z (M,) that a rule chooses for the truth gt (M,)."""
+def _scale_and_shift(z: Float, gt: Float, rule: Scale) -> tuple[float, float]:
+    """Factor on z (M,), and what is added then, that a rule chooses for the truth gt (M,)."""
+    unit = z.max()  # so that squares of tiny or huge depths stay in range
+    if rule == "affine":
+        centred = (z - z.mean()) / unit
+        spread = float(centred @ centred)
+        # rounding errors of a constant depth are no relief
+        s = float(centred @ gt) / spread / unit if np.ptp(z) > 1e-9 * unit else 0.0
+        return s, float(gt.mean() - s * z.mean())
+    s = 1.0
     if rule == "median":
-        return float(np.median(gt / z))
-    if rule == "mre":
+        s = np.median(gt / z)
+    elif rule == "mre":
         order = np.argsort(gt / z, kind="stable")
         total = np.cumsum((z / gt)[order])
-        return float((gt / z)[order][np.searchsorted(total, 0.5 * total[-1])])
-    if rule == "lsq":
-        unit = z / z.max()  # so that squares of tiny or huge depths stay in range
-        return float(np.dot(unit, gt) / np.dot(unit, unit) / z.max())
-    return 1.0
-
-
-def _affine(z: Float, gt: Float) -> tuple[float, float]:
-    """Scale and shift of z (M,) with the least squares of the truth gt (M,)."""
-    unit = z.max()  # so that squares of tiny or huge depths stay in range
-    centred = (z - z.mean()) / unit
-    spread = float(centred @ centred)
-    # rounding errors of a constant depth are no relief
-    s = float(centred @ gt) / spread / unit if np.ptp(z) > 1e-9 * unit else 0.0
-    return s, float(gt.mean() - s * z.mean())
+        s = (gt / z)[order][np.searchsorted(total, 0.5 * total[-1])]
+    elif rule == "lsq":
+        s = np.dot(z / unit, gt) / np.dot(z / unit, z / unit) / unit
+    return float(s), 0.0
 
 
 def skill(mre: float, mre_constant: float) -> float:
