@@ -44,21 +44,13 @@ class Evidence:
 
 
 def evidence(
-    soup: Soup,
-    data: EnergyData,
-    component: Int,
-    focal_sigma: float = 0.0,
-    rigid: Mask | None = None,
+    soup: Soup, data: EnergyData, component: Int, focal_sigma: float = 0, rigid: Mask | None = None
 ) -> Evidence:
-    """Evidence of the flow for the camera.
+    """Evidence of the flow for the camera, at an answer with rigid components (N,).
 
-    Args:
-        soup: The answer.
-        data: Sampled pixels with their flow.
-        component: (N,) rigid component of every superpixel.
-        focal_sigma: Standard deviation of the log focal length, 0 where it is given.
-        rigid: (N,) True where the flow is that of a moving camera and may show its errors; None
-            where none is sought.
+    `focal_sigma` is the standard deviation of the log focal length, 0 where it is given; `rigid`
+    (N,) is True where the flow is that of a moving camera and may show its errors, None where none
+    are sought.
     """
     valid = data.pixel_weight.sum(axis=1) > 0.25
     shown: dict[str, CameraError] = {}
