@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.epipolar import MOTION_STEP, Motion
 from soup_nlp.start.labelling import (
@@ -26,7 +27,7 @@ from soup_nlp.start.labelling import (
     candidates,
     dominant,
 )
-from soup_nlp.start.regions import connected_labels, connected_pieces, numbered
+from soup_nlp.start.regions import connected_pieces, numbered
 from soup_nlp.start.views import JUMP_PX, FlowFit, Views
 
 REFERENCE = 1000
@@ -94,15 +95,6 @@ def displaced(x: Float) -> Float:
     return np.concatenate([R, T], axis=-1)
 
 
-CLIP_PX = 3.0
-"""Limit of a superpixel's error where explanations are compared, pixels."""
-
-
-def trimmed_mean(error: Float) -> float:
-    """Mean error without the largest tenth, which a component may include by mistake."""
-    return float(np.mean(np.sort(error)[: max(1, int(np.ceil(0.9 * len(error))))]))
-
-
 def fit_robustly(
     matrix: Callable[[Float], Float], size: int, point: Float, target: Float, scale: Float
 ) -> tuple[Float, Float]:
@@ -153,7 +145,8 @@ def moving_pieces(flow: FlowFit) -> Int:
     """(N,) connected piece of what moves before a camera that turns at most; 0 is what the turn
     explains, and pieces with too few superpixels whose flow is usable."""
     still = fit_turn(flow.views)[1] < JUMP_PX
-    piece = connected_labels(~flow.seg.across(still) & (flow.jump < JUMP_PX), flow.seg)
+    continuous = ~flow.seg.across(still) & (flow.jump < JUMP_PX)
+    piece = connected(flow.seg.pairs[continuous], len(still))
     still |= np.bincount(piece, flow.views.usable)[piece] < PIECE_SIZE
     return numbered(np.where(still, -1, piece))
 
@@ -168,20 +161,17 @@ def joined(flow: FlowFit, surface: Int) -> Int:
 
     The smallest joins the neighbour with the longest common outline, until all are large enough.
     """
-    seg, count = flow.seg, len(surface)
     while True:
-        ends = np.sort(surface[seg.pairs], axis=1)
-        across = ends[:, 0] != ends[:, 1]
-        key, outline = np.unique(ends[across] @ [count, 1], return_inverse=True)
-        length = np.bincount(outline, seg.boundary_length[across].astype(float), len(key))
-        ends = np.stack(np.divmod(key, count), axis=1)
+        across = flow.seg.across(surface)
+        ends, length = surface[flow.seg.pairs[across]], flow.seg.boundary_length[across]
         size = np.bincount(surface, flow.views.usable)
-        small = np.unique(ends[size[ends] < LEAST_SURFACE * count])
+        small = np.unique(ends[size[ends] < LEAST_SURFACE * len(surface)])
         if not len(small):
             return surface
         c = small[np.argmin(size[small])]
-        a, b = ends[np.argmax(np.where((ends == c).any(axis=1), length, 0.0))]
-        surface = np.where(surface == c, a + b - c, surface)
+        beside = (ends == c).any(axis=1)
+        outline = np.bincount(ends[beside].sum(axis=1) - c, length[beside])
+        surface = np.where(surface == c, np.argmax(outline), surface)
 
 
 def constant_depth(views: Views, turn: Float | None = None) -> tuple[Soup, Float]:

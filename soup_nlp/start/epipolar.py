@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.pair import Pair
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import rays
@@ -81,14 +81,11 @@ class Matches(NamedTuple):
     weight: Float
     focal: float
 
-    def at(self, which: Int | Mask | slice) -> Matches:
-        """The correspondences with these indices."""
-        return Matches(self.ray[which], self.target[which], self.weight[which], self.focal)
-
     def confident(self, most: int) -> Matches:
         """Those with weight; evenly about `most` of them if there are more."""
         use = np.flatnonzero(self.weight > 0)
-        return self.at(use[:: max(1, len(use) // most)])
+        use = use[:: max(1, len(use) // most)]
+        return Matches(self.ray[use], self.target[use], self.weight[use], self.focal)
 
     def distance(self, motion: Motion) -> Float:
         """(M,) Sampson distance to a motion, pixels."""
@@ -198,7 +195,7 @@ def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
         )
         x = fit.x
         error = np.abs(residual(x))
-        near = error[error < max(3 * scale, LEAST_WIDTH)]
+        near = error[error < 3 * scale]
         noise = 1.5 * float(np.median(near)) if len(near) else scale
         if noise > 0.8 * scale:
             break
@@ -328,11 +325,8 @@ def most_probable(
 def relief_spread(motion: Motion, covariance: Float, ray: Float, target: Float) -> Float:
     """(M,) standard deviation of log depth by the error of a motion, a common scale left out.
 
-    Args:
-        motion: The motion.
-        covariance: (5, 5) covariance of the parameters of `around` it.
-        ray: (M, 3) rays of the reference frame.
-        target: (M, 3) points of the next frame to which they move.
+    The error has the `covariance` (5, 5) of the parameters of `around`. Rays (M, 3) move to the
+    points `target` (M, 3) of the next frame.
     """
     moved, steps = around(motion), MOTION_STEP * np.eye(5)
     target = target / target[:, 2:]

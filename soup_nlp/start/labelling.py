@@ -22,6 +22,7 @@ from typing import Self
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
+from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.plane import PlaneFit
 from soup_nlp.mrf.trws import solve_trws
 from soup_nlp.start.epipolar import (
@@ -33,7 +34,7 @@ from soup_nlp.start.epipolar import (
     most_probable,
     refine_near,
 )
-from soup_nlp.start.regions import belonging, connected_labels, connected_pieces
+from soup_nlp.start.regions import belonging, connected_pieces
 from soup_nlp.start.views import JUMP_PX, FlowFit
 
 LEAST_NOISE, MOST_NOISE = 0.05, 0.6
@@ -134,7 +135,7 @@ def labelled(flow: FlowFit, motions: list[Motion], surface: Int) -> Labelling:
     label = belonging(flow.seg, label, seen)
     cost = np.where(seen[:, None], cost, 0.0)
     first = int(np.argmax(np.bincount(label)))
-    piece = connected_labels(~flow.seg.across(label), flow.seg)
+    piece = connected(flow.seg.pairs[~flow.seg.across(label)], len(label))
     saved = np.bincount(piece, cost[:, first] - cost[rows, label])
     label = np.where(saved[piece] < price_of_motion(len(label)), first, label)
     return Labelling.of(flow, motions, label, shared)
@@ -249,8 +250,6 @@ component. From a third on it may confirm a prior."""
 LEAST_SCENE = 0.6
 """Least share of the superpixels that the camera's motion explains; below it, the
 still part may be the scene."""
-LEAST_STILL = 0.5
-"""Least share of still superpixels in a piece with continuous flow."""
 
 
 def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
@@ -259,7 +258,8 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
     A bonnet, a logo or dirt on the lens is fixed to the camera, or moves as it does, so that its
     flow shows neither depth nor the camera's motion. A distant region stands still as well, but its
     depth under the camera's motion explains that; the flow of a fixed region contradicts every
-    depth. Nothing is fixed between frames with different intrinsics.
+    depth. In a piece with continuous flow no more moves than stands still. Nothing is fixed between
+    frames with different intrinsics.
 
     Returns:
         The mask, and (N,) the mean displacement of every superpixel, pixels.
@@ -275,7 +275,7 @@ def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
         return none, shift
     may &= error - shift > LEAST_GAP_PX
     moves = ~usable | (error > LEAST_GAP_PX)
-    piece = connected_labels(moves[seg.pairs].all(axis=1) & (flow.jump < JUMP_PX), seg)
-    count, still_count = (np.bincount(piece, m, minlength=len(seg)) for m in (usable & moves, may))
-    mostly = (still_count >= PIECE_SIZE) & (still_count >= LEAST_STILL * count)
-    return may & mostly[piece], shift
+    inside = moves[seg.pairs].all(axis=1) & (flow.jump < JUMP_PX)
+    piece = connected(seg.pairs[inside], len(seg))
+    others, still = (np.bincount(piece, mask) for mask in (usable & moves & ~may, may))
+    return may & ((still >= PIECE_SIZE) & (still >= others))[piece], shift

@@ -20,7 +20,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment
-from soup_nlp.start.bending import CLIP_PX, displaced, fit_robustly, least_gap, trimmed_mean
+from soup_nlp.start.bending import displaced, fit_robustly, least_gap
 from soup_nlp.start.epipolar import LEAST_MATCHES, RELIEF, Motion, most_probable
 from soup_nlp.start.propose import Start
 from soup_nlp.start.regions import SCENE
@@ -38,6 +38,8 @@ that of one that the flow hardly confirms in a usual scene."""
 COMMON_NOISES, MOST_COMMON_PX = 1.5, 0.15
 """Error of the flow that is the same over large parts of the image, in units of its noise, and its
 limit in pixels: more noise than that averages out."""
+CLIP_PX = 3.0
+"""Limit of a superpixel's error where explanations are compared, pixels."""
 DEEPEST = 50.0
 """Largest depth relative to the median where an inverse depth has a shift."""
 COMPARED_SIDE = 320
@@ -134,8 +136,10 @@ class StartWithFlow(NamedTuple):
         point = np.column_stack([views.anchor[at], inverse / middle])
         scale = np.tile(views.focal, (len(at), 1))
         x, miss = fit_robustly(displaced, 7 if shifted else 6, point, target, scale)
-        error = trimmed_mean(np.minimum(np.linalg.norm(miss, axis=1), CLIP_PX))
-        return error, rotation.exp(x[:3]), x[3:6] / middle, middle * x[6]
+        error = np.sort(np.minimum(np.linalg.norm(miss, axis=1), CLIP_PX))
+        # a component may include the largest tenth by mistake
+        error = error[: int(np.ceil(0.9 * len(error)))]
+        return float(np.mean(error)), rotation.exp(x[:3]), x[3:6] / middle, middle * x[6]
 
     def relief(self, c: int) -> float:
         """Error of the flow of a component at one depth, above the noise, pixels."""

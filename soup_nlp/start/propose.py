@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from soup_nlp.arrays import Float, Int, Mask
-from soup_nlp.geometry.graph import Segmentation
+from soup_nlp.geometry.graph import Segmentation, connected
 from soup_nlp.geometry.plane import about_anchor, at_anchor, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.start.bending import (
@@ -37,7 +37,6 @@ from soup_nlp.start.labelling import (
 from soup_nlp.start.regions import (
     ORIGINS,
     SCENE,
-    connected_labels,
     connected_pieces,
     continued,
     numbered,
@@ -178,7 +177,7 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     contrast = np.zeros(len(seg.pairs)) if contrast is None else contrast
     fixed, shift = fixed_to_camera(flow)
     flow = flow.without(fixed)
-    surface = connected_labels(flow.jump < JUMP_PX, seg)
+    surface = connected(seg.pairs[flow.jump < JUMP_PX], len(seg))
     motions, bends = surface_motions(flow, surface)
     bends &= o.bending
     jumping = discontinuous(flow, surface, bends)

@@ -24,13 +24,8 @@ from soup_nlp.start.views import JUMP_PX, FlowFit
 
 def connected_pieces(mask: Mask, seg: Segmentation) -> Int:
     """(N,) connected component of every superpixel of a mask (N,), -1 outside."""
-    inside = np.asarray(mask[seg.pairs].all(axis=1))
-    return np.where(mask, connected_labels(inside, seg), -1)
-
-
-def connected_labels(hold: Mask, seg: Segmentation) -> Int:
-    """(N,) connected component of every superpixel, joined by the pairs that `hold` (P,) marks."""
-    return connected(seg.pairs[hold], len(seg))
+    inside = mask[seg.pairs].all(axis=1)
+    return np.where(mask, connected(seg.pairs[inside], len(seg)), -1)
 
 
 def numbered(label: Int) -> Int:

@@ -17,6 +17,7 @@ from soup_nlp.config.problem import Problem, load_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluation.metrics import UNSCALED, depth_metrics
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model.energy_options import BENDING_ARAP
 from soup_nlp.pipeline.case import prepare, solver_options
@@ -33,7 +34,6 @@ from soup_nlp.start.bending import (
     turn_alone,
 )
 from soup_nlp.start.labelling import IN_NOISE, LEAST_NOISE, Labelling, dominant, labelled
-from soup_nlp.start.regions import connected_labels
 from soup_nlp.start.views import FlowFit
 
 pytestmark = pytest.mark.slow
@@ -191,7 +191,9 @@ def quiet_orbit(**changes: object) -> tuple[FlowFit, Labelling]:
     """The changed flow of a moving camera, with a noise of 0.02 px, and its labels."""
     c = case("orbit")
     flow = fit(c)._replace(residual=np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c))), **changes)
-    return flow, labelled(flow, [dominant(flow)], connected_labels(flow.jump < 1, flow.seg))
+    return flow, labelled(
+        flow, [dominant(flow)], connected(flow.seg.pairs[flow.jump < 1], len(flow.seg))
+    )
 
 
 def test_depth_that_explains_the_flow_is_no_turn():

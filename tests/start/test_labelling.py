@@ -9,12 +9,13 @@ from helpers_truth import majority
 
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.graph import connected
 from soup_nlp.mrf.trws import mrf_energy
 from soup_nlp.start import labelling
 from soup_nlp.start.epipolar import SIDEWAYS, Motion
 from soup_nlp.start.labelling import CHANGE_COST, MOST_COST, labelled, price_of_motion, smooth
 from soup_nlp.start.propose import propose
-from soup_nlp.start.regions import belonging, connected_labels, continued, harmonic, likeness
+from soup_nlp.start.regions import belonging, continued, harmonic, likeness
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def test_every_region_gets_one_motion(world, given):
     _, flow, component, (room, wedge) = world
     several = [turned(wedge, 0.4, 0), turned(wedge, -0.4, 1), turned(wedge, 0.4, 2)]
     motions = {"none": [SIDEWAYS], "room": [room], "three of the wedge": [room, *several]}[given]
-    found = labelled(flow, motions, connected_labels(flow.jump < 1, flow.seg))
+    found = labelled(flow, motions, connected(flow.seg.pairs[flow.jump < 1], len(flow.seg)))
     assert len(found.motions) == 2
     first = int(np.bincount(component[found.label == 0]).argmax())
     assert (found.label == (component != first)).mean() > 0.95
@@ -139,7 +140,9 @@ def test_what_is_not_seen_has_no_motion_of_its_own(world):
     uv = pair.flow.uv + np.where(np.isin(seg.labels, hidden)[..., None], 7.0, 0.0)
     confidence = np.where(np.isin(seg.labels, hidden), 0.0, 1.0)
     blind = fitted(pair.with_flow(Flow(uv.astype(np.float32), confidence, "test")), seg)
-    found = labelled(blind, [room, wedge], connected_labels(blind.jump < 1, blind.seg))
+    found = labelled(
+        blind, [room, wedge], connected(blind.seg.pairs[blind.jump < 1], len(blind.seg))
+    )
     assert len(found.motions) == 2
     assert len(np.unique(found.label[inner])) == 1
     start = propose(blind)
