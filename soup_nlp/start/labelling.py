@@ -220,13 +220,11 @@ def smooth(flow: FlowFit, cost: Float) -> Int:
 
 
 def with_least_relief(flow: FlowFit, choice: Labelling) -> tuple[Labelling, Float]:
-    """The labelling with the most probable motion of every rigid component (`most_probable`).
+    """The labelling with the most probable motion of every rigid component (`most_probable`), and
+    (M, 5, 5) covariances of its motions by the error that the flow of a component shares.
 
-    The error that the flow of a component shares follows from what its motion leaves unexplained,
-    across the epipolar lines: along them, depth would explain it. An exact flow leaves none.
-
-    Returns:
-        The labelling, and (M, 5, 5) covariances of its motions by that error.
+    That follows from what its motion leaves unexplained, across the epipolar lines: along them,
+    depth would explain it. An exact flow leaves none.
     """
     motions = list(choice.motions)
     covariance = np.tile(np.diag(MOTION_CHANGE**2), (len(motions), 1, 1))
@@ -253,16 +251,14 @@ still part may be the scene."""
 
 
 def fixed_to_camera(flow: FlowFit) -> tuple[Mask, Float]:
-    """(N,) True where the image stands still, which the camera's motion contradicts.
+    """(N,) True where the image stands still, which the camera's motion contradicts, and (N,) the
+    mean displacement of every superpixel, pixels.
 
     A bonnet, a logo or dirt on the lens is fixed to the camera, or moves as it does, so that its
     flow shows neither depth nor the camera's motion. A distant region stands still as well, but its
     depth under the camera's motion explains that; the flow of a fixed region contradicts every
     depth. In a piece with continuous flow no more moves than stands still. Nothing is fixed between
     frames with different intrinsics.
-
-    Returns:
-        The mask, and (N,) the mean displacement of every superpixel, pixels.
     """
     seg, views, usable = flow.seg, flow.views, flow.views.usable
     none, shift = np.zeros(len(seg), bool), views.distance(views.ray)
