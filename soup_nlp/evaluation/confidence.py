@@ -56,7 +56,10 @@ MIN_CONFIDENCE = 0.5
 MOST_SIGMA = (1 - MIN_CONFIDENCE) * NO_CONFIDENCE
 """The sigma of that confidence."""
 KINDS = ("measured", "inferred", "drawn")
-"""By what the depth of a pixel is known, see `kinds`."""
+"""By what the depth of a pixel is known. Measured: by parallax, in the static scene. Inferred: from
+a contact or an order (what moves by itself), from a surface that is continued where no flow can be
+used or nothing is seen of it in the next frame, from how a surface bends, or from a given depth.
+Drawn: nothing tells it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,13 +185,8 @@ def terms(
 
 
 def kinds(rec: Reconstruction, flow: Flow, start: Start, drawn: Mask, given: Mask) -> Image:
-    """(H, W) by what the depth of every pixel is known, an index of `KINDS`.
-
-    Measured: by parallax, in the static scene. Inferred: from a contact or an order (what moves by
-    itself), from a surface that is continued where no flow can be used or nothing is seen of it in
-    the next frame, from how a surface bends, or from a given depth, which decides where `given`
-    (N,) is True. Drawn: nothing tells it, True in `drawn` (H, W).
-    """
+    """(H, W) indices of `KINDS`; drawn (H, W) where nothing tells the depth, `given` (N,) where a
+    given one decides."""
     by_others = (start.component != SCENE) | start.bends | start.interpolated | given
     inferred = by_others[rec.labels] | (flow.confidence <= 0) | hidden(rec)
     return np.where(drawn, 2, inferred).astype(np.uint8)

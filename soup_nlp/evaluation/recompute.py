@@ -17,16 +17,8 @@ State = Mapping[str, Float]
 
 
 def lift(s: State, ray: Float, superpixel: Int) -> tuple[Float, Float]:
-    """Points in both frames of rays on the planes of superpixels.
-
-    Args:
-        s: State of a soup.
-        ray: (M, B, 3) rays.
-        superpixel: (M,) superpixel of each row.
-
-    Returns:
-        (M, B, 3) reference-frame and next-frame points.
-    """
+    """Points (M, B, 3) in both frames of rays (M, B, 3), each row on the plane of one of the
+    superpixels (M,)."""
     facing = -(s["n"][superpixel][:, None] * ray).sum(-1)
     X = ((s["lam"] * s["d"])[superpixel][:, None] / facing)[..., None] * ray
     T = (s["lam"][:, None] * s["t"])[superpixel]
@@ -125,11 +117,8 @@ def depth_map(s: State, labels: Int, K: Float) -> Float:
 def detail(s: State, labels: Int, given: Mapping[str, Any], used: Mask) -> Float:
     """(H, W) log depth relative to the planes of a soup by the flow of the pixels, equation 30.
 
-    Args:
-        s: State of the soup.
-        labels: (H, W) superpixels.
-        given: Flow, its confidence and intrinsics, as stored under "input".
-        used: (N,) superpixels with detail.
+    Flow, its confidence and intrinsics are `given` as stored under "input"; the superpixels with
+    detail are `used` (N,).
     """
     v, u = np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]]
     pixel = np.stack([u, v, np.ones_like(u)], -1)
@@ -157,13 +146,9 @@ def detail(s: State, labels: Int, given: Mapping[str, Any], used: Mask) -> Float
 
 
 def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float]:
-    """Depth errors after one global scale, by their names in summary.json.
+    """Errors of a depth z to the truth gt, both NaN where unknown, by their names in summary.json.
 
-    Args:
-        z: Estimated depth, NaN where unknown.
-        gt: True depth of the same shape, NaN where unknown.
-        rule: "median", "mre", "lsq" or "none".
-        cap: Truth beyond this depth is left out.
+    The one global scale follows from the rule: "median", "mre", "lsq" or "none".
     """
     true = np.isfinite(gt) & (gt > 0) & (gt <= (np.inf if cap is None else cap))
     compared = true & np.isfinite(z) & (z > 0)

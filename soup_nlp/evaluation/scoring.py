@@ -42,12 +42,8 @@ def score_depths(
 ) -> dict[str, DepthMetrics]:
     """Metrics of named depth maps, and of a constant depth, against dense or sparse truth.
 
-    Args:
-        truth: Dense `depth_ref`, or else sparse `points`; `depth_next` where it is known.
-        depths: (H, W) z of the reference frame by name.
-        convention: Rule of the one global scale of each depth map, and the pixels that count.
-        depth_next: (H', W') z of the next frame.
-        sigma: (H, W) uncertainty of the depth "solution".
+    The depths (H, W) are those of the reference frame, `depth_next` (H', W') is that of the next
+    one, and sigma (H, W) is the uncertainty of the depth "solution".
 
     Returns:
         Metrics by the same names, "constant", "solution_next" for the next frame, and the names of
