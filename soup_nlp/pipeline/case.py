@@ -28,7 +28,7 @@ from soup_nlp.start.given_depth import GivenDepth, by_prior
 from soup_nlp.start.prior_evidence import JUDGED_PIECES, LEAST_SIGMA, PriorEvidence, judged
 from soup_nlp.start.propose import Start, most_usual, propose
 from soup_nlp.start.regions import ORIGINS, TOO_FAST, covering
-from soup_nlp.start.views import FlowFit, SeededStart
+from soup_nlp.start.views import FlowFit
 from soup_nlp.storage.progress import Watch
 from soup_nlp.storage.system import require_memory
 
@@ -134,8 +134,8 @@ STARTS = 3
 def _flow_fit(problem: Problem, pair: Pair, seg: Segmentation, sample: int = 0) -> FlowFit:
     """The flow of a pair as affine maps, fitted to one of its samples."""
     assert pair.flow is not None
-    options = SeededStart(**dict(problem.start), seed=problem.seed ^ sample)
-    return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, options)
+    seen = pair.flow, pair.K_ref, pair.K_next
+    return FlowFit.of(seg, *seen, problem.start, problem.seed ^ sample)
 
 
 def _begun(problem: Problem, pair: Pair, seg: Segmentation) -> Begun:

@@ -60,8 +60,8 @@ class Rows(NamedTuple):
     origin: Int | int
 
 
-def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
-    """(C,) log scales of least cost, those `still` at 0, and (C,) the kind of row behind each.
+def minimum(count: int, parts: list[Rows]) -> tuple[Float, Int]:
+    """(C,) log scales of least cost, that of the scene 0, and (C,) the kind of row behind each.
 
     A row decides if it is exact at the minimum; among several the one of the largest weight.
     """
@@ -74,16 +74,17 @@ def minimum(count: int, parts: list[Rows], still: Int) -> tuple[Float, Int]:
         (np.concatenate([one, -one, -one, one]), (np.tile(each, 4), columns)), (m, count + 2 * m)
     )
     bounds = np.tile([-MOST_LOG_SCALE, MOST_LOG_SCALE], (count, 1))
-    bounds[still] = 0.0
+    bounds[SCENE] = 0.0
     slack = np.tile([0.0, np.inf], (2 * m, 1))
     cost = np.concatenate([np.zeros(count), up, down])
     x = linprog(cost, A_eq=A.tocsr(), b_eq=value, bounds=np.vstack([bounds, slack])).x[:count]
     exact = np.abs(x[a] - x[b] - value) < 1e-7
+    by_weight = np.flatnonzero(exact)[np.argsort((up + down)[exact], kind="stable")]
     origin = np.full(count, ORIGINS.index("nothing"))
-    for end in (b, a):
-        for row in np.flatnonzero(exact)[np.argsort((up + down)[exact], kind="stable")]:
-            origin[end[row]] = kind[row]
-    origin[still] = ORIGINS.index("reference")
+    # of values with the same index the last one, that of the largest weight, is kept
+    origin[b[by_weight]] = kind[by_weight]
+    origin[a[by_weight]] = kind[by_weight]
+    origin[SCENE] = ORIGINS.index("reference")
     return x, origin
 
 
@@ -165,13 +166,13 @@ def scaled(
     displacements could be compared. For the order (P,) see `Start.order`.
     """
     count = int(label.max()) + 1
-    if count == 1 or not len(flow.seg.pairs):
+    if count == 1:
         return np.ones(len(soup)), np.full(len(soup), ORIGINS.index("reference"))
     fixed = np.zeros(len(soup), bool) if fixed is None else fixed
     parts = [contact(flow, soup, label, fixed), before(flow, soup, label, order)]
     if floor is not None:
         parts += [displacement(flow, soup, label), above(flow, soup, label, floor)]
-    x, origin = minimum(count, parts, np.array([SCENE]))
+    x, origin = minimum(count, parts)
     origin = np.where(fixed, FIXED, origin[label])
     return np.exp(x)[label], origin
 
@@ -225,7 +226,7 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
     low = at[ray[at, 1] > np.quantile(ray[at, 1], 0.4)]
     if len(low) < 3:
         return none
-    three = np.random.default_rng(o.seed).choice(low, (GROUND_TRIALS, 3))
+    three = np.random.default_rng(flow.seed).choice(low, (GROUND_TRIALS, 3))
     three = three[np.abs(np.linalg.det(ray[three])) > 1e-6]
     planes = np.linalg.solve(ray[three], mu[three][..., None])[..., 0]
     planes = planes[planes[:, 1] > LEVEL * np.linalg.norm(planes, axis=1)]

@@ -15,7 +15,7 @@ from soup_nlp.geometry.graph import Segmentation
 from soup_nlp.geometry.plane import PlaneFit, about_anchor, fit_planes, normal_and_distance
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import sample_pixels
-from soup_nlp.schema.section import Section, Seed
+from soup_nlp.schema.section import Section
 from soup_nlp.start.epipolar import FITS, LEAST_MATCHES, Matches, Motion, stacked
 
 
@@ -33,12 +33,6 @@ class StartOptions(Section):
     ground: bool = True
     """Use the ground of an upright image, a level plane on which much of the scene lies: unreliable
     depths and components below it are lifted."""
-
-
-class SeededStart(StartOptions):
-    """StartOptions with the seed of sampling, which a problem has once."""
-
-    seed: Seed = 0
 
 
 SAMPLES = {"shared": 40, "homography": 100}
@@ -138,7 +132,8 @@ class FlowFit(NamedTuple):
         seg: Superpixels and graphs.
         K_ref: (3, 3) intrinsics of the reference frame.
         K_next: (3, 3) intrinsics of the next frame.
-        options: Options of the start, with the seed.
+        options: Options of the start.
+        seed: Seed of sampling.
         views: Rays, targets and confidence of every superpixel.
         poor: (N,) True where the views are a neighbour's, or do not count.
         fit: (N, 3, 2) affine flow, see `affine_flow`.
@@ -150,7 +145,8 @@ class FlowFit(NamedTuple):
     seg: Segmentation
     K_ref: Float
     K_next: Float
-    options: SeededStart
+    options: StartOptions
+    seed: int
     views: Views
     poor: Mask
     fit: Float
@@ -165,15 +161,15 @@ class FlowFit(NamedTuple):
         flow: Flow,
         K_ref: Float,
         K_next: Float,
-        options: SeededStart | None = None,
+        options: StartOptions,
+        seed: int = 0,
     ) -> FlowFit:
         """Sample and fit a flow with confidence.
 
         Raises:
             DataError: fewer than `LEAST_MATCHES` pixels have a usable flow.
         """
-        o = options or SeededStart()
-        index, filled = sample_pixels(seg.labels, flow, SAMPLES[o.method], o.seed)
+        index, filled = sample_pixels(seg.labels, flow, SAMPLES[options.method], seed)
         if filled.sum() < LEAST_MATCHES:
             raise DataError(
                 "too few pixels have a usable flow",
@@ -196,7 +192,8 @@ class FlowFit(NamedTuple):
         targets, focal = rays(K_next, uv + shift), np.diag(K_next)[:2]
         views = Views(rays(K_ref, uv), targets, weight, anchor, radius, focal)
         seen = np.bincount(seg.labels.ravel(), flow.confidence.ravel()) / seg.sizes
-        fitted = cls(seg, K_ref, K_next, o, views, poor, *affine_flow(views), seen, np.zeros(0))
+        given = seg, K_ref, K_next, options, seed, views, poor
+        fitted = cls(*given, *affine_flow(views), seen, np.zeros(0))
         edge = rays(K_ref, seg.boundary)
         first, second = (fitted.followed(which, edge) for which in seg.pairs.T)
         return fitted._replace(jump=np.linalg.norm(first - second, axis=-1).mean(axis=1))
@@ -249,12 +246,8 @@ QUADRATIC_PX = 0.1
 
 
 def affine_flow(views: Views) -> tuple[Float, Float]:
-    """Affine flow of every superpixel, fitted robustly.
-
-    Returns:
-        (N, 3, 2) maps from offsets in radii to targets in pixels, and (N,) their mean error in
-        pixels, which measures the flow's noise whether surfaces bend or not.
-    """
+    """Affine flow of every superpixel, fitted robustly: (N, 3, 2) maps from offsets in radii to
+    targets in pixels, and (N,) their mean error, pixels: noise, whether surfaces bend or not."""
     off = (views.ray - views.anchor[:, None])[..., :2] / views.radius[:, None, None]
     basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)
     target = views.target[..., :2] * views.focal

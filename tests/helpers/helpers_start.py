@@ -17,7 +17,7 @@ from soup_nlp.geometry import camera
 from soup_nlp.geometry.graph import Segmentation, build_segmentation
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.geometry.superpixels import segment, split_components
-from soup_nlp.start.views import FlowFit, SeededStart, Views
+from soup_nlp.start.views import FlowFit, StartOptions, Views
 
 Float = NDArray[np.float64]
 
@@ -90,9 +90,9 @@ def scene_problem(
     return make_problem({"input": source, **parts}, overrides)
 
 
-def fitted(pair: Pair, seg: Segmentation, **options: Any) -> FlowFit:
+def fitted(pair: Pair, seg: Segmentation, seed: int = 0, **options: Any) -> FlowFit:
     """The flow of a pair in superpixels, with options of the start."""
-    return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, SeededStart(**options))
+    return FlowFit.of(seg, pair.flow, pair.K_ref, pair.K_next, StartOptions(**options), seed)
 
 
 def flow_of(
@@ -109,5 +109,5 @@ def flow_of(
     anchor, none = camera.rays(K, seg.anchors), np.zeros(n)
     views = Views(anchor[:, None], anchor[:, None], weight, anchor, np.ones(n), np.ones(2))
     jump = np.broadcast_to(jump, len(seg.pairs))
-    affine, own = np.zeros((n, 3, 2)), SeededStart(**options)
-    return FlowFit(seg, K, K, own, views, none > 0, affine, none, weight[:, 0], jump)
+    affine, own = np.zeros((n, 3, 2)), StartOptions(**options)
+    return FlowFit(seg, K, K, own, 0, views, none > 0, affine, none, weight[:, 0], jump)

@@ -8,7 +8,7 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.geometry import camera, rotation
 from soup_nlp.start.propose import propose
 from soup_nlp.start.regions import FIXED
-from soup_nlp.start.views import FlowFit
+from soup_nlp.start.views import FlowFit, StartOptions
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +34,7 @@ def scene_flow(turn=TURN):
 
 
 def start_of(seg, flow):
-    return propose(FlowFit.of(seg, Flow(flow), K, K))
+    return propose(FlowFit.of(seg, Flow(flow), K, K, StartOptions()))
 
 
 @pytest.fixture(scope="module")

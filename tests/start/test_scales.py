@@ -51,7 +51,7 @@ def test_the_minimum_is_one():
     a, b = rng.integers(0, 4, (2, 40))
     value, up, down = rng.normal(size=40), rng.random(40), rng.random(40)
     r = Rows(a, b, value, up, down, ORIGINS.index("outline"))
-    x, origin = minimum(4, [r], np.array([0]))
+    x, origin = minimum(4, [r])
     assert x[0] == 0
     assert origin[0] == ORIGINS.index("reference")
     assert (origin[1:] == ORIGINS.index("outline")).all()

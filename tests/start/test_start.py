@@ -20,7 +20,7 @@ from soup_nlp.model import oracle
 from soup_nlp.model.energy_data import build_energy_data
 from soup_nlp.model.energy_options import Weights
 from soup_nlp.start.propose import Start, most_usual, propose
-from soup_nlp.start.views import FlowFit
+from soup_nlp.start.views import FlowFit, StartOptions
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +177,7 @@ def test_flow_that_is_wrong_in_parts(room, change, turn, depth, worst):
     else:
         uv = uv + rng.normal(0, 0.5, shape) if change == "noise" else rng.normal(0, 30, shape)
     flow = Flow(uv, confidence.astype(float), "test")
-    start = propose(FlowFit.of(seg, flow, CORNER_K, K_next))
+    start = propose(FlowFit.of(seg, flow, CORNER_K, K_next, StartOptions()))
     assert_usable(start, seg)
     e = compare(start, pair, seg, pure)
     assert np.median(e.rotation) < turn
@@ -295,7 +295,7 @@ def test_too_few_usable_pixels_are_an_error(room, usable):
     confidence = np.zeros(pair.size)
     confidence[70, 50 : 50 + usable] = 1
     with pytest.raises(DataError, match="too few pixels") as caught:
-        FlowFit.of(seg, Flow(pair.flow.uv, confidence, "thin"), CORNER_K, CORNER_K)
+        fitted(pair.with_flow(Flow(pair.flow.uv, confidence, "thin")), seg)
     assert "thin" in str(caught.value)
     assert str(usable) in str(caught.value)
     # what a user of two frames can do: with the default flow there is no file to look at
