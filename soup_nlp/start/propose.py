@@ -34,14 +34,7 @@ from soup_nlp.start.labelling import (
     limited_noise,
     with_least_relief,
 )
-from soup_nlp.start.regions import (
-    ORIGINS,
-    SCENE,
-    connected_pieces,
-    continued,
-    numbered,
-    vote,
-)
+from soup_nlp.start.regions import ORIGINS, SCENE, connected_pieces, continued, numbered, vote
 from soup_nlp.start.scales import ground, held, on_ground, scaled
 from soup_nlp.start.views import JUMP_PX, LEAST_SEEN, FlowFit, Views, determined
 
@@ -186,16 +179,8 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     choice = None if bends.all() else labelled(rigid, motions, surface)
     turn = turn_alone(rigid, choice) if o.bending and choice is not None else None
     if choice is None or turn is not None:
-        soup, error = constant_depth(flow.views, turn)
-        if turn is not None and o.upright:
-            soup = receding(flow.views, soup)
-        every = np.ones(len(seg), bool)
-        start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
-        start = replace(
-            start, surface=surface, bends=every, unexplained=jumping, at_rest=turn is not None
-        )
-        part = _scene_first(surface) if turn is None else moving_pieces(flow)
-        return _ordered(flow, start, part, contrast)
+        start = _without_relief(flow, surface, turn, contrast)
+        return replace(start, surface=surface, unexplained=jumping)
     choice, covariance = with_least_relief(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
     soup, interpolated = _with_depth(rigid, choice, wrong)
@@ -240,17 +225,24 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     )
 
 
-def _ordered(flow: FlowFit, start: Start, part: Int, contrast: Float) -> Start:
-    """A start without relief, with its parts (N,) placed in the order by occlusion."""
+def _without_relief(flow: FlowFit, surface: Int, turn: Float | None, contrast: Float) -> Start:
+    """Surfaces (N,) that bend, or what moves before a camera that only turns, in their order."""
+    every, at_rest = np.ones(len(surface), bool), turn is not None
+    soup, error = constant_depth(flow.views, turn)
+    if at_rest and flow.options.upright:
+        soup = receding(flow.views, soup)
+    start = Start.whole(flow.views, soup, error, every, limited_noise(flow.residual))
+    part = moving_pieces(flow) if at_rest else _scene_first(surface)
     order = vote(contrast, part, flow.seg)
-    scale, origin = scaled(flow, start.soup, part, order)
-    moved = np.abs(scale - 1) > 1e-6
-    soup = replace(start.soup, lam=start.soup.lam * scale).normalised()
-    origin = np.where(moved, ORIGINS.index("occlusion"), 0)
-    component = numbered(np.where(moved, part, SCENE))
+    scale, origin = scaled(flow, soup, part, order)
+    placed = np.abs(scale - 1) > 1e-6
+    soup = replace(soup, lam=soup.lam * scale).normalised()
+    origin = np.where(placed, ORIGINS.index("occlusion"), 0)
+    component = numbered(np.where(placed, part, SCENE))
     stays = held(flow, soup, component, origin, order, contrast)
-    part = part if start.at_rest else component
-    return replace(start, soup=soup, origin=origin, component=component, part=part, order=stays)
+    part = part if at_rest else component
+    start = replace(start, soup=soup, component=component, part=part, origin=origin, order=stays)
+    return replace(start, bends=every, at_rest=at_rest)
 
 
 def _scene_first(label: Int, counts: Mask | None = None) -> Int:
@@ -260,10 +252,8 @@ def _scene_first(label: Int, counts: Mask | None = None) -> Int:
 
 
 def _with_depth(flow: FlowFit, choice: Labelling, wrong: Mask) -> tuple[Soup, Mask]:
-    """Planes under the chosen motions, and (N,) True where they are interpolated.
-
-    They are also where the motion does not explain the flow, `wrong` (N,).
-    """
+    """Planes under the chosen motions, and (N,) True where they are interpolated, as also where
+    the motion does not explain the flow, `wrong` (N,)."""
     fit, views = choice.fit, flow.views
     mu, slope = fit.inverse_depth[:, 0], fit.slope[:, 0]
     interpolated = ~determined(fit)[:, 0] | flow.poor | wrong | (flow.seen < LEAST_SEEN)
