@@ -11,11 +11,11 @@ from soup_nlp.geometry.camera import rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
 from soup_nlp.start.camera_error import (
+    LEAST_ODDS,
     TRIED_ERRORS,
     CameraError,
     camera_error,
     camera_errors,
-    likeliest,
 )
 from soup_nlp.start.epipolar import Matches
 from soup_nlp.start.regions import SCENE
@@ -39,8 +39,10 @@ class Evidence:
 
     @property
     def camera(self) -> str | None:
-        """Error of the given camera that the flow shows, one of `ERROR_KINDS`, or None."""
-        return likeliest(self.errors)
+        """Error of the given camera that the flow shows, one of `ERROR_KINDS`, or None: the most
+        probable one, if its odds are at least `LEAST_ODDS`."""
+        kind = max(self.errors, key=lambda kind: self.errors[kind].log_odds, default=None)
+        return kind if kind and self.errors[kind].log_odds > LEAST_ODDS else None
 
 
 def evidence(

@@ -6,7 +6,7 @@ nearly any flow. A focal length that is a guess has an error for certain, which 
 distinguishes it from one that is given. See docs/confidence.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -190,12 +190,6 @@ def _distance(tried: Matches, motion: Motion, kind: str, x: float, given: Matche
 def camera_errors(matches: Matches) -> dict[str, CameraError]:
     """What correspondences say of every kind of error of a given camera, see `camera_error`."""
     return {kind: camera_error(matches, kind, *prior) for kind, prior in ERROR_KINDS.items()}
-
-
-def likeliest(errors: Mapping[str, CameraError]) -> str | None:
-    """The most probable error, if its odds are at least `LEAST_ODDS`."""
-    kind = max(errors, key=lambda kind: errors[kind].log_odds, default=None)
-    return kind if kind and errors[kind].log_odds > LEAST_ODDS else None
 
 
 def better_camera(K: Float, kind: str, x: float) -> Float | None:

@@ -22,7 +22,6 @@ from soup_nlp.start.camera_error import (
     better_camera,
     camera_errors,
     corrected,
-    likeliest,
 )
 from soup_nlp.start.epipolar import Matches, Motion, estimate, triangulate
 
@@ -130,7 +129,7 @@ def test_the_error_of_a_camera_is_found(kind, x):
     exact = matches()
     seen = seen_by(kind, x, exact)
     found = camera_errors(seen)
-    assert likeliest(found) == kind
+    assert Evidence(np.zeros(0), found).camera == kind
     assert found[kind].mean == pytest.approx(x, rel=0.3)
     # what it says of depth is what the error does to it, also where it is large
     wrong, right = (triangulate(estimate(m), m.ray, m.target)[0] for m in (seen, exact))
@@ -145,7 +144,7 @@ def test_the_error_of_a_camera_is_found(kind, x):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_right_camera_is_believed(seed):
     found = camera_errors(matches(seed))
-    assert likeliest(found) is None
+    assert Evidence(np.zeros(0), found).camera is None
     nothing = np.ones((9, 3)), np.ones((9, 3)), np.ones(9)
     assert not any(error.squares(*nothing).any() for error in found.values())
 
@@ -177,7 +176,7 @@ def test_a_better_camera_has_square_pixels():
 def test_too_few_matches_show_no_error():
     seen = matches()
     few = Matches(seen.ray[:7], seen.target[:7], seen.weight[:7], FOCAL)
-    assert likeliest(camera_errors(few)) is None
+    assert Evidence(np.zeros(0), camera_errors(few)).camera is None
 
 
 def started(pair: Pair):
