@@ -292,15 +292,13 @@ def most_probable(
     expected: Float | float = 0.0,
     spread: float = RELIEF,
 ) -> tuple[Motion, Float]:
-    """The motion that minimises the mean squared epipolar distance and the relief.
+    """The motion that minimises the mean squared epipolar distance and the relief, and the (5, 5)
+    covariance of the parameters of `around` it.
 
     `mean rho(e, EPIPOLAR_PX) / error^2 + mean rho(log(z / median z), spread) / spread^2`, with e
     the Sampson distance and rho(x, c) = c^2 log(1 + x^2 / c^2) the Cauchy loss. It begins at each
     of the motions; `error` is the systematic one of the flow, pixels. Relief, whose standard
     deviation is `spread`, is counted from the `expected` log depth (M,) of a depth prior.
-
-    Returns:
-        The motion, and the (5, 5) covariance of the parameters of `around` it.
     """
     root = np.sqrt(matches.weight / matches.weight.sum())
 

@@ -126,11 +126,8 @@ class StartWithFlow(NamedTuple):
     def motion(
         self, at: Int, inverse: Float, shifted: bool = False
     ) -> tuple[float, Float, Float, float]:
-        """The rigid motion of superpixels (M,) with inverse depths (M,).
-
-        These are its error in pixels without the largest tenth, R and T of `X' = R X + T`, and the
-        shift added to all inverse depths, 0 unless `shifted`.
-        """
+        """The rigid motion of superpixels (M,) with inverse depths (M,): its error in pixels, R and
+        T of `X' = R X + T`, and the shift added to all inverse depths, 0 unless `shifted`."""
         views, target = self.flow.views, self.flow.centre[at, :2]
         middle = float(np.median(np.abs(inverse)))
         point = np.column_stack([views.anchor[at], inverse / middle])
