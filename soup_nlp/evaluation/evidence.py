@@ -55,12 +55,10 @@ def evidence(
     are sought.
     """
     valid = data.pixel_weight.sum(axis=1) > 0.25
-    shown: dict[str, CameraError] = {}
     # what moves by itself has another motion
-    scene = valid & (component == SCENE)
-    at = scene if rigid is None else scene & rigid
-    if rigid is not None and at.any():
-        shown = camera_errors(_matches(data, at))
+    scene, shown = valid & (component == SCENE), {}
+    if rigid is not None and (scene & rigid).any():
+        shown = camera_errors(_matches(data, scene & rigid))
     acting = dict(shown)
     if focal_sigma and scene.any():
         # its deviation is known

@@ -27,8 +27,6 @@ from soup_nlp.storage.store import read_h5, require
 
 DEPTHS = {"solution": "ref", "nlp": "nlp_ref", "start": "start_ref", "rigid": "rigid_ref"}
 """Depth maps of the reference frame that a result stores, by the name of their metrics."""
-
-
 SURE = {"solution_90": 0.9, "solution_70": 0.7}
 """Shares of the pixels with a true depth, by least sigma, that are scored separately."""
 
@@ -156,11 +154,7 @@ def _depths(result: object) -> dict[str, Float]:
 
 
 def _map(values: object, what: str) -> Float:
-    """(H, W) numbers.
-
-    Raises:
-        DataError: the values are no map of numbers.
-    """
+    """(H, W) numbers; DataError for values that are no map of numbers."""
     expected = "(H, W) numbers, or a file; NaN where unknown"
     return array_of(values, what, "evaluate", expected, axes="(H, W)").astype(np.float64)
 
@@ -184,10 +178,9 @@ def rigid_depth(pair: Pair, seed: int = 0) -> Float | None:
     triangulated by itself without smoothing, so far points with little parallax can have wild
     depths; only those beyond `FAR` times the median are dropped.
 
-    Returns:
-        (H, W) z of the reference frame in lengths of the translation; NaN where the flow has no
-        confidence, the triangulated point is not in front of both cameras, or it is too far. None
-        where there are too few pixels with flow, or no motion fits for lack of parallax.
+    It is (H, W) z of the reference frame in lengths of the translation; NaN where the flow has no
+    confidence, the triangulated point is not in front of both cameras, or it is too far. None where
+    there are too few pixels with flow, or no motion fits for lack of parallax.
     """
     if pair.flow is None:
         return None

@@ -262,7 +262,7 @@ def _level(mu: Float, floor: Float, under: Mask, weight: Float) -> bool:
     ratio = mu[under] / floor[under]
     middle = np.quantile(ratio, 0.5, weights=weight[under], method="inverted_cdf")
     near = np.abs(ratio / middle - 1) < OFF
-    return bool(weight[under][near].sum() > 0.5 * weight[under].sum())
+    return bool(weight[under][near].sum() > weight[under][~near].sum())
 
 
 def on_ground(
