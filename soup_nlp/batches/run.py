@@ -155,6 +155,10 @@ def batch(
         while left:
             known = stored.kept_rows(folder, {name: heads[name] for name in left})
             rows |= {k: row for k, row in known.items() if not (retry_failed and failed(row))}
+            for mark in (_mark(folder, name) for name in known):
+                # of a run that was killed just after it wrote the row
+                if mark.exists() and _claimed(mark, token):
+                    mark.unlink()
             home = folder.absolute()
             works = {
                 name: partial(_solve, problems[name], home, heads[name], token, known.get(name))

@@ -190,6 +190,8 @@ def test_a_killed_run_goes_on_and_two_runs_solve_no_pair_twice(four, tmp_path):
     run.kill()
     run.wait()
     kept = read_rows(out / "pairs.jsonl")
+    # as if it had been killed between the row and its mark
+    (out / "pairs" / f"{kept[0]['key']}.claim").write_text(f"{os.uname().nodename} {run.pid} 1")
     runs = [subprocess.Popen(command(four, out)) for _ in range(2)]
     assert [run.wait() for run in runs] == [0, 0]
     rows = read_rows(out / "pairs.jsonl")
