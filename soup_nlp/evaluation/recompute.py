@@ -145,6 +145,35 @@ def detail(s: State, labels: Int, given: Mapping[str, Any], used: Mask) -> Float
     return out
 
 
+def shrinkage(
+    s: State, e: Mapping[str, Any], seg: Mapping[str, Any], labels: Int, sigma: Float, drawn: Mask
+) -> Float:
+    """(H, W) change of the log depth of drawn superpixels, equation 31, by its normal equations.
+
+    Data of the energy and the segmentation are as stored; sigma (H, W) is that of log depth, and
+    `drawn` (H, W) True where nothing tells the depth.
+    """
+    every, (a, b) = np.arange(len(s["lam"])), e["pairs"].T
+    share, variance = (
+        np.array([values[labels == k].mean() for k in every]) for values in (drawn, sigma**2)
+    )
+    anchor = lift(s, e["anchor_ray"][:, None], every)[0][:, 0, 2]
+    ray = e["boundary_ray"].mean(axis=1, keepdims=True)
+    first, second = (lift(s, ray, k)[0][:, 0, 2] for k in (a, b))
+    step = np.log(anchor[b] * second / (anchor[a] * first)) / 2
+    w = seg["boundary_length"] * (seg["pair_weight"] / seg["pair_weight"].max()) ** 3
+    w = w / w.mean() / 0.3**2 * np.exp(-(step**2) / (variance[a] + variance[b]) / 2)
+    w[e["order_weight"] != 0] = 0
+    A, rhs = np.diag(1 / variance), np.zeros(len(every))
+    for at, other, sign in ((a, b, 1), (b, a, -1)):
+        np.add.at(A, (at, at), w)
+        np.add.at(A, (at, other), -w)
+        np.add.at(rhs, at, sign * w * step)
+    free, x = share > 0.5, np.zeros(len(every))
+    x[free] = np.linalg.solve(A[np.ix_(free, free)], rhs[free])
+    return np.asarray(x[labels])
+
+
 def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float]:
     """Errors of a depth z to the truth gt, both NaN where unknown, by their names in summary.json.
 

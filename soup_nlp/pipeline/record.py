@@ -114,6 +114,7 @@ class Run(Case):
         confidence: Uncertainty of `reconstruction`.
         refined: Result of the refinement of `solution`; None where it is off.
         full: Depth at the images' own size, where the pair was solved at a smaller one.
+        shrinkage: (N,) change of log depth of what is drawn; None without detail.
     """
 
     solution: Solution
@@ -124,6 +125,7 @@ class Run(Case):
     confidence: Confidence
     refined: Refined | None = None
     full: FullSize | None = None
+    shrinkage: Float | None = None
 
     def __str__(self) -> str:
         h, w = self.pair.size

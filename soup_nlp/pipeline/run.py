@@ -26,7 +26,7 @@ from soup_nlp.data.formats.cameras import check_cameras
 from soup_nlp.data.inputs import PriorOptions, pair_hash, pair_with_prior
 from soup_nlp.data.pair import Pair
 from soup_nlp.errors import ConfigError, StoppedError, expect
-from soup_nlp.evaluation.confidence import confidence
+from soup_nlp.evaluation.confidence import KINDS, confidence
 from soup_nlp.evaluation.scoring import rigid_depth, score_depths
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.geometry.plane import tilt_to_camera
@@ -36,12 +36,13 @@ from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run, full_size
-from soup_nlp.refine.detail import detail
+from soup_nlp.refine.detail import detail, shrinkage
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined, RefineOptions
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
+from soup_nlp.start.regions import likeness
 from soup_nlp.start.views import StartOptions
 from soup_nlp.storage.progress import Listener, Watch
 
@@ -155,9 +156,15 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     assert pair.flow is not None
     energy = case.data, case.weights, case.formulation()
     sure = confidence(planes, pair, case.start, *energy, case.given)
-    if refined is not None and case.problem.refine.detail and not case.start.at_rest:
-        used = ~case.start.bends & case.data.pixel_weight.any(axis=1)
-        after = dense(detail(planes, pair.flow, pair.K_next, used))
+    moved = None
+    if refined is not None and case.problem.refine.detail:
+        drawn = sure.kind == KINDS.index("drawn")
+        moved = shrinkage(planes, case.data, likeness(case.segmentation), sure.sigma, drawn)
+        beside = moved[labels]
+        if not case.start.at_rest:
+            used = ~case.start.bends & case.data.pixel_weight.any(axis=1)
+            beside = beside + detail(planes, pair.flow, pair.K_next, used)
+        after = dense(beside)
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.original is None else full_size(case.original, pair, after)
     start = plane_depth(case.start.soup, labels, pair.K_ref)
@@ -179,6 +186,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         confidence=sure,
         refined=refined,
         full=full,
+        shrinkage=moved,
     )
 
 

@@ -1,21 +1,28 @@
-"""Detail: how far pixels are from the planes of their superpixels, by plane plus parallax.
+"""Detail: how far pixels are from the planes of their superpixels, by flow and by neighbours.
 
-The plane and motion of a superpixel predict where its pixels move. What their flow differs from
-that along the epipolar lines is the parallax of points before or behind the plane (M. Irani,
-P. Anandan, ECCV 1996). Errors of the flow have no such direction: what it differs across the lines
-tells how much of the parallax is error, and so does the round trip of a pixel.
+By plane plus parallax: the plane and motion of a superpixel predict where its pixels move. What
+their flow differs from that along the epipolar lines is the parallax of points before or behind the
+plane (M. Irani, P. Anandan, ECCV 1996). Errors of the flow have no such direction: what it differs
+across the lines tells how much of the parallax is error, and so does the round trip of a pixel.
+Superpixels that are drawn, whose depth nothing tells, move between their neighbours.
 """
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.pair import Flow
 from soup_nlp.geometry.camera import pixel_grid
 from soup_nlp.geometry.soup import Reconstruction
+from soup_nlp.model.energy_data import EnergyData
 
 NEAREST, FARTHEST = 1.0, -0.5
 """Largest and least change of inverse depth, relative to the plane: a point at less than half or
 more than twice its depth is on another surface."""
+STEP = 0.3
+"""Standard deviation of the step of log depth between two neighbours with a usual border. MRE of 27
+families hardly depends on it (0.2 and 0.4: within 0.2 %)."""
 TINY = float(np.finfo(float).tiny)
 
 
@@ -52,3 +59,34 @@ def detail(planes: Reconstruction, flow: Flow, K_next: Float, used: Mask) -> Flo
     error = squares(across) - np.log(np.where(counts, c, 1.0)) / 2
     share = np.maximum(1.0 - error / np.maximum(squares(along), TINY), 0.0)
     return np.asarray(-np.log1p(c * share * x))
+
+
+def shrinkage(
+    planes: Reconstruction, data: EnergyData, likeness: Float, sigma: Float, drawn: Mask
+) -> Float:
+    """(N,) change of the log depth of superpixels towards their neighbours, equation 31.
+
+    Superpixels that are mostly `drawn` (H, W) change, by how unsure they are: `sigma` (H, W) is the
+    standard deviation of log depth. The `likeness` (P,) of two neighbours weighs their border.
+    """
+    soup, of, n = planes.soup, planes.labels.ravel(), len(planes.soup)
+    size = np.bincount(of, minlength=n)
+    variance = np.bincount(of, sigma.ravel() ** 2, n) / size
+    free, out = np.bincount(of, drawn.ravel(), n) > size / 2, np.zeros(n)
+    if not free.any():
+        return out
+    anchor = np.log(soup.depth_across(np.arange(n)[:, None], data.anchor_ray)[0])
+    # slopes are unsure as well: a step half-way from the anchors to the border
+    border = np.log(soup.depth_across(data.pairs, data.boundary_ray.mean(axis=1)))
+    step = np.diff(anchor[data.pairs.T] + border, axis=0)[0] / 2
+    # a step that is large for both sigmas is one of the scene, as is one that an occlusion shows
+    surface = np.exp(-(step**2) / (2 * variance[data.pairs].sum(axis=1)))
+    weight = np.where(data.order_weight == 0, surface * likeness, 0.0)
+    weight /= max(float(likeness.mean()), TINY) * STEP**2
+    rows = np.repeat(np.arange(len(step))[:, None], 2, axis=1)
+    values = np.broadcast_to([-1.0, 1.0], rows.shape)
+    change = sparse.csr_matrix((values.ravel(), (rows.ravel(), data.pairs.ravel())), (len(step), n))
+    change = change[:, free]
+    matrix = change.T @ sparse.diags(weight) @ change + sparse.diags(1 / variance[free])
+    out[free] = spsolve(matrix.tocsc(), -change.T @ (weight * step))
+    return out

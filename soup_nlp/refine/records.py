@@ -29,7 +29,8 @@ class RefineOptions(Section):
     """Factor of E_photo, which measures how far the images contradict a superpixel's homography;
     0 leaves the images out."""
     detail: bool = True
-    """Give the pixels of rigid superpixels the depth of their own flow beside the plane."""
+    """Give the pixels of rigid superpixels the depth of their own flow beside the plane, and move
+    superpixels that are drawn towards their neighbours."""
     max_seconds: Tolerance = 300.0
     """CPU time of this process that the rounds together may take."""
 

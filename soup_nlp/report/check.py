@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from soup_nlp.arrays import Float
+from soup_nlp.arrays import Float, Int
 from soup_nlp.errors import DataError
 from soup_nlp.evaluation import recompute
+from soup_nlp.evaluation.confidence import KINDS
 from soup_nlp.evaluation.scoring import DEPTHS, SURE
 from soup_nlp.geometry.constraints import constraints
 from soup_nlp.report.layout import Stored
@@ -153,7 +154,7 @@ def _constraints(r: Stored) -> Iterator[Claim]:
 
 def _depths(r: Stored) -> Iterator[Claim]:
     """Largest relative difference of the depth maps of the reference frame from the planes, that of
-    the solution with the detail that the flow adds."""
+    the solution with its detail."""
     labels, K = require(r.tree, "segmentation/labels"), require(r.tree, "input/K_ref")
     for which in ("solution", "nlp", "start"):
         if DEPTHS[which] not in r.tree["depth"]:
@@ -161,14 +162,27 @@ def _depths(r: Stored) -> Iterator[Claim]:
         depth = require(r.tree, f"depth/{DEPTHS[which]}")
         z = recompute.depth_map(r.soup(which), labels, K)
         if which == "solution" and "detail" in r.tree["depth"]:
-            used = (r.tree["start"]["bends"] == 0) & r.tree["energy"]["pixel_weight"].any(axis=1)
-            z = z * np.exp(recompute.detail(r.soup(which), labels, r.tree["input"], used))
+            z = z * np.exp(_beside(r.tree, r.soup(which), labels))
         both = np.isfinite(depth) & np.isfinite(z)
         off, note = float(np.abs(z[both] / depth[both] - 1).max(initial=0.0)), ""
         lost = float((np.isfinite(depth) != np.isfinite(z)).mean())
         if lost > LOST:
             off, note = 1.0, f"{lost:.1%} of the pixels are known in one only"
         yield Claim(f"depth map {which}", 0.0, off, RELATIVE, note=note)
+
+
+def _beside(tree: Mapping[str, Any], soup: recompute.State, labels: Int) -> Float:
+    """(H, W) log depth relative to the planes: by the flow, and of what is drawn."""
+    out = np.zeros(labels.shape)
+    if not tree["start"]["at_rest"]:
+        used = (tree["start"]["bends"] == 0) & tree["energy"]["pixel_weight"].any(axis=1)
+        out = recompute.detail(soup, labels, tree["input"], used)
+    # earlier results have none
+    if "shrinkage" in tree["depth"]:
+        drawn = tree["confidence"]["kind"] == KINDS.index("drawn")
+        maps = labels, tree["depth"]["sigma_ref"], drawn
+        out = out + recompute.shrinkage(soup, tree["energy"], tree["segmentation"], *maps)
+    return out
 
 
 def _scores(r: Stored) -> Iterator[Claim]:

@@ -1,4 +1,6 @@
-"""Detail is exact for exact flow, small for noise, and none where the flow is no evidence."""
+"""Detail: exact for exact flow, small for noise, none without evidence; shrinkage."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +10,8 @@ from soup_nlp.data.pair import Flow
 from soup_nlp.evaluation import recompute
 from soup_nlp.geometry.camera import pixel_grid
 from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
-from soup_nlp.refine.detail import detail
+from soup_nlp.refine.detail import STEP, detail, shrinkage
+from soup_nlp.start.regions import likeness
 
 LABELS = np.kron(np.arange(12).reshape(3, 4), np.ones((HEIGHT // 3, WIDTH // 4), int))
 EVERY = np.ones(12, bool)
@@ -87,3 +90,48 @@ def test_an_independent_computation_agrees(seed):
     again = recompute.detail(vars(tiny.soup), tiny.seg.labels, given, used)
     np.testing.assert_allclose(found, again, atol=1e-11)
     assert 0.02 < np.abs(found).mean() < 0.2
+
+
+def moved(tiny: Tiny, sigma: np.ndarray, drawn: np.ndarray, **data: np.ndarray) -> np.ndarray:
+    """Change of log depth by superpixel where sigma and what is drawn are given by superpixel."""
+    labels = tiny.seg.labels
+    planes = reconstruct(tiny.soup, labels, K_REF, K_NEXT)
+    energy = replace(tiny.data, **data)
+    return shrinkage(planes, energy, likeness(tiny.seg), sigma[labels], drawn[labels])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_is_drawn_moves_as_an_independent_computation_says(seed):
+    tiny, rng = Tiny(seed=seed), np.random.default_rng(seed)
+    n = len(tiny.soup)
+    sigma, drawn = rng.uniform(0.1, 1.0, n), rng.random(n) < 0.6
+    found = moved(tiny, sigma, drawn)
+    assert not found[~drawn].any()
+    assert np.abs(found[drawn]).max() > 0.05
+    labels, seg = tiny.seg.labels, vars(tiny.seg)
+    of = labels, sigma[labels], drawn[labels]
+    again = recompute.shrinkage(vars(tiny.soup), vars(tiny.data), seg, *of)
+    np.testing.assert_allclose(found[labels], again, atol=1e-11)
+
+
+def test_shrinkage_weighs_neighbours_against_the_own_depth():
+    tiny, every = Tiny(), np.ones(12, bool)
+    order, one = np.zeros(len(tiny.data.pairs)), np.arange(12) == 5
+    # superpixels that face the camera, all at one depth but one
+    flat = Soup(
+        np.where(one, 1.2, 1.0),
+        np.tile([0.0, 0.0, -1.0], (12, 1)),
+        np.ones(12),
+        *(np.zeros((12, *shape)) for shape in ((3, 3), (3,))),
+    )
+    tiny.soup = flat
+    sigma, beside = np.full(12, 0.2), (tiny.data.pairs == 5).any(axis=1)
+    weight = likeness(tiny.seg) / likeness(tiny.seg).mean() / STEP**2
+    step = np.log(1.2)
+    w = (weight * np.exp(-(step**2) / (4 * 0.2**2)))[beside].sum()
+    found = moved(tiny, sigma, one, order_weight=order)
+    np.testing.assert_allclose(found, np.where(one, -step * w / (w + 1 / 0.2**2), 0.0))
+    # less where it is surer, not where one is known to cover the other, nothing if nothing is drawn
+    assert 0 > moved(tiny, np.full(12, 0.1), one, order_weight=order)[5] > found[5]
+    assert not moved(tiny, sigma, one, order_weight=np.ones(len(order))).any()
+    assert not moved(tiny, sigma, ~every).any()
