@@ -154,6 +154,8 @@ def shrinkage(
     `drawn` (H, W) True where nothing tells the depth.
     """
     every, (a, b) = np.arange(len(s["lam"])), e["pairs"].T
+    if not len(a):
+        return np.zeros(labels.shape)
     share, variance = (
         np.array([values[labels == k].mean() for k in every]) for values in (drawn, sigma**2)
     )

@@ -73,7 +73,7 @@ def shrinkage(
     size = np.bincount(of, minlength=n)
     variance = np.bincount(of, sigma.ravel() ** 2, n) / size
     free, out = np.bincount(of, drawn.ravel(), n) > size / 2, np.zeros(n)
-    if not free.any():
+    if not free.any() or not len(data.pairs):
         return out
     anchor = np.log(soup.depth_across(np.arange(n)[:, None], data.anchor_ray)[0])
     # slopes are unsure as well: a step half-way from the anchors to the border
@@ -82,7 +82,7 @@ def shrinkage(
     # a step that is large for both sigmas is one of the scene, as is one that an occlusion shows
     surface = np.exp(-(step**2) / (2 * variance[data.pairs].sum(axis=1)))
     weight = np.where(data.order_weight == 0, surface * likeness, 0.0)
-    weight /= max(float(likeness.mean()), TINY) * STEP**2
+    weight /= likeness.mean() * STEP**2
     rows = np.repeat(np.arange(len(step))[:, None], 2, axis=1)
     values = np.broadcast_to([-1.0, 1.0], rows.shape)
     change = sparse.csr_matrix((values.ravel(), (rows.ravel(), data.pairs.ravel())), (len(step), n))

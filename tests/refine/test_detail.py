@@ -135,3 +135,12 @@ def test_shrinkage_weighs_neighbours_against_the_own_depth():
     assert 0 > moved(tiny, np.full(12, 0.1), one, order_weight=order)[5] > found[5]
     assert not moved(tiny, sigma, one, order_weight=np.ones(len(order))).any()
     assert not moved(tiny, sigma, ~every).any()
+
+
+def test_a_lone_superpixel_that_is_drawn_stays():
+    tiny = Tiny(superpixels=1)
+    assert len(tiny.soup) == 1
+    assert moved(tiny, np.ones(1), np.ones(1, bool)) == 0
+    maps = tiny.seg.labels, np.ones(tiny.seg.labels.shape), tiny.seg.labels == 0
+    again = recompute.shrinkage(vars(tiny.soup), vars(tiny.data), vars(tiny.seg), *maps)
+    assert not again.any()
