@@ -150,15 +150,13 @@ def shrinkage(
 ) -> Float:
     """(H, W) change of the log depth of drawn superpixels, equation 31, by its normal equations.
 
-    Data of the energy and the segmentation are as stored; sigma (H, W) is that of log depth, and
+    Data of the energy and the segmentation are as stored; sigma (N,) is that of log depth, and
     `drawn` (H, W) True where nothing tells the depth.
     """
     every, (a, b) = np.arange(len(s["lam"])), e["pairs"].T
     if not len(a):
         return np.zeros(labels.shape)
-    share, variance = (
-        np.array([values[labels == k].mean() for k in every]) for values in (drawn, sigma**2)
-    )
+    share, variance = np.array([drawn[labels == k].mean() for k in every]), sigma**2
     anchor = lift(s, e["anchor_ray"][:, None], every)[0][:, 0, 2]
     ray = e["boundary_ray"].mean(axis=1, keepdims=True)
     first, second = (lift(s, ray, k)[0][:, 0, 2] for k in (a, b))

@@ -159,7 +159,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     moved = None
     if refined is not None and case.problem.refine.detail:
         drawn = sure.kind == KINDS.index("drawn")
-        moved = shrinkage(planes, case.data, likeness(case.segmentation), sure.sigma, drawn)
+        moved = shrinkage(planes, case.data, likeness(case.segmentation), sure.own_sigma, drawn)
         beside = moved[labels]
         if not case.start.at_rest:
             used = ~case.start.bends & case.data.pixel_weight.any(axis=1)

@@ -66,13 +66,12 @@ def shrinkage(
 ) -> Float:
     """(N,) change of the log depth of superpixels towards their neighbours, equation 31.
 
-    Superpixels that are mostly `drawn` (H, W) change, by how unsure they are: `sigma` (H, W) is the
+    Superpixels that are mostly `drawn` (H, W) change, by how unsure they are: `sigma` (N,) is the
     standard deviation of log depth. The `likeness` (P,) of two neighbours weighs their border.
     """
     soup, of, n = planes.soup, planes.labels.ravel(), len(planes.soup)
-    size = np.bincount(of, minlength=n)
-    variance = np.bincount(of, sigma.ravel() ** 2, n) / size
-    free, out = np.bincount(of, drawn.ravel(), n) > size / 2, np.zeros(n)
+    free = np.bincount(of, drawn.ravel(), n) > np.bincount(of, minlength=n) / 2
+    variance, out = sigma**2, np.zeros(n)
     if not free.any() or not len(data.pairs):
         return out
     anchor = np.log(soup.depth_across(np.arange(n)[:, None], data.anchor_ray)[0])

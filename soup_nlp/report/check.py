@@ -180,8 +180,8 @@ def _beside(tree: Mapping[str, Any], soup: recompute.State, labels: Int) -> Floa
     # earlier results have none
     if "shrinkage" in tree["depth"]:
         drawn = tree["confidence"]["kind"] == KINDS.index("drawn")
-        maps = labels, tree["depth"]["sigma_ref"], drawn
-        out = out + recompute.shrinkage(soup, tree["energy"], tree["segmentation"], *maps)
+        parts = tree["energy"], tree["segmentation"], labels, tree["confidence"]["own_sigma"]
+        out = out + recompute.shrinkage(soup, *parts, drawn)
     return out
 
 

@@ -118,6 +118,7 @@ confidence/plane          1     N,3,3   marginal covariance of relative inverse 
 anchor and of its slopes over the radius, not calibrated
 confidence/spread         1     H,W     standard deviation of log z by the marginals, not calibrated
 confidence/kind           1     H,W     by what z is known: 0 measured, 1 inferred, 2 drawn
+confidence/own_sigma      1     N       sigma of a superpixel without errors that neighbours share
 confidence/component_sigma  1   C       standard deviation of a rigid component's log scale
 
 components/of_superpixel  1     N       what moves as one in the solution; 0 is the background

@@ -97,7 +97,7 @@ def moved(tiny: Tiny, sigma: np.ndarray, drawn: np.ndarray, **data: np.ndarray) 
     labels = tiny.seg.labels
     planes = reconstruct(tiny.soup, labels, K_REF, K_NEXT)
     energy = replace(tiny.data, **data)
-    return shrinkage(planes, energy, likeness(tiny.seg), sigma[labels], drawn[labels])
+    return shrinkage(planes, energy, likeness(tiny.seg), sigma, drawn[labels])
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -109,7 +109,7 @@ def test_what_is_drawn_moves_as_an_independent_computation_says(seed):
     assert not found[~drawn].any()
     assert np.abs(found[drawn]).max() > 0.05
     labels, seg = tiny.seg.labels, vars(tiny.seg)
-    of = labels, sigma[labels], drawn[labels]
+    of = labels, sigma, drawn[labels]
     again = recompute.shrinkage(vars(tiny.soup), vars(tiny.data), seg, *of)
     np.testing.assert_allclose(found[labels], again, atol=1e-11)
 
@@ -141,6 +141,6 @@ def test_a_lone_superpixel_that_is_drawn_stays():
     tiny = Tiny(superpixels=1)
     assert len(tiny.soup) == 1
     assert moved(tiny, np.ones(1), np.ones(1, bool)) == 0
-    maps = tiny.seg.labels, np.ones(tiny.seg.labels.shape), tiny.seg.labels == 0
+    maps = tiny.seg.labels, np.ones(1), tiny.seg.labels == 0
     again = recompute.shrinkage(vars(tiny.soup), vars(tiny.data), vars(tiny.seg), *maps)
     assert not again.any()
