@@ -163,7 +163,7 @@ def shrinkage(
     step = np.log(anchor[b] * second / (anchor[a] * first)) / 2
     w = seg["boundary_length"] * (seg["pair_weight"] / seg["pair_weight"].max()) ** 3
     w = w / w.mean() / 0.3**2 * np.exp(-(step**2) / (variance[a] + variance[b]) / 2)
-    w[e["order_weight"] != 0] = 0
+    w = np.where(e.get("order_weight", 0) == 0, w, 0)
     A, rhs = np.diag(1 / variance), np.zeros(len(every))
     for at, other, sign in ((a, b, 1), (b, a, -1)):
         np.add.at(A, (at, at), w)
