@@ -39,7 +39,7 @@ FACTORS = {
 drawn, and within a scene without any evidence; see `sigma_of`."""
 ADDED = ("flow", "scale", "relief", "outline", "mixed", "starts", "camera", "bends")
 """Terms whose squares are added up; those without a factor are standard deviations as they are."""
-SHARED = ("relief", "camera")
+CORRELATED = ("relief", "camera")
 """Terms of errors that a whole component shares: they bend its relief, and neighbours tell nothing
 of them."""
 MISFIT, MOST_MISFIT = 2.0, 5.0
@@ -74,7 +74,7 @@ class Confidence:
         spread: (H, W) standard deviation of log depth by the marginals, not calibrated.
         plane: (N, 3, 3) marginal covariance of relative inverse depth and slopes.
         component_sigma: (C,) standard deviation of the components' log scale.
-        own_sigma: (N,) root mean square of sigma in a superpixel without the terms `SHARED`.
+        own_sigma: (N,) root mean square of sigma in a superpixel without the terms `CORRELATED`.
         evidence: Evidence of the flow for the camera.
         terms: (H, W) terms of sigma by name, without their factors, see `terms`.
         kind: (H, W) by what the depth is known, an index of `KINDS`.
@@ -239,7 +239,7 @@ def confidence(
     # what is as uncertain as a drawing is one
     nothing = ((known["drawn"] > 0) & ~given[labels]) | (sigma >= FACTORS["drawn"])
     kind = kinds(rec, pair.flow, start, nothing, given)
-    own = sigma_of(known | {name: np.zeros(labels.shape) for name in SHARED})
+    own = sigma_of(known | {name: np.zeros(labels.shape) for name in CORRELATED})
     squares = np.bincount(labels.ravel(), own.ravel() ** 2) / np.bincount(labels.ravel())
     scale = with_prior(component)
     return Confidence(sigma, spread, plane, scale, np.sqrt(squares), sure, known, kind)

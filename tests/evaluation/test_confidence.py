@@ -283,6 +283,12 @@ def test_relief_is_as_unsure_as_the_motion_of_its_superpixel(small_room, sure):
     wide = sure_of(small_room, covariance=4 * start.covariance)
     np.testing.assert_allclose(wide.terms["relief"], 2 * sure.terms["relief"], rtol=1e-9)
     assert sure.terms["relief"].max() > 0
+    # neighbours share that error: it is none of the superpixel's own sigma
+    np.testing.assert_allclose(wide.own_sigma, sure.own_sigma)
+    squares = np.bincount(labels.ravel(), sure.sigma.ravel() ** 2)
+    whole = np.sqrt(squares / small_room.segmentation.sizes)
+    assert (sure.own_sigma < whole).any()
+    assert (sure.own_sigma < whole * (1 + 1e-12)).all()
     odd = np.arange(len(small_room)) % 2 == 1
     relief = sure_of(small_room, motion=np.where(odd, -1, start.motion)).terms["relief"]
     assert (relief[odd[labels]] == 0).all()

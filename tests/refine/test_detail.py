@@ -1,6 +1,7 @@
 """Detail: exact for exact flow, small for noise, none without evidence; shrinkage."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from helpers_model import HEIGHT, K_NEXT, K_REF, WIDTH, Tiny, random_soup
 from soup_nlp.data.pair import Flow
 from soup_nlp.evaluation import recompute
 from soup_nlp.geometry.camera import pixel_grid
-from soup_nlp.geometry.soup import Reconstruction, Soup, reconstruct
+from soup_nlp.geometry.soup import Reconstruction, Soup, plane_depth, reconstruct
+from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.refine.detail import STEP, detail, shrinkage
 from soup_nlp.start.regions import likeness
 
@@ -144,3 +146,15 @@ def test_a_lone_superpixel_that_is_drawn_stays():
     maps = tiny.seg.labels, np.ones(1), tiny.seg.labels == 0
     again = recompute.shrinkage(vars(tiny.soup), vars(tiny.data), vars(tiny.seg), *maps)
     assert not again.any()
+
+
+def test_a_run_delivers_what_is_drawn_shrunk(small_room):
+    # before a camera at rest all is drawn, and the flow gives no detail
+    case = replace(small_room, start=replace(small_room.start, at_rest=True))
+    solution = skipped(case)
+    done = make_run(case, solution, SimpleNamespace(soup=solution.soup))
+    planes = plane_depth(done.soup, case.segmentation.labels, case.pair.K_ref)
+    assert np.abs(done.shrinkage).max() > 0.01
+    change = np.log(done.reconstruction.depth_ref / planes)
+    np.testing.assert_allclose(change, done.shrinkage[case.segmentation.labels], atol=1e-12)
+    assert make_run(case, solution).shrinkage is None
