@@ -1,9 +1,6 @@
-"""The page of a suite: tables by pair, family and half; a picture of sigma; two pages compared."""
+"""The page of a suite: by family and half; a table by pair, a picture; two suites compared."""
 
-import re
-from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -47,7 +44,13 @@ SIGMA_COLUMNS = {
 }
 """Titles of the columns on sigma."""
 SIGMA_BY_PAIR = ("NLL", "within 1", "within 2", "sure and wrong", "AUSE", "drawn")
-"""Those that the table of all pairs shows."""
+"""Those of the table by pair."""
+PAIR = ["pair", "flow"]
+"""Columns that identify a row of the table by pair."""
+ABOUT_PAIRS = (
+    "MRE of every method after one median scale per image, without a cap, CPU seconds, scores of"
+    " sigma."
+)
 ABOUT_ERRORS = (
     "Means over the pairs. Seen: superpixels with usable flow (mean confidence above 0.5); moving:"
     " pixels that move by themselves, where a mask or the true motion is known."
@@ -68,7 +71,10 @@ ABOUT_HALVES = (
 
 
 def suite_page(page: Path, frame: pd.DataFrame, note: str = "") -> str:
-    """The page of the rows of one suite; its picture is written beside it."""
+    """The page of the rows of one suite; its table by pair and its picture are written beside it.
+
+    The table is a CSV file: pair, flow, family, MRE of every method, CPU seconds, scores of sigma.
+    """
     good = frame[frame["ok"].eq(True)]
     scored = good[mre_of(good).notna()]
     settings = ", ".join(sorted(frame["settings"].astype(str).unique()))
@@ -81,13 +87,12 @@ def suite_page(page: Path, frame: pd.DataFrame, note: str = "") -> str:
     about = f"{provenance(frame)}; settings {settings} (one a flow source)."
     blocks = [f"# Accuracy on {page.stem}", note, verdict, about]
     if len(scored):
-        by_pair = scored.set_axis(pd.Index(scored["title"], name="pair, flow"))
-        blocks += ["## MRE, one median scale per image, no cap", _by_pair(by_pair)]
+        table = page.with_suffix(".csv")
+        _by_pair(scored).to_csv(table, float_format="%.4f")
+        blocks.append(f"[{table.name}]({table.name}) has every pair: {ABOUT_PAIRS}")
         blocks += ["## By half", ABOUT_HALVES, _halves(scored)]
         blocks += ["## By family", ABOUT_ERRORS, _by_family(scored)]
         blocks += ["## Sigma", ABOUT_SIGMA]
-        sigma = {t: numbers(by_pair, c) for c, t in SIGMA_COLUMNS.items() if t in SIGMA_BY_PAIR}
-        blocks.append(markdown(pd.DataFrame(sigma).dropna(axis=1, how="all")))
         if plot_sigma(page.with_suffix(".png"), frame):
             blocks.append(f"![Sparsification by sigma, and its reliability]({page.stem}.png)")
     return page_text(blocks, frame)
@@ -101,13 +106,15 @@ def _best(frame: pd.DataFrame) -> pd.Series:
     return out
 
 
-def _by_pair(frame: pd.DataFrame) -> str:
-    """Table of family, MRE of every method but the filled rigid depth, and time."""
-    shown = [m for m in METHODS if m != "rigid_filled"]
-    table = pd.DataFrame({m: mre_of(frame, m) for m in shown}).dropna(axis=1, how="all")
+def _by_pair(frame: pd.DataFrame) -> pd.DataFrame:
+    """Family, MRE of every method but the filled rigid depth, CPU seconds and scores of sigma."""
+    table = pd.DataFrame({m: mre_of(frame, m) for m in METHODS if m != "rigid_filled"})
+    table["CPU s"] = frame["cpu_seconds"].astype(float).round().astype(int)
+    for column, title in SIGMA_COLUMNS.items():
+        if title in SIGMA_BY_PAIR:
+            table[title] = numbers(frame, column)
     table.insert(0, "family", frame["family"])
-    table["CPU s"] = frame["cpu_seconds"]
-    return markdown(table, dict.fromkeys(table, ".4f") | {"CPU s": ".0f"})
+    return table.set_index(pd.MultiIndex.from_frame(frame[PAIR])).dropna(axis=1, how="all")
 
 
 def _by_family(frame: pd.DataFrame) -> str:
@@ -169,20 +176,17 @@ def plot_sigma(path: Path, frame: pd.DataFrame) -> bool:
     return True
 
 
-# --- two pages compared -------------------------------------------------------------------------
+# --- two suites compared ------------------------------------------------------------------------
 
 
 def read_pages(path: Path) -> pd.DataFrame:
-    """The numbers by pair of a page, or of all pages of a folder: `pair, flow` is the index."""
-    pages = sorted(path.glob("*.md")) if path.is_dir() else [path]
-    texts = [page.read_text(encoding="utf-8") for page in pages if page.is_file()]
-    by_pair = re.compile(r"^\| pair, flow \|.*\n(?:^\|.*\n)*", re.MULTILINE)
-    form: Any = {"sep": r"\s*\|\s*", "engine": "python", "skiprows": [1], "na_values": "-"}
-    tables = [pd.read_csv(StringIO(t), **form) for text in texts for t in by_pair.findall(text)]
-    own = [t.iloc[:, 1:-1].set_index("pair, flow") for t in tables if "baseline" not in t]
-    if not any("solution" in table for table in own):
+    """The table by pair of a page, or of all pages of a folder: `pair` and `flow` are the index."""
+    files = sorted(path.glob("*.csv")) if path.is_dir() else [path.with_suffix(".csv")]
+    tables = [pd.read_csv(file, dtype={"pair": str}) for file in files if file.is_file()]
+    tables = [table for table in tables if "pair" in table]
+    if not tables:
         raise DataError("no table by pair is there", where=path, expected="pages of `accuracy`")
-    return pd.concat(own).groupby(level=0, sort=False).first()
+    return pd.concat(tables).drop_duplicates(PAIR).set_index(PAIR)
 
 
 def comparison(before: pd.DataFrame, after: pd.DataFrame) -> str:
@@ -194,12 +198,10 @@ def comparison(before: pd.DataFrame, after: pd.DataFrame) -> str:
     if both.empty:
         raise DataError("the pages have no pair in common")
     old, new = before.loc[both], after.loc[both]
-    family = new["family"] if "family" in new else old["family"]
-    flow = pd.Series([title.rpartition(", ")[2] for title in both], both, name="flow")
     table = pd.DataFrame({"before": old["solution"], "after": new["solution"]})
     table["ratio"] = table["after"] / table["before"]
     table["NLL before"], table["NLL after"] = old.get("NLL"), new.get("NLL")
-    groups = table.groupby([family, flow], sort=False)
+    groups = table.groupby([new["family"], "flow"], sort=False)
     families = groups.mean()
     families["ratio"] = groups["ratio"].agg(geometric)
     families.insert(0, "pairs", groups.size())

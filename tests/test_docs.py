@@ -1,6 +1,7 @@
 """The documents agree with the code: links, names, keys, rooms, scores."""
 
 import ast
+import csv
 import re
 from functools import cache
 from pathlib import Path
@@ -141,16 +142,13 @@ def cells(page: str, head: str) -> list[list[str]]:
     return [[c.strip() for c in line.split("|")[1:-1]] for line in (lines[0], *lines[2:])]
 
 
-RESULTS = ("results/accuracy/rendered.md", "results/accuracy/shared.md")
-
-
-def stored_scores() -> dict[tuple[str, ...], list[str]]:
+def stored_scores() -> dict[tuple[str, str], list[str]]:
     """MRE of solution and constant depth by pair and flow."""
     out = {}
-    for page in RESULTS:
-        head, *rows = cells(page, "| pair, flow |")
-        at = [head.index("solution"), head.index("constant")]
-        out |= {tuple(row[0].rsplit(", ", 1)): [row[k] for k in at] for row in rows}
+    for suite in ("rendered", "shared"):
+        text = (ROOT / f"results/accuracy/{suite}.csv").read_text(encoding="utf-8")
+        for row in csv.DictReader(text.splitlines()):
+            out[row["pair"], row["flow"]] = [row["solution"], row["constant"]]
     return out
 
 

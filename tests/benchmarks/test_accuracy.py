@@ -154,6 +154,10 @@ def test_two_pages_are_compared_by_family_and_half(tmp_path):
     assert "half A, dis: 1.1892 over 2; worse by 10 %: 1, better: 0" in text
     assert "half B, dis: 2.0000 over 1; worse by 10 %: 1, better: 0" in text
     assert main(["compare", str(tmp_path / "before"), str(tmp_path / "before/shared.md")]) == 0
+    table = (tmp_path / "before/shared.csv").read_text().splitlines()
+    assert table[0] == "pair,flow,family,solution,constant,CPU s"
+    assert table[1] == "a,dis,street,0.0300,0.0400,1"
+    assert "[shared.csv](shared.csv)" in page.read_text()
     assert main(["compare", str(tmp_path), str(tmp_path)]) == 2
 
 
