@@ -131,7 +131,7 @@ def paper(
     page, cells = out / "README.md", list(plan.drop_duplicates("key")["cell"])
     frame = measure(cells, measure_pair, page, workers)
     note = f"Superpixels wanted: {superpixels} in the comparison, {analysis} elsewhere."
-    return finish(page, frame, papers.paper_page(frame, plan, note))
+    return finish(page, frame, papers.paper_page(page, frame, plan, note))
 
 
 @app.command()
@@ -153,7 +153,7 @@ def speed(
     sizes = numbers(superpixels), numbers(neighbours)
     cells, page = speeds.speed_cells(*pairs, *sizes, overrides or []), out / f"{name}.md"
     frame = measure(cells, speeds.measure_speed, page, fresh=True)
-    return finish(page, frame, speeds.speed_page(frame))
+    return finish(page, frame, speeds.speed_page(page, frame))
 
 
 @app.command()

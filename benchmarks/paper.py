@@ -227,8 +227,8 @@ def _with_truth(data: Path | None) -> list[Item]:
 # --- the page -------------------------------------------------------------------------------------
 
 
-def paper_page(frame: pd.DataFrame, plan: pd.DataFrame, note: str) -> str:
-    """The page of all rows; `note` gives their sizes."""
+def paper_page(page: Path, frame: pd.DataFrame, plan: pd.DataFrame, note: str) -> str:
+    """The page of all rows; `note` gives their sizes. A CSV file by pair is written beside it."""
     rows = plan.join(frame.set_index("key").drop(columns="variant"), on="key")
     rows["mre"] = mre_of(rows)
     sections = dict(list(rows.groupby("section", sort=False)))
@@ -236,7 +236,7 @@ def paper_page(frame: pd.DataFrame, plan: pd.DataFrame, note: str) -> str:
     blocks = ["# The paper, row by row", f"{provenance(frame)}; {os.cpu_count()} cores."]
     blocks += [ABOUT, f"{note} {measured}"]
     if "comparison" in sections:
-        blocks += _comparison(sections["comparison"])
+        blocks += _comparison(page.with_name("pairs.csv"), sections["comparison"])
     blocks += ["Published ablation, MRE:", markdown(ABLATION.rename_axis("sequence"))]
     for name, (title, _) in STUDIES.items():
         blocks += [f"## {title}", "Median MRE of the pairs:"]
@@ -255,21 +255,20 @@ def _pivot(rows: pd.DataFrame, index: str, columns: str) -> pd.DataFrame:
     return table.reindex(index=rows[index].unique(), columns=rows[columns].unique())
 
 
-def _comparison(rows: pd.DataFrame) -> list[str]:
+def _comparison(by_pair: Path, rows: pd.DataFrame) -> list[str]:
     groups = rows.groupby(["dataset", "method"])["mre"].mean()
     table = PUBLISHED.add_suffix(" (published)").join(groups.unstack())
     constant = mre_of(rows, "constant").groupby(rows["dataset"]).mean()
     table["constant depth"] = constant.reindex(table.index)
     maps = {"start": "start", "NLP": "nlp", "refined": "solution", "constant": "constant"}
-    by_pair = pd.DataFrame({title: mre_of(rows, name) for title, name in maps.items()})
-    by_pair[["status", "CPU s"]] = rows[["status", "cpu_seconds"]]
+    pairs = pd.DataFrame({title: mre_of(rows, name) for title, name in maps.items()})
+    pairs[["status", "CPU s"]] = rows[["status", "cpu_seconds"]]
     index = pd.MultiIndex.from_frame(rows[["name", "method"]])
-    forms = dict.fromkeys(by_pair, ".4f") | {"CPU s": ".0f"}
+    pairs.set_axis(index).to_csv(by_pair, float_format="%.4f")
     return [
         "## Mean relative error per dataset",
         markdown(table.rename_axis("dataset")),
-        "Every pair, MRE; the constrained NLP's status:",
-        markdown(by_pair.set_axis(index), forms),
+        f"[{by_pair.name}]({by_pair.name}): MRE and status of the NLP by pair.",
     ]
 
 

@@ -74,10 +74,10 @@ def family_scores(pairs: Pairs, factors: Mapping[str, Mapping[str, float]]) -> l
 
 
 def sigma_page(page: Path, frame: pd.DataFrame) -> str:
-    """The page of the fit; its picture is written beside it.
+    """The page of the fit; its picture and a CSV file by family are written beside it.
 
     It has today's factors, those of all families and the range of those with a family left out, and
-    scores by family with today's factors and with those of all other families.
+    scores with today's factors and with those of all other families, of families and their mean.
     """
     pairs = pairs_of(frame)
     every = fitted(pairs)
@@ -99,9 +99,14 @@ def sigma_page(page: Path, frame: pd.DataFrame) -> str:
     ]
     table = pd.DataFrame(before).set_index("family")[list(SCORES)]
     table["nll, left out"] = pd.DataFrame(after).set_index("family")["nll"]
-    table.loc["mean"] = table.mean()
-    about = "By today's factors; nll, left out: by those fitted to the other families."
-    blocks += ["## By family", about, markdown(table, ".3f")]
+    by_family = page.with_suffix(".csv")
+    table.to_csv(by_family, float_format="%.3f")
+    about = (
+        "By today's factors; nll, left out: by those fitted to the other families."
+        f" [{by_family.name}]({by_family.name}) has every family."
+    )
+    mean = table.agg(["mean"]).rename_axis("family")
+    blocks += ["## Scores", about, markdown(mean, ".3f")]
     blocks.append(f"![Reliability of sigma by family]({page.stem}.png)")
     return "\n\n".join(blocks) + "\n"
 

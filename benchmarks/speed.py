@@ -94,8 +94,8 @@ def measure_speed(cell: Cell) -> Row:
     }
 
 
-def speed_page(frame: pd.DataFrame) -> str:
-    """Markdown page of the rows: runs, seconds by stage, machine."""
+def speed_page(page: Path, frame: pd.DataFrame) -> str:
+    """Markdown page of the rows: runs, machine; CPU seconds by stage are a CSV file beside it."""
     good = frame[frame["ok"].eq(True)]
     blocks = ["# Speed", f"{provenance(frame)}. Solves without a status succeeded."]
     if len(good):
@@ -110,8 +110,11 @@ def speed_page(frame: pd.DataFrame) -> str:
         runs.index = pd.MultiIndex.from_frame(good[several].rename(columns=RUN))
         failed = good["status"].ne("Solve_Succeeded").any()
         shown = {name: form for name, form in COLUMNS.items() if failed or name != "status"}
-        stages = {column: (column.removeprefix("cpu."), ".2f") for column in cpu}
-        blocks += [titled(runs, shown), NOTE, "## CPU seconds by stage", titled(runs, stages)]
+        stages = page.with_suffix(".csv")
+        cpu.rename(columns=lambda name: name.removeprefix("cpu.")).set_axis(runs.index).to_csv(
+            stages, float_format="%.2f"
+        )
+        blocks += [titled(runs, shown), f"{NOTE} [{stages.name}]({stages.name}): by stage."]
     memory = f"{psutil.virtual_memory().total / 2**30:.0f} GB"
     facts = ", ".join(f"{k} {v}" for k, v in versions().items())
     machine = f"{os.cpu_count()} cores of {processor()}, {memory}, {platform.platform()}; {facts}."
