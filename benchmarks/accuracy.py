@@ -47,26 +47,9 @@ SIGMA_BY_PAIR = ("NLL", "within 1", "within 2", "sure and wrong", "AUSE", "drawn
 """Those of the table by pair."""
 PAIR = ["pair", "flow"]
 """Columns that identify a row of the table by pair."""
-ABOUT_PAIRS = (
-    "MRE of every method after one median scale per image, without a cap, CPU seconds, scores of"
-    " sigma."
-)
-ABOUT_ERRORS = (
-    "Means over the pairs. Seen: superpixels with usable flow (mean confidence above 0.5); moving:"
-    " pixels that move by themselves, where a mask or the true motion is known."
-)
-ABOUT_SIGMA = (
-    "NLL: mean of (error / sigma)^2 / 2 + log sigma of log depth after the median scale; flat: the"
-    " same for the best constant sigma. Within k: share of the pixels within k sigma. Sure and"
-    " wrong: of the pixels with a sigma below 10 %, the share that is wrong by more than 20 %;"
-    " wrong and sure: of those wrong by more than 20 %, the share with a sigma below 10 %; right"
-    " but unsure: of those right to 10 %, the share with a sigma above 25 %. AUSE: area between the"
-    " sparsification curve of sigma and the oracle's, over the MRE; 0 is perfect, 0.8 to 1 is"
-    " chance. Drawn: share of the image."
-)
-ABOUT_HALVES = (
-    "Geometric mean over the families of their mean MRE. Half A has the families that rules were"
-    " chosen on, half B the others (`HALF_B` in benchmarks/suites.py)."
+ABOUT = (
+    "MRE after one median scale per image, without a cap. results/accuracy/README.md says what all"
+    " columns are."
 )
 
 
@@ -89,10 +72,9 @@ def suite_page(page: Path, frame: pd.DataFrame, note: str = "") -> str:
     if len(scored):
         table = page.with_suffix(".csv")
         _by_pair(scored).to_csv(table, float_format="%.4f")
-        blocks.append(f"[{table.name}]({table.name}) has every pair: {ABOUT_PAIRS}")
-        blocks += ["## By half", ABOUT_HALVES, _halves(scored)]
-        blocks += ["## By family", ABOUT_ERRORS, _by_family(scored)]
-        blocks += ["## Sigma", ABOUT_SIGMA]
+        blocks.append(f"[The table by pair]({table.name}). {ABOUT}")
+        blocks += ["## By half", _halves(scored)]
+        blocks += ["## By family", _by_family(scored)]
         if plot_sigma(page.with_suffix(".png"), frame):
             blocks.append(f"![Sparsification by sigma, and its reliability]({page.stem}.png)")
     return page_text(blocks, frame)

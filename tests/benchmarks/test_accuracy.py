@@ -157,7 +157,7 @@ def test_two_pages_are_compared_by_family_and_half(tmp_path):
     table = (tmp_path / "before/shared.csv").read_text().splitlines()
     assert table[0] == "pair,flow,family,solution,constant,CPU s"
     assert table[1] == "a,dis,street,0.0300,0.0400,1"
-    assert "[shared.csv](shared.csv)" in page.read_text()
+    assert "[The table by pair](shared.csv)" in page.read_text()
     assert main(["compare", str(tmp_path), str(tmp_path)]) == 2
 
 
