@@ -1,4 +1,4 @@
-"""Print rows of the tables of depth_prior.md.
+"""Print rows of the tables of depth_prior.md and results/depth_prior.csv.
 
     PYTHONPATH=. python docs/prior_table.py DATA nlp [NAME...]
 
