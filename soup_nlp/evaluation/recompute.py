@@ -174,6 +174,15 @@ def shrinkage(
     return np.asarray(x[labels])
 
 
+def ground(s: State, labels: Int, K: Float, p: Float) -> Float:
+    """(H, W) log depth of the plane of a ground p (3,) relative to the planes of a soup, equation
+    32; inf above the horizon, and where a plane does not face its pixel."""
+    v, u = np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]]
+    inverse = np.linalg.solve(K.T, p) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
+    ratio = inverse.reshape(labels.shape) * depth_map(s, labels, K)
+    return np.where(ratio > 0, -np.log(np.where(ratio > 0, ratio, 1.0)), np.inf)
+
+
 def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float]:
     """Errors of a depth z to the truth gt, both NaN where unknown, by their names in summary.json.
 

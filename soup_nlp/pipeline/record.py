@@ -115,6 +115,8 @@ class Run(Case):
         refined: Result of the refinement of `solution`; None where it is off.
         full: Depth at the images' own size, where the pair was solved at a smaller one.
         shrinkage: (N,) change of log depth of what is drawn; None without detail.
+        ground: (3,) its inverse depth along a ray is their product, 0 without one; None without
+            detail.
     """
 
     solution: Solution
@@ -126,6 +128,7 @@ class Run(Case):
     refined: Refined | None = None
     full: FullSize | None = None
     shrinkage: Float | None = None
+    ground: Float | None = None
 
     def __str__(self) -> str:
         h, w = self.pair.size

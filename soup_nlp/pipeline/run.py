@@ -12,6 +12,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 from pydantic import BaseModel
 
+from soup_nlp.arrays import Float
 from soup_nlp.config.problem import (
     Expected,
     OutputOptions,
@@ -36,13 +37,14 @@ from soup_nlp.model.energy_options import EnergyOptions
 from soup_nlp.model.formulation import FormulationOptions
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run, full_size
-from soup_nlp.refine.detail import detail, shrinkage
+from soup_nlp.refine.detail import above_ground, detail, shrinkage
 from soup_nlp.refine.mppbp import refine_soup
 from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined, RefineOptions
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
-from soup_nlp.start.regions import likeness
+from soup_nlp.start.regions import SCENE, likeness
+from soup_nlp.start.scales import ground
 from soup_nlp.start.views import StartOptions
 from soup_nlp.storage.progress import Listener, Watch
 
@@ -156,7 +158,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
     assert pair.flow is not None
     energy = case.data, case.weights, case.formulation()
     sure = confidence(planes, pair, case.start, *energy, case.given)
-    moved = None
+    moved = level = None
     if refined is not None and case.problem.refine.detail:
         drawn = sure.kind == KINDS.index("drawn")
         moved = shrinkage(planes, case.data, likeness(case.segmentation), sure.own_sigma, drawn)
@@ -164,7 +166,9 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         if not case.start.at_rest:
             used = ~case.start.bends & case.data.pixel_weight.any(axis=1)
             beside = beside + detail(planes, pair.flow, pair.K_next, used)
-        after = dense(beside)
+        level = _ground(case, soup)
+        above = above_ground(planes, beside, level, pair.K_ref)
+        after = dense(np.where(sure.kind == KINDS.index("measured"), beside, above))
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.original is None else full_size(case.original, pair, after)
     start = plane_depth(case.start.soup, labels, pair.K_ref)
@@ -187,7 +191,18 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
         refined=refined,
         full=full,
         shrinkage=moved,
+        ground=level,
     )
+
+
+def _ground(case: Case, soup: Soup) -> Float:
+    """The ground of a soup, see `ground`, by what flow determines of the scene."""
+    start, anchor, options = case.start, case.data.anchor_ray, case.problem.start
+    if not (options.upright and options.ground):
+        return np.zeros(3)
+    known = (start.component == SCENE) & ~start.interpolated & ~start.bends
+    area = np.where(known, case.segmentation.sizes, 0.0)
+    return ground(anchor, 1 / soup.depth_at(anchor), area, case.problem.seed)
 
 
 def skipped(case: Case) -> Solution:

@@ -4,7 +4,8 @@ By plane plus parallax: the plane and motion of a superpixel predict where its p
 their flow differs from that along the epipolar lines is the parallax of points before or behind the
 plane (M. Irani, P. Anandan, ECCV 1996). Errors of the flow have no such direction: what it differs
 across the lines tells how much of the parallax is error, and so does the round trip of a pixel.
-Superpixels that are drawn, whose depth nothing tells, move between their neighbours.
+Superpixels that are drawn, whose depth nothing tells, move between their neighbours. Nothing that
+is not measured lies below the ground.
 """
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.sparse.linalg import spsolve
 
 from soup_nlp.arrays import Float, Mask
 from soup_nlp.data.pair import Flow
-from soup_nlp.geometry.camera import pixel_grid
+from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Reconstruction
 from soup_nlp.model.energy_data import EnergyData
 
@@ -89,3 +90,11 @@ def shrinkage(
     matrix = change.T @ sparse.diags(weight) @ change + sparse.diags(1 / variance[free])
     out[free] = spsolve(matrix.tocsc(), -change.T @ (weight * step))
     return out
+
+
+def above_ground(planes: Reconstruction, beside: Float, ground: Float, K_ref: Float) -> Float:
+    """(H, W) log depth relative to the planes, `beside` (H, W), of points that are not below the
+    ground, equation 32; for its p (3,) see `start.scales.ground`."""
+    inverse = np.maximum(rays(K_ref, pixel_grid(*beside.shape)) @ ground, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.fmin(beside, -np.log(inverse * planes.depth_ref))

@@ -182,6 +182,10 @@ def _beside(tree: Mapping[str, Any], soup: recompute.State, labels: Int) -> Floa
         drawn = tree["confidence"]["kind"] == KINDS.index("drawn")
         parts = tree["energy"], tree["segmentation"], labels, tree["confidence"]["own_sigma"]
         out = out + recompute.shrinkage(soup, *parts, drawn)
+    if "ground" in tree["depth"]:
+        lowest = recompute.ground(soup, labels, tree["input"]["K_ref"], tree["depth"]["ground"])
+        measured = tree["confidence"]["kind"] == KINDS.index("measured")
+        out = np.where(measured, out, np.minimum(out, lowest))
     return out
 
 

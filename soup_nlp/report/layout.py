@@ -108,6 +108,7 @@ depth/ref                 soup  H,W     z of the reference frame, NaN if none
 depth/next                soup  H,W     z of the next frame, NaN if none
 depth/detail              1     H,W     log z of the reference frame relative to the planes
 depth/shrinkage           1     N       part of the detail: of what is drawn, towards its neighbours
+depth/ground              1/soup  3     the ground: its product with a ray is an inverse depth; or 0
 depth/start_ref           soup  H,W     the start's z, reference frame
 depth/rigid_ref           translations  H,W  z by one rigid motion, reference frame
 depth/nlp_ref             soup  H,W     the NLP's z, reference frame
@@ -186,6 +187,7 @@ def result_tree(run: Run) -> ReadTree:
             "next": rec.depth_next,
             "detail": rec.detail,
             "shrinkage": run.shrinkage,
+            "ground": run.ground,
             **{DEPTHS[name]: run.depth_maps.get(name) for name in ("start", "rigid", "nlp")},
             "sigma_ref": rec.sigma_ref,
             "sigma_next": rec.sigma_next,

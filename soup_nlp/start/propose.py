@@ -197,7 +197,11 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
             component = numbered(np.where(mask, regions, component))
     reliable = ~interpolated & rigid.views.usable
     component = _scene_first(component, ~fixed)
-    floor = ground(flow, 1 / soup.depth_at(views.anchor), reliable & (component == SCENE))
+    floor = np.zeros(len(seg))
+    if o.upright and o.ground:
+        area = np.where(reliable & (component == SCENE), seg.sizes, 0.0)
+        p = ground(views.anchor, 1 / soup.depth_at(views.anchor), area, flow.seed)
+        floor = np.maximum(views.anchor @ p, 0.0)
     order = vote(contrast, component, seg)
     scale, origin = scaled(flow, soup, component, order, fixed, floor)
     soup = replace(soup, lam=soup.lam * scale)

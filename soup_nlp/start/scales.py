@@ -212,21 +212,20 @@ GROUND_TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
 
-def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
-    """(N,) inverse depth of the ground at the anchors; 0 above the horizon and without a ground.
+def ground(ray: Float, mu: Float, weight: Float, seed: int) -> Float:
+    """(3,) p of the ground, whose inverse depth along a ray r is `p . r`; zeros without a ground.
 
-    It follows from the inverse depth mu (N,) of the anchors where that is reliable (N,). None is
-    sought unless the options `upright` and `ground` are set.
+    It follows from the inverse depths mu (N,) along the rays (N, 3) of an upright image, where
+    their weight (N,), an area in pixels, is not 0.
     """
-    none, at = np.zeros(len(mu)), np.flatnonzero(reliable)
-    ray, weight, o = flow.views.anchor, flow.seg.sizes.astype(float), flow.options
-    if len(at) < 20 or not (o.upright and o.ground):
+    none, at = np.zeros(3), np.flatnonzero(weight)
+    if len(at) < 20:
         return none
     # inverse depth of a plane is linear in the ray; (x, y, 1) . p with p along the normal
     low = at[ray[at, 1] > np.quantile(ray[at, 1], 0.4)]
     if len(low) < 3:
         return none
-    three = np.random.default_rng(flow.seed).choice(low, (GROUND_TRIALS, 3))
+    three = np.random.default_rng(seed).choice(low, (GROUND_TRIALS, 3))
     three = three[np.abs(np.linalg.det(ray[three])) > 1e-6]
     planes = np.linalg.solve(ray[three], mu[three][..., None])[..., 0]
     planes = planes[planes[:, 1] > LEVEL * np.linalg.norm(planes, axis=1)]
@@ -237,19 +236,17 @@ def ground(flow: FlowFit, mu: Float, reliable: Mask) -> Float:
         plane_mu = planes @ ray[at].T
         return np.asarray((plane_mu > 0) & (np.abs(mu[at] - plane_mu) < ON * np.abs(plane_mu)))
 
-    under = (mu[at] < (1 - OFF) * (planes @ ray[at].T)) @ weight[at]
-    best = planes[np.argmax(on(planes) @ weight[at] - under)]
+    below = (mu[at] < (1 - OFF) * (planes @ ray[at].T)) @ weight[at]
+    best = planes[np.argmax(on(planes) @ weight[at] - below)]
     for _ in range(3):
         inliers = at[on(best)]
         root = np.sqrt(weight[inliers]) / mu[inliers]
         best = np.linalg.lstsq(ray[inliers] * root[:, None], mu[inliers] * root)[0]
     plane_mu = ray @ best
-    below = (plane_mu > 0) & (mu < (1 - OFF) * plane_mu)
-    total, area_on, under = weight[at].sum(), weight[at][on(best)].sum(), reliable & below
+    under = (weight > 0) & (plane_mu > 0) & (mu < (1 - OFF) * plane_mu)
+    total, area_on = weight.sum(), weight[at][on(best)].sum()
     most = LEAST_ON * total if _level(mu, plane_mu, under, weight) else area_on
-    if area_on < LEAST_ON * total or weight[under].sum() > most:
-        return none
-    return np.maximum(plane_mu, 0.0)
+    return none if area_on < LEAST_ON * total or weight[under].sum() > most else best
 
 
 def _level(mu: Float, floor: Float, under: Mask, weight: Float) -> bool:

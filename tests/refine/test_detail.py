@@ -9,10 +9,11 @@ from helpers_model import HEIGHT, K_NEXT, K_REF, WIDTH, Tiny, random_soup
 
 from soup_nlp.data.pair import Flow
 from soup_nlp.evaluation import recompute
-from soup_nlp.geometry.camera import pixel_grid
+from soup_nlp.evaluation.confidence import KINDS
+from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Reconstruction, Soup, plane_depth, reconstruct
 from soup_nlp.pipeline.run import make_run, skipped
-from soup_nlp.refine.detail import STEP, detail, shrinkage
+from soup_nlp.refine.detail import STEP, above_ground, detail, shrinkage
 from soup_nlp.start.regions import likeness
 
 LABELS = np.kron(np.arange(12).reshape(3, 4), np.ones((HEIGHT // 3, WIDTH // 4), int))
@@ -148,7 +149,7 @@ def test_a_lone_superpixel_that_is_drawn_stays():
     assert not again.any()
 
 
-def test_a_run_delivers_what_is_drawn_shrunk(small_room):
+def test_a_run_delivers_what_is_drawn_shrunk_and_above_the_ground(small_room):
     # before a camera at rest all is drawn, and the flow gives no detail
     case = replace(small_room, start=replace(small_room.start, at_rest=True))
     solution = skipped(case)
@@ -156,5 +157,33 @@ def test_a_run_delivers_what_is_drawn_shrunk(small_room):
     planes = plane_depth(done.soup, case.segmentation.labels, case.pair.K_ref)
     assert np.abs(done.shrinkage).max() > 0.01
     change = np.log(done.reconstruction.depth_ref / planes)
-    np.testing.assert_allclose(change, done.shrinkage[case.segmentation.labels], atol=1e-12)
+    labels, shrunk = case.segmentation.labels, done.shrinkage[case.segmentation.labels]
+    lowest = recompute.ground(vars(done.soup), labels, case.pair.K_ref, done.ground)
+    assert 0.01 < (lowest < shrunk).mean() < 0.5
+    np.testing.assert_allclose(change, np.minimum(shrunk, lowest), atol=1e-12)
     assert make_run(case, solution).shrinkage is None
+    # measured depth stays
+    done = make_run(small_room, solution, SimpleNamespace(soup=solution.soup))
+    measured, below = (
+        done.confidence.kind == KINDS.index("measured"),
+        done.reconstruction.detail > lowest + 1e-12,
+    )
+    assert below[measured].any()
+    assert not below[~measured].any()
+
+
+def test_nothing_lies_below_the_ground():
+    tiny = Tiny()
+    planes, labels = reconstruct(tiny.soup, tiny.seg.labels, K_REF, K_NEXT), tiny.seg.labels
+    p = np.array([0.1, 6.0, 0.3]) / np.median(planes.depth_ref)
+    inverse = rays(K_REF, pixel_grid(*labels.shape)) @ p
+    found = planes.depth_ref * np.exp(above_ground(planes, BUMPS, p, K_REF))
+    bumps, under = planes.depth_ref * np.exp(BUMPS), inverse > 0
+    under[under] &= bumps[under] > 1 / inverse[under]
+    assert 0.1 < under.mean() < 0.9
+    np.testing.assert_allclose(found[under], 1 / inverse[under])
+    np.testing.assert_array_equal(found[~under], bumps[~under])
+    again = np.minimum(BUMPS, recompute.ground(vars(tiny.soup), labels, K_REF, p))
+    np.testing.assert_allclose(found, planes.depth_ref * np.exp(again), rtol=1e-12)
+    # without a ground nothing changes
+    np.testing.assert_array_equal(above_ground(planes, BUMPS, np.zeros(3), K_REF), BUMPS)

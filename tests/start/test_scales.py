@@ -156,7 +156,8 @@ def moving(Z: np.ndarray) -> Soup:
 
 def lift(flow, Z, reliable, component):
     scene = component * ALL == SCENE
-    floor = ground(flow, 1 / Z, reliable & scene)
+    ray = flow.views.anchor
+    floor = np.maximum(ray @ ground(ray, 1 / Z, np.where(reliable & scene, 1.0, 0.0), 0), 0.0)
     soup, lifted = on_ground(flow, moving(Z), floor, reliable, component * ALL)
     np.testing.assert_array_equal(lifted, ~np.isclose(soup.depth_at(flow.views.anchor), Z))
     return soup
@@ -172,7 +173,7 @@ def test_without_a_ground_nothing_moves(flow, why):
         Z = 5 / (1 + 0.8 * ray[:, 1])
     else:
         Z = np.random.default_rng(0).uniform(3, 30, len(Z))
-    assert (ground(flow, 1 / Z, ALL) == 0).all()
+    assert (ground(ray, 1 / Z, ALL * 1.0, 0) == 0).all()
 
 
 @pytest.mark.parametrize(
