@@ -24,6 +24,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run
 from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.start import camera_error
+from soup_nlp.storage.each import Row, measure_all
 
 # drawn cases are the same in every run, without a time limit on a busy machine
 settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=40)
@@ -121,6 +122,17 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
         return capsys.readouterr().err
 
     return run
+
+
+@pytest.fixture
+def compares_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Comparisons run solvers in this process, which has no limits: a new one takes seconds."""
+
+    def measured(*args: Any, fresh: bool, seconds: float, **options: Any) -> list[Row]:
+        return measure_all(*args, **options)
+
+    monkeypatch.setattr("soup_nlp.export.compare.measure_all", measured)
+    monkeypatch.setattr("soup_nlp.export.compare.limit_process", lambda *_: None)
 
 
 @pytest.fixture(scope="session")
