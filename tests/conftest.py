@@ -4,7 +4,7 @@ import gc
 import hashlib
 import pickle
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run
 from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.start import camera_error
-from soup_nlp.storage.each import Row, measure_all
+from soup_nlp.storage import each as jobs
 
 # drawn cases are the same in every run, without a time limit on a busy machine
 settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=40)
@@ -124,14 +124,26 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     return run
 
 
+@pytest.fixture(scope="module")
+def simple_starts() -> Iterator[None]:
+    """One start of a pair, and one kind of error of its camera, in the tests of a module.
+
+    For what is done with results, whose time is mostly that of the starts.
+    """
+    kind = "zoom between the frames"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline_case, "STARTS", 1)
+        patch.setattr(camera_error, "ERROR_KINDS", {kind: camera_error.ERROR_KINDS[kind]})
+        # not what is known of all kinds
+        patch.setattr(evidence, "camera_errors", once(camera_error.camera_errors))
+        patch.setattr(confidence, "evidence", once(evidence.evidence))
+        yield
+
+
 @pytest.fixture
-def compares_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Comparisons run solvers in this process, which has no limits: a new one takes seconds."""
-
-    def measured(*args: Any, fresh: bool, seconds: float, **options: Any) -> list[Row]:
-        return measure_all(*args, **options)
-
-    monkeypatch.setattr("soup_nlp.export.compare.measure_all", measured)
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jobs run in this process and without limits, as a new one takes seconds to begin."""
+    monkeypatch.setattr(jobs, "_in_processes", lambda works, *_: jobs.each(works))
     monkeypatch.setattr("soup_nlp.export.compare.limit_process", lambda *_: None)
 
 

@@ -21,7 +21,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.scenes.catalogue import render_scene
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -74,7 +74,7 @@ def run_line(words):
     return subprocess.run([program, *words[1:]], check=False).returncode
 
 
-@pytest.mark.usefixtures("reader", "compares_here")
+@pytest.mark.usefixtures("reader", "one_process")
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_runs_as_printed(page, monkeypatch):
     # the instances of the family are small, and come from records of their size

@@ -16,7 +16,6 @@ from helpers_files import sets, write_pair
 from kill_table import start
 
 import soup_nlp
-from soup_nlp.batches import run as batches
 from soup_nlp.batches.run import _claimed, batch, interval, page, table
 from soup_nlp.batches.sources import problems_of
 from soup_nlp.cli.main import main
@@ -24,6 +23,8 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.storage.each import each, read_rows
+
+pytestmark = pytest.mark.usefixtures("simple_starts")
 
 TINY = [
     *("segmentation.superpixels=12", "segmentation.neighbours=4", "energy.pixel_samples=4"),
@@ -142,13 +143,8 @@ def rows_of(out: Path) -> dict[str, dict[str, str]]:
         return {row["pair"]: row for row in csv.DictReader(file)}
 
 
-def in_this_process(monkeypatch) -> None:
-    """From now on a batch starts no processes, which take longer than what they solve."""
-    monkeypatch.setattr(batches, "each", lambda jobs, *_, **__: each(jobs))
-
-
 @pytest.mark.slow
-def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys, monkeypatch):
+def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys, request):
     root, out = tmp_path / "in", tmp_path / "out"
     shutil.copytree(pairs, root)
     words = ["batch", str(root), "-o", str(out), "--workers", "2", *TINY_SET]
@@ -165,7 +161,7 @@ def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys, monkeypatch):
     assert "3 of 3 pairs, 1 failed" in capsys.readouterr().out
     # what is finished is kept; what was replaced under its name, or repaired, is solved
     solved = len(read_rows(out / "pairs.jsonl"))
-    in_this_process(monkeypatch)
+    request.getfixturevalue("one_process")
     assert main(words) == 1
     assert len(read_rows(out / "pairs.jsonl")) == solved == 2
     for name in ("frame_0.png", "frame_1.png", "K.txt"):
@@ -186,7 +182,7 @@ def four(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_and_two_runs_solve_no_pair_twice(four, tmp_path, monkeypatch):
+def test_a_killed_run_goes_on_and_two_runs_solve_no_pair_twice(four, tmp_path, request):
     out = tmp_path / "out"
     command = ["batch", str(four), "-o", str(out), "-q", *TINY_SET]
     run = start(command)
@@ -197,7 +193,7 @@ def test_a_killed_run_goes_on_and_two_runs_solve_no_pair_twice(four, tmp_path, m
     kept = read_rows(out / "pairs.jsonl")
     # as if it had been killed between the row and its mark
     (out / "pairs" / f"{kept[0]['key']}.claim").write_text(f"{os.uname().nodename} {run.pid} 1")
-    in_this_process(monkeypatch)
+    request.getfixturevalue("one_process")
     runs = [start(command) for _ in range(2)]
     for run in runs:
         run.join()

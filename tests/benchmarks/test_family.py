@@ -239,7 +239,7 @@ open(stub + ".sol", "w").write("\\n".join(map(str, [*head, *values, "objno 0 0"]
 """
 
 
-@pytest.mark.usefixtures("compares_here")
+@pytest.mark.usefixtures("one_process")
 def test_a_solver_of_ones_own_is_a_command_line(folder, tmp_path, monkeypatch, capsys):
     """The recipe of docs/adding.md: a program that reads .nl, found by its name on the PATH."""
     program = tmp_path / "mine"
