@@ -36,7 +36,7 @@ from soup_nlp.start.bending import (
 from soup_nlp.start.labelling import IN_NOISE, LEAST_NOISE, Labelling, dominant, labelled
 from soup_nlp.start.views import FlowFit
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 UNORDERED = "energy.weights.order=0"  # leaves out the order that occlusion shows
 
