@@ -4,7 +4,7 @@ import gc
 import hashlib
 import pickle
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case, Run
 from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.start import camera_error
+from soup_nlp.storage import each as jobs
 
 # drawn cases are the same in every run, without a time limit on a busy machine
 settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=40)
@@ -66,10 +67,11 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 SLOWEST = (
-    *("test_batches", "test_bending", "test_walkthrough", "test_sequence", "test_stop"),
-    *("test_symbolic", "test_compare", "test_given_depth", "test_family"),
-    *("test_odd_inputs", "test_stored_json"),
+    *("test_walkthrough", "test_bending", "test_batches", "test_sequence", "test_family"),
+    *("test_recipes", "test_given_depth", "test_evidence", "test_odd_inputs", "test_compare"),
+    *("test_no_parallax", "test_solve", "test_stop", "test_scenes", "test_symbolic"),
 )
+ORDER = {name: number for number, name in enumerate(SLOWEST)}
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -79,7 +81,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The slowest files come first, so that no worker has one left at the end."""
-    items.sort(key=lambda item: item.path.stem not in SLOWEST)
+    items.sort(key=lambda item: ORDER.get(item.path.stem, len(ORDER)))
 
 
 def pytest_collection_finish() -> None:
@@ -121,6 +123,29 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
         return capsys.readouterr().err
 
     return run
+
+
+@pytest.fixture(scope="module")
+def simple_starts() -> Iterator[None]:
+    """One start of a pair, and one kind of error of its camera, in the tests of a module.
+
+    For what is done with results, whose time is mostly that of the starts.
+    """
+    kind = "zoom between the frames"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline_case, "STARTS", 1)
+        patch.setattr(camera_error, "ERROR_KINDS", {kind: camera_error.ERROR_KINDS[kind]})
+        # not what is known of all kinds
+        patch.setattr(evidence, "camera_errors", once(camera_error.camera_errors))
+        patch.setattr(confidence, "evidence", once(evidence.evidence))
+        yield
+
+
+@pytest.fixture
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jobs run in this process and without limits, as a new one takes seconds to begin."""
+    monkeypatch.setattr(jobs, "_in_processes", lambda works, *_: jobs.each(works))
+    monkeypatch.setattr("soup_nlp.export.compare.limit_process", lambda *_: None)
 
 
 @pytest.fixture(scope="session")

@@ -22,6 +22,8 @@ from soup_nlp.geometry.camera import intrinsics
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.report.check import check_folder
 
+pytestmark = pytest.mark.usefixtures("simple_starts")
+
 ROOT = Path(__file__).resolve().parents[1]
 
 # --- the recipes of docs/adding.md -------------------------------------------------------------

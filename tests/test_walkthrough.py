@@ -21,7 +21,7 @@ from soup_nlp.cli.main import main
 from soup_nlp.config.problem import Problem
 from soup_nlp.data.scenes.catalogue import render_scene
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -38,10 +38,10 @@ SOLVES = {"solve", "demo", "chain"}
 def small(tree):
     """The sections of a problem file with small sizes."""
     segmentation = {**tree.get("segmentation", {})}
-    segmentation["superpixels"] = min(segmentation.get("superpixels", 40), 40)
-    sizes = {"max_size": 0.03, "segmentation": segmentation}
+    segmentation["superpixels"] = min(segmentation.get("superpixels", 30), 30)
+    sizes = {"max_size": 0.01, "segmentation": segmentation}
     if isinstance(tree.get("input"), dict) and tree["input"].get("kind") == "scene":
-        sizes["input"] = {**tree["input"], "width": 192, "height": 96}
+        sizes["input"] = {**tree["input"], "width": 128, "height": 64}
     return {**tree, **sizes}
 
 
@@ -52,7 +52,7 @@ def reader(tmp_path, monkeypatch):
     monkeypatch.setattr(webbrowser, "open", lambda address: True)
     (tmp_path / "clip").mkdir()
     for frame in (1, 0):
-        pair = render_scene("orbit", width=192, height=96, frame=frame)
+        pair = render_scene("orbit", width=128, height=64, frame=frame)
         write_pair(tmp_path / "clip", pair, [f"{frame}", f"{frame + 1}"])
     np.save("prior.npy", pair.truth.depth_ref)
     for name, frame in (("a", 0), ("b", 1)):
@@ -74,7 +74,7 @@ def run_line(words):
     return subprocess.run([program, *words[1:]], check=False).returncode
 
 
-@pytest.mark.usefixtures("reader")
+@pytest.mark.usefixtures("reader", "one_process")
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_runs_as_printed(page, monkeypatch):
     # the instances of the family are small, and come from records of their size

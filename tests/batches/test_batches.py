@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers_files import sets, write_pair
+from kill_table import start
 
 import soup_nlp
 from soup_nlp.batches.run import _claimed, batch, interval, page, table
@@ -22,6 +23,8 @@ from soup_nlp.config.problem import make_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.storage.each import each, read_rows
+
+pytestmark = pytest.mark.usefixtures("simple_starts")
 
 TINY = [
     *("segmentation.superpixels=12", "segmentation.neighbours=4", "energy.pixel_samples=4"),
@@ -141,7 +144,7 @@ def rows_of(out: Path) -> dict[str, dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys):
+def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys, request):
     root, out = tmp_path / "in", tmp_path / "out"
     shutil.copytree(pairs, root)
     words = ["batch", str(root), "-o", str(out), "--workers", "2", *TINY_SET]
@@ -158,6 +161,7 @@ def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys):
     assert "3 of 3 pairs, 1 failed" in capsys.readouterr().out
     # what is finished is kept; what was replaced under its name, or repaired, is solved
     solved = len(read_rows(out / "pairs.jsonl"))
+    request.getfixturevalue("one_process")
     assert main(words) == 1
     assert len(read_rows(out / "pairs.jsonl")) == solved == 2
     for name in ("frame_0.png", "frame_1.png", "K.txt"):
@@ -169,10 +173,6 @@ def test_a_batch_keeps_what_is_finished(pairs, tmp_path, capsys):
     assert rows_of(out)["0_orbit"] == rows["0_orbit"]
 
 
-def command(pairs: Path, out: Path) -> list[str]:
-    return [sys.executable, "-m", "soup_nlp", "batch", str(pairs), "-o", str(out), "-q", *TINY_SET]
-
-
 @pytest.fixture(scope="module")
 def four(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("four")
@@ -182,18 +182,22 @@ def four(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_and_two_runs_solve_no_pair_twice(four, tmp_path):
+def test_a_killed_run_goes_on_and_two_runs_solve_no_pair_twice(four, tmp_path, request):
     out = tmp_path / "out"
-    run = subprocess.Popen(command(four, out))
+    command = ["batch", str(four), "-o", str(out), "-q", *TINY_SET]
+    run = start(command)
     while len(read_rows(out / "pairs.jsonl")) < 1:
         time.sleep(0.05)
     run.kill()
-    run.wait()
+    run.join()
     kept = read_rows(out / "pairs.jsonl")
     # as if it had been killed between the row and its mark
     (out / "pairs" / f"{kept[0]['key']}.claim").write_text(f"{os.uname().nodename} {run.pid} 1")
-    runs = [subprocess.Popen(command(four, out)) for _ in range(2)]
-    assert [run.wait() for run in runs] == [0, 0]
+    request.getfixturevalue("one_process")
+    runs = [start(command) for _ in range(2)]
+    for run in runs:
+        run.join()
+    assert [run.exitcode for run in runs] == [0, 0]
     rows = read_rows(out / "pairs.jsonl")
     assert rows[: len(kept)] == kept
     assert sorted(row["key"] for row in rows) == [f"orbit_{k}" for k in range(4)]

@@ -15,7 +15,7 @@ from benchmarks.table import Cell, Item, frame_of
 from soup_nlp.errors import ConfigError
 from soup_nlp.storage.each import Row, attempt, read_rows
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 
 def test_suites_list_the_papers_pairs(tmp_path):

@@ -12,7 +12,7 @@ from benchmarks.table import Cell, frame_of
 from soup_nlp.evaluation.confidence import ADDED, FACTORS
 from soup_nlp.storage.each import append_row, read_rows
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 
 def test_the_plan_has_every_run_once_small_ones_first():
@@ -37,6 +37,7 @@ def test_bad_input_ends_with_2(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("one_process")
 def test_a_real_run_and_its_table(tmp_path):
     size = ["--scenes", "street", "--superpixels", "12", "--neighbours", "4", "--widths", "64"]
     small = sets("solver.presolve_eps=[0.3] solver.presolve_iterations=3 solver.max_iter=1")

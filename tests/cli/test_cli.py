@@ -14,7 +14,7 @@ from helpers_files import sets, write_flo, write_pair
 from soup_nlp.cli.main import main
 from soup_nlp.data.scenes.catalogue import render_scene
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 SMALL = sets(
     "input.width=144 input.height=96 segmentation.superpixels=25 segmentation.neighbours=6"

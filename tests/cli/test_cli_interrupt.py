@@ -21,7 +21,7 @@ from soup_nlp.report import folder as folders
 from soup_nlp.storage.folders import SUMS
 from soup_nlp.storage.progress import interruptible
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 SMALL = sets(
     "input.width=96 input.height=72 flow.source=truth segmentation.superpixels=12"

@@ -19,7 +19,7 @@ from soup_nlp.config.problem import load_problem
 from soup_nlp.data.scenes.catalogue import render_scene
 from soup_nlp.storage.folders import SUMS, Sums, write_sums
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("solves_once")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts", "solves_once")]
 
 SMALL = sets(
     "input.width=112 input.height=84 refine.from_start=true refine.rounds=1 refine.particles=4"

@@ -22,7 +22,7 @@ from soup_nlp.errors import ConfigError, DataError
 from soup_nlp.pipeline.run import ProblemKeys
 from soup_nlp.report.check import check_folder
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 SMALL = {"superpixels": 12, "neighbours": 4}
 

@@ -17,6 +17,8 @@ from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.refine.records import Refined
 from soup_nlp.report.verdict import facts
 
+pytestmark = pytest.mark.usefixtures("simple_starts")
+
 IMAGE = np.zeros((40, 60, 3), np.uint8)
 K = intrinsics(60, 60, 30, 20)
 

@@ -266,6 +266,11 @@ def test_other_components_are_less_sure_than_the_scene(small_room, sure):
     np.testing.assert_allclose(sure.component_sigma[1], 1 / np.sqrt(raw**-2 + PRIOR**-2))
 
 
+def test_a_case_knows_how_far_its_starts_are_apart(small_room):
+    """There are several, each from other samples of the flow."""
+    assert np.mean(small_room.start.scatter > 0) > 0.5
+
+
 @pytest.mark.slow
 def test_depth_is_less_sure_where_the_starts_disagree(small_room, sure):
     labels = small_room.segmentation.labels

@@ -13,6 +13,7 @@ from soup_nlp.geometry import rotation
 from soup_nlp.geometry.camera import project, rays
 from soup_nlp.geometry.soup import Soup
 from soup_nlp.model.energy_data import EnergyData
+from soup_nlp.pipeline import case as pipeline_case
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, skipped
 from soup_nlp.report.findings import hints
@@ -179,8 +180,9 @@ def test_too_few_matches_show_no_error():
     assert Evidence(np.zeros(0), camera_errors(few)).camera is None
 
 
-def started(pair: Pair):
-    """The start of a pair as a run, and what is said of it."""
+def started(pair: Pair, monkeypatch):
+    """One start of a pair as a run, and what is said of it."""
+    monkeypatch.setattr(pipeline_case, "STARTS", 1)
     raw = {"input": {"kind": "motorcycle"}, "segmentation": {"superpixels": 50}}
     case = prepare(make_problem(raw), pair=pair)
     done = make_run(case, skipped(case))
@@ -188,15 +190,15 @@ def started(pair: Pair):
 
 
 @pytest.mark.slow
-def test_a_wrong_principal_point_makes_depth_unsure():
+def test_a_wrong_principal_point_makes_depth_unsure(monkeypatch):
     orbit = scene_problem("orbit", 320, 136, 50).load_pair()
     K = orbit.K_ref.copy()
     K[0, 2] += 32
-    exact, told = started(replace(orbit, flow=None))
+    exact, told = started(replace(orbit, flow=None), monkeypatch)
     assert exact.good
     assert exact.confidence.evidence.camera is None
     assert "intrinsics" not in told
-    wrong, told = started(replace(orbit, flow=None, K_ref=K, K_next=K))
+    wrong, told = started(replace(orbit, flow=None, K_ref=K, K_next=K), monkeypatch)
     assert "intrinsics" in told
     sigma = np.median(wrong.confidence.sigma), np.median(exact.confidence.sigma)
     assert sigma[0] > 1.3 * sigma[1]
@@ -206,8 +208,8 @@ def test_a_wrong_principal_point_makes_depth_unsure():
 
 
 @pytest.mark.slow
-def test_two_scenes_are_drawn():
+def test_two_scenes_are_drawn(monkeypatch):
     one, other = (scene_problem(name, 320, 136, 50).load_pair() for name in ("room", "street"))
-    done, told = started(replace(one, flow=None, image_next=other.image_next))
+    done, told = started(replace(one, flow=None, image_next=other.image_next), monkeypatch)
     assert not done.good
     assert "same scene" in told

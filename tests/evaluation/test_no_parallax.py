@@ -11,7 +11,7 @@ from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.run import make_run, run, skipped
 from soup_nlp.report.verdict import verdict
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,8 @@ from soup_nlp.export.verify import Limits
 from soup_nlp.model.formulation import Formulation
 from soup_nlp.storage.each import each, read_rows
 
+pytestmark = pytest.mark.usefixtures("simple_starts")
+
 LABEL = {
     "problem": "tiny",
     "identity": "0",
@@ -85,9 +87,12 @@ def test_time_and_memory_are_limited():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ipopt-tuned", "ipopt-adaptive", "pounce"])
-def test_solvers_reach_a_verified_point(name, tmp_path):
+def test_solvers_reach_a_verified_point(name, tmp_path, request):
     if name not in available():
         pytest.skip(f"{name} is not installed")
+    # one of them in a process with limits
+    if name != "ipopt-tuned":
+        request.getfixturevalue("one_process")
     (row,) = run([name], tmp_path)
     assert row["verified"], row
     assert row["status"] != "Time_Limit"
@@ -171,6 +176,7 @@ def quick(limits: Limits) -> Task:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_process")
 def test_runs_resume_and_an_error_is_a_row(tmp_path):
     assert [row["solver"] for row in run(["ipopt-tuned"], tmp_path)] == ["ipopt-tuned"]
     first = (tmp_path / "r.jsonl").read_text()
@@ -205,6 +211,7 @@ def test_files_are_read_before_anything_runs(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_process")
 def test_an_interrupted_comparison_has_a_page_and_goes_on(tmp_path, monkeypatch, capsys):
     pages = []
 

@@ -26,6 +26,8 @@ from soup_nlp.pipeline.record import Case
 from soup_nlp.solve.stages import solve_soup
 from soup_nlp.storage.folders import SUMS
 
+pytestmark = pytest.mark.usefixtures("simple_starts")
+
 KNOWN: dict[str, Case] = {}
 
 

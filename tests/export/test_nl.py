@@ -23,6 +23,8 @@ from soup_nlp.model.programs import build_matrix_nlp, build_tangent_nlp
 from soup_nlp.pipeline.case import prepare
 from soup_nlp.pipeline.record import Case
 
+pytestmark = pytest.mark.usefixtures("simple_starts")
+
 FORMS = [*(Formulation(gauge=gauge) for gauge in GAUGES), Formulation(coordinates="tangent")]
 
 

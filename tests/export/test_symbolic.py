@@ -16,7 +16,7 @@ from soup_nlp.model import oracle
 from soup_nlp.solve.functions import Functions
 from soup_nlp.solve.stages import solve_soup
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = [

@@ -15,7 +15,7 @@ from helpers_odd_results import chain_cases, result_cases
 from helpers_odd_run import Case, fault
 from helpers_odd_world import World
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 CASES: list[Case] = list(
     chain(

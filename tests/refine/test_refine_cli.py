@@ -18,7 +18,7 @@ from soup_nlp.pipeline.run import run
 from soup_nlp.report.check import check_folder
 from soup_nlp.report.result import load
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 SMALL = (
     "input.width=160 input.height=96 segmentation.superpixels=30 segmentation.neighbours=6"

@@ -22,7 +22,7 @@ from soup_nlp.sequence.folder import Contents, renew_page, write_chain
 from soup_nlp.sequence.links import make_chain
 from soup_nlp.storage.files import read_json
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 WRONG = (None, True, 0.5, 10**30, "\n<b>", [], [[]], {"a": {}}, [1, 2, 3])
 """One of each type of JSON, and values that no entry has."""

@@ -26,7 +26,7 @@ from soup_nlp.sequence.links import make_chain
 from soup_nlp.sequence.score import chain_exit_code, chain_lines
 from soup_nlp.sequence.solve import one_camera
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 
 def test_a_chain_is_written(tmp_path):

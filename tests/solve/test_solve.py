@@ -23,7 +23,7 @@ from soup_nlp.solve.kkt import optimality
 from soup_nlp.solve.solver_options import Stages
 from soup_nlp.solve.stages import Solution, _near, solve_soup
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 WEIGHTS = Weights(
     arap=0.15,

@@ -14,7 +14,7 @@ from soup_nlp.config.problem import Problem, load_problem
 from soup_nlp.report.folder import WritableRun
 from soup_nlp.storage.progress import Progress, interruptible
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 SMALL = (
     "input.width=64 input.height=48 flow.source=truth segmentation.superpixels=10"

@@ -36,7 +36,7 @@ from soup_nlp.start.bending import (
 from soup_nlp.start.labelling import IN_NOISE, LEAST_NOISE, Labelling, dominant, labelled
 from soup_nlp.start.views import FlowFit
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 UNORDERED = "energy.weights.order=0"  # leaves out the order that occlusion shows
 
@@ -87,8 +87,7 @@ def test_sheet_bends_and_can_be_told_not_to():
     ("scene", "least", "most"), [("sheet", 0.9, 1), ("banner", 0.2, 0.4), ("street", 0, 0)]
 )
 def test_the_decision_does_not_depend_on_the_number_of_superpixels(scene, least, most, count):
-    wide = "input.width=512", "input.height=218"
-    start = prepare(problem(scene, f"segmentation.superpixels={count}", *wide)).start
+    start = case(scene, f"segmentation.superpixels={count}").start
     assert least <= start.bends.mean() <= most
 
 

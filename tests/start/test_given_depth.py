@@ -26,7 +26,7 @@ from soup_nlp.start.prior_evidence import EXPLAINED, LEAST_MARGIN, edge_margin, 
 from soup_nlp.start.propose import Start, propose
 from soup_nlp.start.regions import ORIGINS
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
 
 WAVE = np.sin(np.mgrid[0:240, 0:320] / 40.0).prod(axis=0)
 """A smooth map that is independent of the scene."""

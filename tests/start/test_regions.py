@@ -15,6 +15,8 @@ from soup_nlp.model.reweighting import in_pixels
 from soup_nlp.pipeline.run import run
 from soup_nlp.start.regions import ORIGINS
 
+pytestmark = pytest.mark.usefixtures("simple_starts")
+
 K = camera.intrinsics(50.0, 50.0, 15.5, 7.5)
 
 

@@ -34,6 +34,8 @@ from soup_nlp.storage.folders import (
 from soup_nlp.storage.store import write_h5
 from soup_nlp.storage.system import deferred_signals, scratch
 
+pytestmark = pytest.mark.usefixtures("simple_starts")
+
 
 def put(folder: Path, files: Mapping[str, str]) -> None:
     """Write files by name, with their folders."""
