@@ -195,17 +195,17 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
             # each connected region of the mask is a component
             regions = component.max() + 1 + connected_pieces(mask, seg)
             component = numbered(np.where(mask, regions, component))
-    reliable = ~interpolated & rigid.views.usable
     component = _scene_first(component, ~fixed)
+    known = ~interpolated & rigid.views.usable & (component == SCENE)
     floor = np.zeros(len(seg))
     if o.upright and o.ground:
-        area = np.where(reliable & (component == SCENE), seg.sizes, 0.0)
+        area = np.where(known, seg.sizes, 0.0)
         p = ground(views.anchor, 1 / soup.depth_at(views.anchor), area, flow.seed)
         floor = np.maximum(views.anchor @ p, 0.0)
     order = vote(contrast, component, seg)
     scale, origin = scaled(flow, soup, component, order, fixed, floor)
     soup = replace(soup, lam=soup.lam * scale)
-    soup, lifted = on_ground(flow, soup, floor, reliable, component)
+    soup, lifted = on_ground(flow, soup, floor, known, component)
     wrong = (wrong | lifted) & ~bends
     piece = connected_pieces(wrong, seg)
     large = np.bincount(piece[wrong], minlength=1)[piece] >= PIECE_SIZE

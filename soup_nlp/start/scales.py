@@ -208,6 +208,9 @@ second on it lies below."""
 LEAST_ON = 0.05
 """Of the area with known depth, the least share on the ground, and the largest share of another
 surface below it. Of wrong flow less must lie below it than on it."""
+LOWEST = 5.0
+"""Depth relative to that of the ground up to which a surface may lie below it, as beside a dam:
+then four times as low as the ground. More is wrong flow; 3 to 10 score alike."""
 GROUND_TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
@@ -263,19 +266,15 @@ def _level(mu: Float, floor: Float, under: Mask, weight: Float) -> bool:
 
 
 def on_ground(
-    flow: FlowFit, soup: Soup, floor: Float, reliable: Mask, component: Int
+    flow: FlowFit, soup: Soup, floor: Float, known: Mask, component: Int
 ) -> tuple[Soup, Mask]:
     """The soup with what is below the ground lifted to it, and (N,) True where that is.
 
-    Superpixels of the scene keep the translation they share: their flow is wrong. Where most of
-    what is reliable (N,) below the ground is another surface, that is kept. For the floor (N,) see
-    `ground`.
+    Superpixels of the scene keep the translation they share: their flow is wrong. Those whose depth
+    is known (N,) may be lower. For the floor (N,) see `ground`.
     """
-    mu, scene = 1 / soup.depth_at(flow.views.anchor), component == SCENE
-    lifted = mu < (1 - OFF) * floor
-    under = lifted & reliable & scene
-    if _level(mu, floor, under, flow.seg.sizes.astype(float)):
-        lifted &= ~under
+    mu = 1 / soup.depth_at(flow.views.anchor)
+    lifted = mu < np.where(known, 1 / LOWEST, 1 - OFF) * floor
     factor = np.where(lifted, mu / np.maximum(floor, 1e-12), 1.0)
-    t = np.where((lifted & scene)[:, None], soup.t / factor[:, None], soup.t)
+    t = np.where((lifted & (component == SCENE))[:, None], soup.t / factor[:, None], soup.t)
     return replace(soup, lam=soup.lam * factor, t=t), lifted
