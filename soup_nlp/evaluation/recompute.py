@@ -174,13 +174,14 @@ def shrinkage(
     return np.asarray(x[labels])
 
 
-def ground(s: State, labels: Int, K: Float, p: Float) -> Float:
-    """(H, W) log depth of the plane of a ground p (3,) relative to the planes of a soup, equation
-    32; inf above the horizon, and where a plane does not face its pixel."""
+def ground(s: State, labels: Int, K: Float, p: Float, sigma: Float, beside: Float) -> Float:
+    """(H, W) log depth relative to the planes of a soup, `beside` (H, W), lifted to a ground p (3,)
+    by its standard deviation sigma (H, W), equation 32."""
     v, u = np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]]
     inverse = np.linalg.solve(K.T, p) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
-    ratio = inverse.reshape(labels.shape) * depth_map(s, labels, K)
-    return np.where(ratio > 0, -np.log(np.where(ratio > 0, ratio, 1.0)), np.inf)
+    ratio = inverse.reshape(labels.shape) * depth_map(s, labels, K) * np.exp(beside)
+    lifted = beside - np.log(np.where(ratio > 1, ratio, 1.0)) / (1 + (0.05 / sigma) ** 2)
+    return np.asarray(lifted)
 
 
 def scores(z: Float, gt: Float, rule: str, cap: float | None) -> dict[str, float]:

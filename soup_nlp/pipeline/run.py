@@ -167,7 +167,7 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
             used = ~case.start.bends & case.data.pixel_weight.any(axis=1)
             beside = beside + detail(planes, pair.flow, pair.K_next, used)
         level = _ground(case, soup)
-        above = above_ground(planes, beside, level, pair.K_ref)
+        above = above_ground(planes, beside, level, pair.K_ref, sure.sigma)
         after = dense(np.where(sure.kind == KINDS.index("measured"), beside, above))
     after = replace(after, sigma_ref=sure.sigma)
     full = None if case.original is None else full_size(case.original, pair, after)

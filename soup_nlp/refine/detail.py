@@ -24,6 +24,8 @@ more than twice its depth is on another surface."""
 STEP = 0.3
 """Standard deviation of the step of log depth between two neighbours with a usual border. MRE of 27
 families hardly depends on it (0.2 and 0.4: within 0.2 %)."""
+GROUND_SIGMA = 0.05
+"""Standard deviation of the log depth of the ground: what differs less is taken to lie on it."""
 TINY = float(np.finfo(float).tiny)
 
 
@@ -92,9 +94,15 @@ def shrinkage(
     return out
 
 
-def above_ground(planes: Reconstruction, beside: Float, ground: Float, K_ref: Float) -> Float:
-    """(H, W) log depth relative to the planes, `beside` (H, W), of points that are not below the
-    ground, equation 32; for its p (3,) see `start.scales.ground`."""
+def above_ground(
+    planes: Reconstruction, beside: Float, ground: Float, K_ref: Float, sigma: Float
+) -> Float:
+    """(H, W) log depth relative to the planes, `beside` (H, W), of points that do not lie below the
+    ground, equation 32.
+
+    Sigma (H, W) is the standard deviation of log depth; for p (3,) see `start.scales.ground`.
+    """
     inverse = np.maximum(rays(K_ref, pixel_grid(*beside.shape)) @ ground, 0.0)
     with np.errstate(divide="ignore"):
-        return np.fmin(beside, -np.log(inverse * planes.depth_ref))
+        below = np.fmax(beside + np.log(inverse * planes.depth_ref), 0.0)
+    return np.asarray(beside - below * sigma**2 / (sigma**2 + GROUND_SIGMA**2))

@@ -183,9 +183,9 @@ def _beside(tree: Mapping[str, Any], soup: recompute.State, labels: Int) -> Floa
         parts = tree["energy"], tree["segmentation"], labels, tree["confidence"]["own_sigma"]
         out = out + recompute.shrinkage(soup, *parts, drawn)
     if "ground" in tree["depth"]:
-        lowest = recompute.ground(soup, labels, tree["input"]["K_ref"], tree["depth"]["ground"])
         measured = tree["confidence"]["kind"] == KINDS.index("measured")
-        out = np.where(measured, out, np.minimum(out, lowest))
+        given = tree["input"]["K_ref"], tree["depth"]["ground"], tree["depth"]["sigma_ref"]
+        out = np.where(measured, out, recompute.ground(soup, labels, *given, out))
     return out
 
 

@@ -13,7 +13,7 @@ from soup_nlp.evaluation.confidence import KINDS
 from soup_nlp.geometry.camera import pixel_grid, rays
 from soup_nlp.geometry.soup import Reconstruction, Soup, plane_depth, reconstruct
 from soup_nlp.pipeline.run import make_run, skipped
-from soup_nlp.refine.detail import STEP, above_ground, detail, shrinkage
+from soup_nlp.refine.detail import GROUND_SIGMA, STEP, above_ground, detail, shrinkage
 from soup_nlp.start.regions import likeness
 
 LABELS = np.kron(np.arange(12).reshape(3, 4), np.ones((HEIGHT // 3, WIDTH // 4), int))
@@ -158,32 +158,36 @@ def test_a_run_delivers_what_is_drawn_shrunk_and_above_the_ground(small_room):
     assert np.abs(done.shrinkage).max() > 0.01
     change = np.log(done.reconstruction.depth_ref / planes)
     labels, shrunk = case.segmentation.labels, done.shrinkage[case.segmentation.labels]
-    lowest = recompute.ground(vars(done.soup), labels, case.pair.K_ref, done.ground)
-    assert 0.01 < (lowest < shrunk).mean() < 0.5
-    np.testing.assert_allclose(change, np.minimum(shrunk, lowest), atol=1e-12)
+    given = case.pair.K_ref, done.ground, done.confidence.sigma
+    expected = recompute.ground(vars(done.soup), labels, *given, shrunk)
+    assert 0.01 < (expected < shrunk).mean() < 0.5
+    np.testing.assert_allclose(change, expected, atol=1e-12)
     assert make_run(case, solution).shrinkage is None
     # measured depth stays
     done = make_run(small_room, solution, SimpleNamespace(soup=solution.soup))
-    measured, below = (
-        done.confidence.kind == KINDS.index("measured"),
-        done.reconstruction.detail > lowest + 1e-12,
+    beside, measured = done.reconstruction.detail, done.confidence.kind == KINDS.index("measured")
+    exact = recompute.ground(
+        vars(done.soup), labels, *given[:2], np.full(labels.shape, 1e9), beside
     )
-    assert below[measured].any()
-    assert not below[~measured].any()
+    assert (exact < beside - 1e-6)[measured].any()
 
 
 def test_nothing_lies_below_the_ground():
-    tiny = Tiny()
+    tiny, far = Tiny(), np.full(BUMPS.shape, 1e9)
     planes, labels = reconstruct(tiny.soup, tiny.seg.labels, K_REF, K_NEXT), tiny.seg.labels
     p = np.array([0.1, 6.0, 0.3]) / np.median(planes.depth_ref)
     inverse = rays(K_REF, pixel_grid(*labels.shape)) @ p
-    found = planes.depth_ref * np.exp(above_ground(planes, BUMPS, p, K_REF))
+    found = planes.depth_ref * np.exp(above_ground(planes, BUMPS, p, K_REF, far))
     bumps, under = planes.depth_ref * np.exp(BUMPS), inverse > 0
     under[under] &= bumps[under] > 1 / inverse[under]
     assert 0.1 < under.mean() < 0.9
     np.testing.assert_allclose(found[under], 1 / inverse[under])
     np.testing.assert_array_equal(found[~under], bumps[~under])
-    again = np.minimum(BUMPS, recompute.ground(vars(tiny.soup), labels, K_REF, p))
-    np.testing.assert_allclose(found, planes.depth_ref * np.exp(again), rtol=1e-12)
+    # what is as sure as the ground goes half of the way
+    sigma = np.full(BUMPS.shape, GROUND_SIGMA)
+    half = above_ground(planes, BUMPS, p, K_REF, sigma)
+    np.testing.assert_allclose(2 * (BUMPS - half), np.log(bumps / found), atol=1e-12)
+    again = recompute.ground(vars(tiny.soup), labels, K_REF, p, sigma, BUMPS)
+    np.testing.assert_allclose(half, again, atol=1e-12)
     # without a ground nothing changes
-    np.testing.assert_array_equal(above_ground(planes, BUMPS, np.zeros(3), K_REF), BUMPS)
+    np.testing.assert_array_equal(above_ground(planes, BUMPS, np.zeros(3), K_REF, far), BUMPS)
