@@ -43,7 +43,7 @@ from soup_nlp.refine.photometric import photometric_term
 from soup_nlp.refine.records import Refined, RefineOptions
 from soup_nlp.solve.solver_options import SolverOptions
 from soup_nlp.solve.stages import Solution, solve_soup
-from soup_nlp.start.regions import SCENE, likeness
+from soup_nlp.start.regions import likeness
 from soup_nlp.start.scales import ground
 from soup_nlp.start.views import StartOptions
 from soup_nlp.storage.progress import Listener, Watch
@@ -196,11 +196,11 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
 
 
 def _ground(case: Case, soup: Soup) -> Float:
-    """The ground of a soup, see `ground`, by what flow determines of the scene."""
+    """The ground of a soup, see `ground`, by what flow determines; in a jam cars stand on it."""
     start, anchor, options = case.start, case.data.anchor_ray, case.problem.start
     if not (options.upright and options.ground):
         return np.zeros(3)
-    known = (start.component == SCENE) & ~start.interpolated & ~start.bends
+    known = ~start.interpolated & ~start.bends
     area = np.where(known, case.segmentation.sizes, 0.0)
     return ground(anchor, 1 / soup.depth_at(anchor), area, case.problem.seed)
 
