@@ -210,7 +210,8 @@ LEAST_ON = 0.05
 surface below it. Of wrong flow less must lie below it than on it."""
 LOWEST = 5.0
 """Depth relative to that of the ground up to which a surface may lie below it, as beside a dam:
-then four times as low as the ground. More is wrong flow; 3 to 10 score alike."""
+then four times as low as the ground. More is wrong flow. Fitted on 000074 of KITTI 2012;
+3 and 10 score within 12 % there."""
 GROUND_TRIALS = 500
 """Number of planes through three superpixels that are tried."""
 
