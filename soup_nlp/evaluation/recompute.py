@@ -175,8 +175,8 @@ def shrinkage(
 
 
 def ground(s: State, labels: Int, K: Float, p: Float, sigma: Float, beside: Float) -> Float:
-    """(H, W) log depth relative to the planes of a soup, `beside` (H, W), lifted to a ground p (3,)
-    by its standard deviation sigma (H, W), equation 32."""
+    """(H, W) log depth relative to the planes of a soup: `beside` (H, W), lifted to a ground p (3,)
+    the farther the larger its standard deviation sigma (H, W) is, equation 32."""
     v, u = np.mgrid[0 : labels.shape[0], 0 : labels.shape[1]]
     inverse = np.linalg.solve(K.T, p) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
     ratio = inverse.reshape(labels.shape) * depth_map(s, labels, K) * np.exp(beside)

@@ -196,11 +196,9 @@ def make_run(case: Case, solution: Solution, refined: Refined | None = None) -> 
 
 
 def _ground(case: Case, soup: Soup) -> Float:
-    """The ground of a soup, see `ground`, by what flow determines; in a jam cars stand on it."""
-    start, anchor, options = case.start, case.data.anchor_ray, case.problem.start
-    if not (options.upright and options.ground):
-        return np.zeros(3)
-    known = ~start.interpolated & ~start.bends
+    """(3,) p of the ground by all superpixels whose flow determines their depth, see `ground`."""
+    start, anchor, o = case.start, case.data.anchor_ray, case.problem.start
+    known = ~start.interpolated & ~start.bends & (o.upright and o.ground)
     area = np.where(known, case.segmentation.sizes, 0.0)
     return ground(anchor, 1 / soup.depth_at(anchor), area, case.problem.seed)
 

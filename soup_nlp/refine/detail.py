@@ -4,8 +4,8 @@ By plane plus parallax: the plane and motion of a superpixel predict where its p
 their flow differs from that along the epipolar lines is the parallax of points before or behind the
 plane (M. Irani, P. Anandan, ECCV 1996). Errors of the flow have no such direction: what it differs
 across the lines tells how much of the parallax is error, and so does the round trip of a pixel.
-Superpixels that are drawn, whose depth nothing tells, move between their neighbours. Nothing that
-is not measured lies below the ground.
+Superpixels that are drawn, whose depth nothing tells, move between their neighbours. What is not
+measured is lifted to the ground where it would lie below.
 """
 
 import numpy as np
@@ -97,10 +97,10 @@ def shrinkage(
 def above_ground(
     planes: Reconstruction, beside: Float, ground: Float, K_ref: Float, sigma: Float
 ) -> Float:
-    """(H, W) log depth relative to the planes, `beside` (H, W), of points that do not lie below the
-    ground, equation 32.
+    """(H, W) log depth relative to the planes, from `beside` (H, W), equation 32.
 
-    Sigma (H, W) is the standard deviation of log depth; for p (3,) see `start.scales.ground`.
+    What is below the `ground` (3,), see `start.scales.ground`, is lifted to it, less where it is
+    surer: sigma (H, W) is the standard deviation of log depth.
     """
     inverse = np.maximum(rays(K_ref, pixel_grid(*beside.shape)) @ ground, 0.0)
     with np.errstate(divide="ignore"):
