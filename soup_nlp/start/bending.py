@@ -31,9 +31,9 @@ from soup_nlp.start.views import JUMP_PX, FlowFit, Views
 REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
 with the diameter of the superpixel."""
-AT_REST, TURN_SHARE = 0.5, 9e-5
+AT_REST, TURN_SHARE = 0.6, 9e-5
 """Least ratio of what a turn explains to what the main rigid motion explains, if the camera rests
-(at most 0.18 of 23 families where it moves, at least 0.83 of five where it rests), and the error up
+(at most 0.2 of 23 families where it moves, at least 0.75 of four where it rests), and the error up
 to which it explains the flow, as a share of the longer side of a small image."""
 LEAST_MOVED_DEPTH, LEAST_SCALE = 1e-3, 0.02
 """Least depth of a moved point, and least scale of the refinement of a motion, pixels."""
@@ -53,11 +53,11 @@ def turn_alone(flow: FlowFit, main: Motion) -> Float | None:
     """The camera's (3, 3) rotation, if a turn explains nearly as much as the main motion does.
 
     Of what is seen it explains at least `AT_REST` of the superpixels that the main rigid motion
-    explains with depths. Explained is an error beyond that of an affine flow of at most
-    `2 IN_NOISE` times the first quartile of the main motion's, or of `LEAST_SHARED` (in a small
-    image `TURN_SHARE` of its longer side). A zoom and a shift of the next image are free, because
-    they leave a residual that depths explain; the rotation itself, which a shift can replace, is
-    that of the plain turn.
+    explains with depths. Explained is an error of at most `IN_NOISE` noises beyond that of an
+    affine flow, or of `LEAST_SHARED` (in a small image `TURN_SHARE` of its longer side); where
+    outliers raise the noise, it is twice the first quartile of the main motion's error. A zoom and
+    a shift of the next image are free, because they leave a residual that depths explain; the
+    rotation itself, which a shift can replace, is that of the plain turn.
     """
     at = np.flatnonzero(flow.views.usable)
     if not len(at):
@@ -65,7 +65,8 @@ def turn_alone(flow: FlowFit, main: Motion) -> Float | None:
     views, residual = flow.views.subset(at), flow.residual[at]
     least = min(LEAST_SHARED, TURN_SHARE * max(flow.seg.labels.shape))
     excess = views.fit([main]).penalised()[:, 0] - residual
-    most = max(least, 2 * IN_NOISE * float(np.quantile(excess, 0.25)))
+    noise = min(reference_noise(flow.residual), 2 * float(np.quantile(excess, 0.25)))
+    most = max(least, IN_NOISE * noise)
     rigid, turned = excess < most, fit_turn(views, ANY_TURN)[1] - residual < most
     if not turned.any() or turned.sum() < AT_REST * rigid.sum():
         return None
