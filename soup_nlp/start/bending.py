@@ -10,18 +10,20 @@ depend on the number of superpixels or of rigid components.
 from collections.abc import Callable
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from soup_nlp.arrays import Float, Int, Mask
 from soup_nlp.geometry import rotation
 from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.soup import Soup
-from soup_nlp.start.epipolar import MOTION_STEP, Motion, least_cauchy
+from soup_nlp.start.epipolar import MOTION_STEP, Motion
 from soup_nlp.start.labelling import (
     IN_NOISE,
     LEAST_GAP_PX,
     LEAST_SHARED,
     MOTION_PIXELS,
     PIECE_SIZE,
+    Labelling,
     candidates,
     dominant,
 )
@@ -31,12 +33,13 @@ from soup_nlp.start.views import JUMP_PX, FlowFit, Views
 REFERENCE = 1000
 """Number of superpixels at which the noise is measured: an affine flow leaves a residual that grows
 with the diameter of the superpixel."""
-AT_REST, TURN_SHARE = 0.6, 9e-5
-"""Least ratio of what a turn explains to what the main rigid motion explains, if the camera rests
-(at most 0.2 of 23 families where it moves, at least 0.75 of four where it rests), and the error up
-to which it explains the flow, as a share of the longer side of a small image."""
+AT_REST, TURN_SHARE = 0.8, 9e-5
+"""Least ratio of what a turn explains to what the main rigid motion explains, if the camera rests,
+and the error up to which it explains the flow, as a share of the longer side of a small image."""
 LEAST_MOVED_DEPTH, LEAST_SCALE = 1e-3, 0.02
 """Least depth of a moved point, and least scale of the refinement of a motion, pixels."""
+LEAST_GAIN = 1e-3
+"""Relative change of the loss that ends a fit of `fit_robustly`."""
 
 
 def least_gap(noise: float) -> float:
@@ -49,28 +52,25 @@ def reference_noise(residual: Float) -> float:
     return float(np.median(residual) * np.sqrt(len(residual) / REFERENCE))
 
 
-def turn_alone(flow: FlowFit, main: Motion) -> Float | None:
+def turn_alone(flow: FlowFit, choice: Labelling) -> Float | None:
     """The camera's (3, 3) rotation, if a turn explains nearly as much as the main motion does.
 
     Of what is seen it explains at least `AT_REST` of the superpixels that the main rigid motion
     explains with depths. Explained is an error of at most `IN_NOISE` noises beyond that of an
-    affine flow, or of `LEAST_SHARED` (in a small image `TURN_SHARE` of its longer side); where
-    outliers raise the noise, it is twice the first quartile of the main motion's error. A zoom and
+    affine flow, or of `LEAST_SHARED` (in a small image `TURN_SHARE` of its longer side). A zoom and
     a shift of the next image are free, because they leave a residual that depths explain; the
     rotation itself, which a shift can replace, is that of the plain turn.
     """
     at = np.flatnonzero(flow.views.usable)
     if not len(at):
         return None
-    views, residual = flow.views.subset(at), flow.residual[at]
     least = min(LEAST_SHARED, TURN_SHARE * max(flow.seg.labels.shape))
-    excess = views.fit([main]).penalised()[:, 0] - residual
-    noise = min(reference_noise(flow.residual), 2 * float(np.quantile(excess, 0.25)))
-    most = max(least, IN_NOISE * noise)
-    rigid, turned = excess < most, fit_turn(views, ANY_TURN)[1] - residual < most
-    if not turned.any() or turned.sum() < AT_REST * rigid.sum():
+    most = max(least, IN_NOISE * reference_noise(flow.residual))
+    rigid = (choice.label == 0) & (choice.excess < most)
+    turned = fit_turn(flow.views.subset(at), ANY_TURN)[1] - flow.residual[at] < most
+    if not turned.any() or turned.sum() < AT_REST * rigid[at].sum():
         return None
-    return fit_turn(views.subset(np.flatnonzero(turned)))[0]
+    return fit_turn(flow.views.subset(at[turned]))[0]
 
 
 PLAIN_TURN, ANY_TURN = 4, 7
@@ -119,12 +119,15 @@ def fit_robustly(
     def slope(x: Float) -> Float:
         (at, depth), step = moved(x), MOTION_STEP * free
         change = (matrix(x @ free + step) - matrix(x @ free - step)) @ point / (2 * MOTION_STEP)
-        return (scale / depth * (change[:, :2] - at * change[:, 2:])).reshape(size, -1)
+        return (scale / depth * (change[:, :2] - at * change[:, 2:])).reshape(size, -1).T
 
-    x, e = np.zeros(size), np.zeros(0)
+    x = np.zeros(size)
     for width in (10.0, 3.0, 1.0, 0.3):
-        x, e = least_cauchy(x, miss, slope, width)
-    return x @ free, e.reshape(2, -1).T
+        fit = least_squares(
+            miss, x, slope, loss="cauchy", f_scale=width, ftol=LEAST_GAIN, max_nfev=30
+        )
+        x = fit.x
+    return x @ free, miss(x).reshape(2, -1).T
 
 
 def fit_turn(views: Views, size: int = PLAIN_TURN) -> tuple[Float, Float]:

@@ -23,11 +23,9 @@ from soup_nlp.geometry.camera import rays
 
 LEAST_MATCHES = 8
 """Least number of correspondences that determine a motion, or tell anything of a depth."""
-REFINEMENTS, STEPS, TRANSLATION_FITS, FITS = 5, 30, 6, 8
+REFINEMENTS, EVALUATIONS, TRANSLATION_FITS, FITS = 5, 30, 6, 8
 """Largest number of robust fits of a motion, each with the noise estimated by the last, and of
-steps of a fit; re-weighted fits of a translation, and of anything else."""
-LEAST_GAIN = 1e-3
-"""Relative change of the loss that ends a robust fit."""
+evaluations of a fit; re-weighted fits of a translation, and of anything else."""
 LEAST_WIDTH = 0.01
 """Smallest scale of the robust loss, pixels."""
 MOTION_SIGMA = np.array([0.02] * 3 + [0.3] * 2)
@@ -182,74 +180,60 @@ def refine(motion: Motion, matches: Matches, threshold: float = 1.0) -> Motion:
     The scale of the loss falls from the inlier distance to the noise, so that components that move
     otherwise drop out.
     """
-    root, scale = np.sqrt(matches.weight), max(0.1, 0.5 * threshold)
+    root, moved = np.sqrt(matches.weight), around(motion)
+    x, scale = np.zeros(5), max(0.1, 0.5 * threshold)
+
+    def residual(x: Float) -> Float:
+        return root * matches.distance(moved(x))
+
+    def jacobian(x: Float) -> Float:
+        return (root * (essential_slope(motion, x) @ matches.slope(moved(x)))).T
+
     for _ in range(REFINEMENTS):
-        motion = refine_near(motion, matches, scale, STEPS, 0.0)
-        error = root * np.abs(matches.distance(motion))
+        fit = least_squares(
+            residual, x, jacobian, loss="cauchy", f_scale=scale, max_nfev=EVALUATIONS
+        )
+        x = fit.x
+        error = np.abs(residual(x))
         near = error[error < 3 * scale]
         noise = 1.5 * float(np.median(near)) if len(near) else scale
         if noise > 0.8 * scale:
             break
         scale = max(noise, LEAST_WIDTH)
-    return motion
+    return moved(x)
 
 
-def refine_near(
-    motion: Motion, matches: Matches, noise: float, steps: int = FITS, prior: float = 1.0
-) -> Motion:
+def refine_near(motion: Motion, matches: Matches, noise: float, rounds: int = FITS) -> Motion:
     """Motion near a given one that lowers the robust Sampson distance; `noise` is in pixels.
 
-    A prior (`MOTION_SIGMA`, this many times) holds the directions that a small patch does not
-    determine.
+    Re-weighted Gauss-Newton steps. A prior (`MOTION_SIGMA`) holds the directions that a small patch
+    does not determine.
     """
-    moved = around(motion)
-    x, _ = least_cauchy(
-        np.zeros(5),
-        lambda x: matches.distance(moved(x)),
-        lambda x: essential_slope(motion, x) @ matches.slope(moved(x)),
-        noise,
-        weight=matches.weight,
-        usual=MOTION_SIGMA,
-        prior=prior,
-        steps=steps,
-    )
-    return _facing(moved(x), matches)
-
-
-def least_cauchy(
-    x: Float,
-    miss: Callable[[Float], Float],
-    slope: Callable[[Float], Float],
-    width: float,
-    *,
-    weight: Float | float = 1.0,
-    usual: Float | float = 1.0,
-    prior: float = 0.0,
-    steps: int = STEPS,
-) -> tuple[Float, Float]:
-    """Parameters (K,) near x with the least robust distances, and the distances (M,) there.
-
-    Levenberg-Marquardt steps on re-weighted squares lower
-    `sum weight log(1 + (e / width)^2) + prior |x / usual|^2`. The distances e are `miss(x)`, and
-    `slope(x)` (K, M) their derivatives; `usual` (K,) are changes that are neither small nor large.
-    """
-    e, damping, stiff = miss(x), 1.0, np.broadcast_to(usual, x.shape) ** -2.0
-
-    def loss(x: Float, e: Float) -> float:
-        return float(np.sum(weight * np.log1p((e / width) ** 2)) + prior * stiff @ x**2)
-
-    for _ in range(steps):
-        J, w = slope(x), weight / (width**2 + e**2)
-        A = (w * J) @ J.T + np.diag((prior + damping) * stiff)
-        near = x - np.linalg.lstsq(A, J @ (w * e) + prior * stiff * x)[0]
-        nearer = miss(near)
-        before, after = loss(x, e), loss(near, nearer)
-        damping *= 0.1 if after < before else 10.0
-        if after < before:
-            x, e = near, nearer
-        if abs(after - before) <= LEAST_GAIN * before:
-            break
-    return x, e
+    # one row per coordinate, the pixels contiguous
+    r, q = (np.ascontiguousarray(v.T) for v in (matches.ray, matches.target))
+    R, t, turn, stiff = motion.R, motion.t, np.zeros(3), MOTION_SIGMA**-2.0
+    for _ in range(rounds):
+        y, basis = R @ r, tangent(t)
+        cross = np.cross(y, q, axis=0)
+        E = rotation.hat(t) @ R
+        sides = np.concatenate([E[:2] @ r, E.T[:2] @ q])
+        scale = matches.focal / np.maximum(np.linalg.norm(sides, axis=0), 1e-9)
+        by_turn = (t @ y) * q - np.sum(y * q, axis=0) * t[:, None]
+        J = scale * np.concatenate([by_turn, basis @ cross])
+        e = scale * (t @ cross)
+        w = matches.weight / (1 + (e / noise) ** 2) / noise**2
+        A = (w * J) @ J.T + np.diag(stiff)
+        g = J @ (w * e) + stiff * np.append(turn, basis @ (t - motion.t))
+        try:
+            step = -np.linalg.solve(A, g)
+        except np.linalg.LinAlgError:
+            # the prior is below the rounding of A (focal lengths of 1e9)
+            step = -np.linalg.pinv(A, hermitian=True) @ g
+        step *= min(1.0, 0.1 / max(np.abs(step).max(), 1e-12))
+        turn = turn + step[:3]
+        R, t = rotation.exp(turn) @ motion.R, t + step[3:] @ basis
+        t = t / np.linalg.norm(t)
+    return _facing(Motion(R, t), matches)
 
 
 def tangent(t: Float) -> Float:
@@ -330,7 +314,7 @@ def most_probable(
         )
         return float(end.cost), moved(end.x), end.jac
 
-    _, best, _ = min((fitted(m, STEPS) for m in motions), key=lambda fit: fit[0])
+    _, best, _ = min((fitted(m, EVALUATIONS) for m in motions), key=lambda fit: fit[0])
     # derivatives at the result, in its own coordinates
     slope = fitted(best, 1)[2]
     return best, np.asarray(np.linalg.pinv(slope.T @ slope))

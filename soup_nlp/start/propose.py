@@ -176,11 +176,12 @@ def propose(flow: FlowFit, contrast: Float | None = None) -> Start:
     jumping = discontinuous(flow, surface, bends)
     # the flow of bending regions is no evidence of the motions of rigid ones
     rigid = flow.without(bends)
-    turn = turn_alone(flow, motions[0]) if o.bending and not bends.all() else None
-    if bends.all() or turn is not None:
+    choice = None if bends.all() else labelled(rigid, motions, surface)
+    turn = turn_alone(rigid, choice) if o.bending and choice is not None else None
+    if choice is None or turn is not None:
         start = _without_relief(flow, surface, turn, contrast)
         return replace(start, surface=surface, unexplained=jumping)
-    choice, covariance = with_least_relief(rigid, labelled(rigid, motions, surface))
+    choice, covariance = with_least_relief(rigid, choice)
     wrong = choice.unexplained & rigid.views.usable
     soup, interpolated = _with_depth(rigid, choice, wrong)
     label = component = choice.label

@@ -17,6 +17,7 @@ from soup_nlp.config.problem import Problem, load_problem
 from soup_nlp.data.pair import Pair
 from soup_nlp.evaluation.metrics import UNSCALED, depth_metrics
 from soup_nlp.geometry import rotation
+from soup_nlp.geometry.graph import connected
 from soup_nlp.geometry.soup import Soup, reconstruct
 from soup_nlp.model.energy_options import BENDING_ARAP
 from soup_nlp.pipeline.case import prepare, solver_options
@@ -25,15 +26,14 @@ from soup_nlp.solve.stages import solve_soup
 from soup_nlp.start.bending import (
     ANY_TURN,
     AT_REST,
-    TURN_SHARE,
+    REFERENCE,
     constant_depth,
     discontinuous,
     fit_turn,
     joined,
     turn_alone,
 )
-from soup_nlp.start.epipolar import Motion
-from soup_nlp.start.labelling import LEAST_NOISE, LEAST_SHARED, dominant
+from soup_nlp.start.labelling import IN_NOISE, LEAST_NOISE, Labelling, dominant, labelled
 from soup_nlp.start.views import FlowFit
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("simple_starts")]
@@ -186,26 +186,23 @@ def test_a_turn_is_found_despite_wrong_focal_length_and_movers(turn, longer):
         assert left[still].max() < 1e-6
 
 
-def quiet_orbit() -> tuple[FlowFit, Motion]:
-    """The flow of a moving camera without noise, and the camera's motion."""
-    flow = fit(case("orbit"))
-    flow = flow._replace(residual=0 * flow.residual, jump=0 * flow.jump)
-    assert flow.views.usable.all()
-    return flow, dominant(flow)
-
-
-def with_parallax(flow: FlowFit, motion: Motion, share: float) -> FlowFit:
-    """The flow with this share of what depths add to a turn."""
-    turned = flow.views.ray @ motion.R.T
-    turned = turned / turned[..., 2:]
-    target = turned + share * (flow.views.target - turned)
-    return flow._replace(views=replace(flow.views, target=target))
+def quiet_orbit(**changes: object) -> tuple[FlowFit, Labelling]:
+    """The changed flow of a moving camera, with a noise of 0.02 px, and its labels."""
+    c = case("orbit")
+    flow = fit(c)._replace(residual=np.full(len(c), 0.02 * np.sqrt(REFERENCE / len(c))), **changes)
+    return flow, labelled(
+        flow, [dominant(flow)], connected(flow.seg.pairs[flow.jump < 1], len(flow.seg))
+    )
 
 
 def test_depth_that_explains_the_flow_is_no_turn():
-    flow, motion = quiet_orbit()
-    assert turn_alone(flow, motion) is None
-    assert turn_alone(with_parallax(flow, motion, 0.0), motion) is not None
+    flow, choice = quiet_orbit(jump=np.zeros(len(case("orbit").segmentation.pairs)))
+    assert flow.views.usable.all()
+    assert turn_alone(flow, choice) is None
+    # the same flow with the depths taken out of it
+    turned = flow.views.ray @ choice.motions[0].R.T
+    still = replace(flow.views, target=turned / turned[..., 2:])
+    assert turn_alone(flow._replace(views=still), choice) is not None
 
 
 @pytest.mark.parametrize(
@@ -299,24 +296,26 @@ def test_regions_that_bend_have_their_own_weights_in_one_energy():
     np.testing.assert_array_equal(c.data.pair_weight[outside], c.segmentation.pair_weight[outside])
 
 
-def test_parallax_below_the_error_that_a_flow_shares_is_not_seen():
-    flow, motion = quiet_orbit()
+def test_depth_within_three_noises_of_the_flow_is_not_seen():
+    c, (flow, choice) = case("orbit"), quiet_orbit()
+    choice = replace(choice, label=np.zeros(len(c), int), excess=0)
     error = float(np.quantile(fit_turn(flow.views, ANY_TURN)[1], AT_REST))
     assert error > 320 / 512  # 1 px at 512 columns
-    least = min(LEAST_SHARED, TURN_SHARE * 320)
-    for share, sees in ((0.3, False), (3.0, True)):
-        less = with_parallax(flow, motion, share * least / error)
-        assert (turn_alone(less, motion) is None) == sees
+    # the residual of affine flows is part of the error
+    part = np.sqrt(REFERENCE / len(c))
+    for share, sees in ((0.95, True), (1.05, False)):
+        residual = np.full(len(c), share * error / (IN_NOISE + part) * part)
+        assert (turn_alone(flow._replace(residual=residual), choice) is None) == sees
 
 
 def test_a_stabilised_turn_is_a_turn():
     """The next image is moved back by stabilisation; the rotation is that of the plain turn."""
-    flow, motion = quiet_orbit()
+    flow, choice = quiet_orbit()
     target = flow.views.ray @ rotation.exp(np.array([0.02, -0.2, 0.05])).T
     target = 1.03 * target / target[..., 2:] + np.array([0.2, 0.02, 0.0])
     target[..., 2] = 1.0
     stabilised = flow._replace(views=replace(flow.views, target=target))
-    turn = turn_alone(stabilised, motion)
+    turn = turn_alone(stabilised, choice)
     assert turn is not None
     plain, error = fit_turn(stabilised.views)
     assert np.median(error) > 1.0
